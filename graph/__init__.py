@@ -1,0 +1,1 @@
+"""The factor graph: GTSAM lives here and nowhere else."""

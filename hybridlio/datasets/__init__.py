@@ -1,0 +1,1 @@
+"""Readers, one file each, and the sequence they return."""

@@ -1,0 +1,133 @@
+"""What crosses between the parts: relative poses with covariances, the state, and the three seams' protocols.
+
+An initial-pose source and a residual source each answer with a :class:`RelativePose`; the backend takes it and answers
+with a :class:`State`. Nothing else crosses, so any implementation of a seam goes with any other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridlio import se3
+from hybridlio.errors import DataError
+from hybridlio.sensors import Frame
+
+Array = NDArray[np.float64]
+
+
+def check_covariance(covariance: Array, name: str, size: int = 6) -> Array:
+    """The covariance as a symmetric float64 ``(size, size)`` matrix.
+
+    Raises:
+        DataError: wrong shape, not finite, not symmetric or not positive definite; the message carries ``name``.
+    """
+    covariance = np.asarray(covariance, dtype=np.float64)
+    if covariance.shape != (size, size) or not np.isfinite(covariance).all():
+        raise DataError(f"{name}: expected a finite ({size}, {size}) covariance, got shape {covariance.shape}")
+    if not np.allclose(covariance, covariance.T, rtol=1e-6, atol=1e-12 * float(np.abs(covariance).max())):
+        raise DataError(f"{name}: covariance is not symmetric")
+    covariance = (covariance + covariance.T) / 2
+    try:
+        np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        raise DataError(f"{name}: covariance is not positive definite") from None
+    return covariance
+
+
+@dataclass(frozen=True, eq=False)
+class RelativePose:
+    """Where scan k+1 is relative to scan k, and how sure that is.
+
+    Attributes:
+        pose: ``T_k_k1`` ``(4, 4)``, lidar frames.
+        covariance: ``(6, 6)``, rad² and m², rotation first, of a right perturbation ``T·Exp(ξ)``.
+        source: who says so, such as ``preintegration`` or ``scan-matching``.
+        degenerate: ``(D, 6)`` unit tangent directions that the measurement does not constrain; often empty.
+        ok: False where the source failed and only bridges (the covariance is then wide).
+        details: the source's own diagnostics by name (inliers, iterations, error …).
+    """
+
+    pose: Array
+    covariance: Array
+    source: str
+    degenerate: Array = field(default_factory=lambda: np.empty((0, 6)))
+    ok: bool = True
+    details: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pose", se3.check_pose(self.pose, f"{self.source}: relative pose"))
+        object.__setattr__(self, "covariance", check_covariance(self.covariance, f"{self.source}: relative pose"))
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The backend's estimate at one scan.
+
+    Attributes:
+        stamp_ns: the scan's stamp.
+        T_world_imu: ``(4, 4)``; world's z axis points up.
+        velocity_m_s: ``(3,)`` of the IMU, in world.
+        accel_bias_m_s2, gyro_bias_rad_s: ``(3,)`` each.
+        covariance: ``(15, 15)`` of rotation, position (right perturbation of ``T_world_imu``), velocity, accelerometer
+            bias, gyroscope bias.
+        has_imu: False where no inertial data informs the state: velocity then comes from the relative poses alone.
+    """
+
+    stamp_ns: int
+    T_world_imu: Array
+    velocity_m_s: Array
+    accel_bias_m_s2: Array
+    gyro_bias_rad_s: Array
+    covariance: Array
+    has_imu: bool = True
+
+
+class InitialPoseSource(Protocol):
+    """Where is this scan relative to the last, before looking at the scans?"""
+
+    name: str
+
+    def predict(self, frame: Frame, state: State) -> RelativePose:
+        """Predict ``T_k_k1``, from the scan that ``state`` is at to ``frame``."""
+        ...
+
+    def correct(self, frame: Frame, estimate: RelativePose) -> None:
+        """Learn what the step to ``frame`` turned out to be."""
+        ...
+
+
+class ResidualSource(Protocol):
+    """How far off was the initial pose, looking at both scans?"""
+
+    name: str
+
+    def start(self, frame: Frame) -> None:
+        """Take the first scan."""
+        ...
+
+    def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:
+        """The refined ``T = δT·T̂`` with its covariance; ``δT`` is ``T @ inverse(T̂)``."""
+        ...
+
+
+class Backend(Protocol):
+    """What does everything together say?"""
+
+    name: str
+
+    def start(self, frame: Frame, state: State) -> None:
+        """Take the first scan's state as prior, with its covariance."""
+        ...
+
+    def update(self, frame: Frame, relative: RelativePose) -> State:
+        """Add the step to ``frame`` and return the state there."""
+        ...
+
+    def pose_covariance(self) -> Array:
+        """Covariance ``(6, 6)`` of the current lidar pose relative to the first scan's."""
+        ...

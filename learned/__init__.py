@@ -1,0 +1,1 @@
+"""The learned front end: PyTorch lives here and nowhere else."""
