@@ -1,0 +1,48 @@
+"""Files that appear whole: written beside their place under a temporary name, then renamed into it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+from hybridlio.errors import DataError
+
+
+@contextlib.contextmanager
+def writing_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary path in the same folder that takes ``path``'s place when the block ends well.
+
+    The folder is made where it is missing. The temporary name keeps the suffix, as some writers choose a format by it.
+    When the block raises, or is interrupted, what was written is removed and the file at ``path`` stays as it was.
+
+    Raises:
+        DataError: the place cannot be written to; names ``path`` and the system's reason.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:12]}{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        if error.filename not in (None, str(temporary), str(path.parent), *map(str, path.parents)):
+            raise  # another file's trouble, met inside the block
+        raise DataError(
+            f"cannot write {path}: {error.strerror or error}; choose a place with room and rights"
+        ) from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def write_whole(path: str | os.PathLike[str], data: bytes | str) -> None:
+    """Write ``data`` (text as UTF-8, newlines as given) to ``path``, whole or not at all.
+
+    Raises:
+        DataError: the place cannot be written to.
+    """
+    with writing_whole(path) as temporary:
+        temporary.write_bytes(data.encode() if isinstance(data, str) else data)
