@@ -1,0 +1,72 @@
+"""What all tests share: where the real recordings are, one seed, and threads that do not fight each other."""
+
+from __future__ import annotations
+
+import os
+
+if os.environ.get("PYTEST_XDIST_WORKER"):  # before NumPy and PyTorch load: each worker is a core's worth of work
+    for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(_name, "1")
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import fcntl
+import hashlib
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def project_root() -> Path:
+    """The checkout's root."""
+    return ROOT
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """A generator with the same seed in every test."""
+    return np.random.default_rng(20240229)
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of packed real recordings; the test is skipped where there is none."""
+    folder = Path(os.environ.get("HYBRIDLIO_SHARED_DATA", ROOT.parent / "shared" / "data"))
+    if not (folder / "unpack.py").is_file():
+        pytest.skip(f"no real recordings at {folder} (set HYBRIDLIO_SHARED_DATA to the folder that holds unpack.py)")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def unpacked_recordings(shared_data: Path) -> Path:
+    """The real recordings laid out as KITTI ships them, unpacked once for all workers and later runs."""
+    default = Path(tempfile.gettempdir()) / f"hybridlio-recordings-{os.getuid()}"
+    cache = Path(os.environ.get("HYBRIDLIO_CACHE", default))
+    cache.mkdir(parents=True, exist_ok=True)
+    script = shared_data / "unpack.py"
+    version = hashlib.sha256(script.read_bytes()).hexdigest()
+    done = cache / "unpacked.sha256"
+    with (cache / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # released when the file closes, also by a worker that dies
+        if not (done.is_file() and done.read_text() == version):
+            subprocess.run([sys.executable, str(script), str(cache)], check=True, stdout=subprocess.DEVNULL)
+            done.write_text(version)
+    return cache
+
+
+@pytest.fixture(scope="session")
+def kitti_raw_root(unpacked_recordings: Path) -> Path:
+    """The folder that holds ``2011_09_26/2011_09_26_drive_0005_sync`` (154 scans), ``0048`` (22) and ``0060`` (20)."""
+    return unpacked_recordings / "kitti_raw"
+
+
+@pytest.fixture(scope="session")
+def kitti_odometry_root(unpacked_recordings: Path) -> Path:
+    """The folder that holds ``sequences/00`` (10 scans) and ``poses`` (ground truth in the camera frame)."""
+    return unpacked_recordings / "kitti_odometry"
