@@ -1,0 +1,50 @@
+# `make demo` and `make test` need python3 (3.10 or newer) and make; everything else they set up, once, in .venv.
+
+PYTHON ?= python3
+VENV ?= .venv
+WORKERS ?= 2
+DEMO ?= demo
+DEMO_SECONDS ?= 60
+ARGS ?=
+
+RUN := $(VENV)/bin/python
+READY := $(VENV)/.stamp-ready
+
+.PHONY: help demo test lint format types clean
+
+help:
+	@echo 'make demo     simulate a drive, run the odometry, smooth, evaluate, report   (DEMO_SECONDS=60 DEMO=demo)'
+	@echo 'make test     all tests   (WORKERS=2 ARGS="-k kalman")'
+	@echo 'make lint     ruff: rules and format        make format   apply both'
+	@echo 'make types    mypy, strict, on all packages'
+	@echo 'make clean    remove the environment and everything that was built'
+
+demo: $(READY)
+	@HYBRIDLIO='$(RUN) -m hybridlio' bash scripts/demo.sh '$(DEMO)' '$(DEMO_SECONDS)'
+
+test: $(READY)
+	$(RUN) -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
+
+lint: $(READY)
+	$(RUN) -m ruff check .
+	$(RUN) -m ruff format --check .
+
+format: $(READY)
+	$(RUN) -m ruff check --fix .
+	$(RUN) -m ruff format .
+
+types: $(READY)
+	$(RUN) -m mypy
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage
+
+$(RUN):
+	@$(PYTHON) -c 'import sys; sys.exit("hybridlio needs Python 3.10 or newer: make PYTHON=python3.11" if sys.version_info < (3, 10) else 0)'
+	$(PYTHON) -m venv $(VENV)
+
+$(READY): pyproject.toml constraints.txt scripts/system-libraries.sh | $(RUN)
+	@bash scripts/system-libraries.sh $(RUN)
+	@echo 'installing hybridlio and what it needs into $(VENV) (a few minutes, once)'
+	@$(RUN) -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test]'
+	@touch $@
