@@ -1,4 +1,4 @@
-"""A trajectory: stamped lidar poses with covariances, and the text formats people exchange."""
+"""A trajectory: stamped lidar poses with covariances. Its text formats are in `trajectory_files`."""
 
 from __future__ import annotations
 
