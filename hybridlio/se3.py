@@ -48,7 +48,7 @@ def so3_left_jacobian(rotvec: ArrayLike) -> Array:
     angle = np.linalg.norm(rotvec, axis=-1)[..., None, None]
     small = angle < _SMALL_ANGLE_RAD
     safe = np.where(small, 1.0, angle)
-    a = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
+    a = np.where(small, 0.5 - angle**2 / 24, 2 * np.sin(safe / 2) ** 2 / safe**2)
     b = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
     K = hat(rotvec)
     return np.asarray(np.eye(3) + a * K + b * (K @ K))

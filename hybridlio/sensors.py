@@ -93,14 +93,18 @@ class ImuSamples:
     def between(self, start_ns: int, end_ns: int) -> ImuSamples:
         """Samples from ``start_ns`` to ``end_ns``, with linearly interpolated ones at both ends.
 
-        An end outside the recording is not extrapolated: the result then starts or stops where the samples do.
+        An end outside the recording is not extrapolated: the result then starts or stops where the samples do. It is
+        empty where ``end_ns`` lies before ``start_ns``. Takes logarithmic time in the recording's length.
         """
-        inside = (self.stamps_ns > start_ns) & (self.stamps_ns < end_ns)
-        ends = [t for t in (start_ns, end_ns) if len(self) and self.stamps_ns[0] <= t <= self.stamps_ns[-1]]
-        stamps = np.unique(np.concatenate([self.stamps_ns[inside], np.array(ends, np.int64)]))
+        if end_ns < start_ns or not len(self):
+            return ImuSamples.empty()
+        first = int(np.searchsorted(self.stamps_ns, start_ns, side="right"))
+        last = int(np.searchsorted(self.stamps_ns, end_ns, side="left"))
+        ends = [t for t in (start_ns, end_ns) if self.stamps_ns[0] <= t <= self.stamps_ns[-1]]
+        stamps = np.unique(np.concatenate([self.stamps_ns[first:last], np.array(ends, np.int64)]))
         if not len(stamps):
             return ImuSamples.empty()
-        near = slice(*np.clip(np.searchsorted(self.stamps_ns, stamps[[0, -1]]) + np.array([-1, 2]), 0, len(self)))
+        near = slice(max(first - 1, 0), last + 1)  # with one known sample beyond each end to interpolate from
         # relative times: nanoseconds since 1970 do not fit a float64's 53 bits
         at, known = (stamps - stamps[0]) / NS_PER_S, (self.stamps_ns[near] - stamps[0]) / NS_PER_S
         columns = np.hstack([self.gyro_rad_s[near], self.accel_m_s2[near]])
@@ -109,7 +113,8 @@ class ImuSamples:
 
     def longest_gap_s(self, start_ns: int, end_ns: int) -> float:
         """The longest time without a sample between ``start_ns`` and ``end_ns``, in seconds."""
-        inside = self.stamps_ns[(self.stamps_ns >= start_ns) & (self.stamps_ns <= end_ns)]
+        first = int(np.searchsorted(self.stamps_ns, start_ns, side="left"))
+        inside = self.stamps_ns[first : int(np.searchsorted(self.stamps_ns, end_ns, side="right"))]
         return float(np.diff(np.concatenate([[start_ns], inside, [end_ns]])).max() / NS_PER_S)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
@@ -9,8 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.errors import DataError
-from hybridlio.sensors import Calibration, Frame, GpsFix, ImuSamples, LidarModel, Scan
+from hybridlio.sensors import NS_PER_S, Calibration, Frame, GpsFix, ImuNoise, ImuSamples, LidarModel, Scan
 from hybridlio.trajectory import Trajectory
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass
+class Notes:
+    """Remarks on what is unusual in a recording: each is logged as a warning once, and kept with the sequence."""
+
+    name: str
+    texts: list[str] = field(default_factory=list)
+
+    def add(self, text: str) -> None:
+        """Log and keep one remark."""
+        if text not in self.texts:
+            self.texts.append(text)
+            _log.warning("%s: %s", self.name, text)
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +45,10 @@ class Sequence:
         gps: fixes in time order.
         lidar: the sensor, where known; decides the vertex map's limits.
         pose_file_frame: ``lidar`` or ``camera``: the frame that KITTI pose files of this recording use.
+        forward_speed_m_s: ``(N,)`` the vehicle's speed at the scans as its own navigation system gives it, or None;
+            for judging a trajectory's length where positions are poor.
+        imu_noise: the IMU's noise where the recording says it.
+        notes: what was found unusual when opening (gaps, dropped stamps, substitutes); also logged then.
     """
 
     name: str
@@ -38,6 +60,9 @@ class Sequence:
     gps: tuple[GpsFix, ...] = ()
     lidar: LidarModel | None = None
     pose_file_frame: str = "lidar"
+    forward_speed_m_s: NDArray[np.float64] | None = None
+    imu_noise: ImuNoise | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not len(self.stamps_ns):
@@ -45,6 +70,11 @@ class Sequence:
         backwards = np.diff(self.stamps_ns) <= 0
         if backwards.any():
             raise DataError(f"{self.name}: scan stamps do not increase at scan {int(backwards.argmax()) + 1}")
+        for what, values in (("reference", self.reference), ("forward_speed_m_s", self.forward_speed_m_s)):
+            if values is not None and len(values) != len(self.stamps_ns):
+                raise DataError(f"{self.name}: {what} has {len(values)} entries for {len(self.stamps_ns)} scans")
+        if any(a.stamp_ns > b.stamp_ns for a, b in zip(self.gps, self.gps[1:], strict=False)):
+            raise DataError(f"{self.name}: GPS fixes are not in time order; sort them by stamp")
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -52,10 +82,29 @@ class Sequence:
     def __getitem__(self, index: int) -> Frame:
         """Frame ``index`` (negative counts from the end), its scan read now."""
         k = range(len(self))[index]
-        previous = self.stamps_ns[k - 1] if k else self.imu.stamps_ns[0] if len(self.imu) else self.stamps_ns[0]
-        start, end = int(previous), int(self.stamps_ns[k])
-        gps = tuple(fix for fix in self.gps if start < fix.stamp_ns <= end)
-        return Frame(k, self.load_scan(k), self.imu.between(start, end), gps)
+        end = int(self.stamps_ns[k])
+        start = int(self.stamps_ns[k - 1]) if k else self._first_stamp_ns()
+        first, last = (bisect_right(self.gps, t, key=lambda fix: fix.stamp_ns) for t in (start if k else start - 1, end))
+        return Frame(k, self.load_scan(k), self.imu.between(start, end), self.gps[first:last])
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))
+
+    def _first_stamp_ns(self) -> int:
+        """The earliest stamp of any sensor, for what the first frame carries."""
+        firsts = [int(self.stamps_ns[0])]
+        firsts += [int(self.imu.stamps_ns[0])] if len(self.imu) else []
+        firsts += [self.gps[0].stamp_ns] if self.gps else []
+        return min(firsts)
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the first scan to the last."""
+        return float(self.stamps_ns[-1] - self.stamps_ns[0]) / NS_PER_S
+
+    @property
+    def gaps(self) -> tuple[tuple[int, float], ...]:
+        """Where scans are missing: ``(k, seconds since scan k-1)`` for each step over 1.5 times the median one."""
+        steps = np.diff(self.stamps_ns) / NS_PER_S
+        large = np.flatnonzero(steps > 1.5 * np.median(steps)) if len(steps) else np.empty(0, np.int64)
+        return tuple((int(k) + 1, float(steps[k])) for k in large)
