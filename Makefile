@@ -1,4 +1,4 @@
-# `make demo` and `make test` need python3 (3.10 or newer) and make; everything else they set up, once, in .venv.
+# `make demo` and `make test` need python3 (3.11 or newer) and make; everything else they set up, once, in .venv.
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -40,7 +40,7 @@ clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage
 
 $(RUN):
-	@$(PYTHON) -c 'import sys; sys.exit("hybridlio needs Python 3.10 or newer: make PYTHON=python3.11" if sys.version_info < (3, 10) else 0)'
+	@$(PYTHON) -c 'import sys; sys.exit("hybridlio needs Python 3.11 or newer: make PYTHON=python3.11" if sys.version_info < (3, 11) else 0)'
 	$(PYTHON) -m venv $(VENV)
 
 $(READY): pyproject.toml constraints.txt scripts/system-libraries.sh | $(RUN)

@@ -1,3 +1,46 @@
 """Lidar-inertial odometry that joins a learned front end with a factor graph."""
 
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # what type checkers and editors see; at run time each name loads when first used
+    from hybridlio.errors import HybridLioError
+    from hybridlio.estimates import RelativePose, State
+    from hybridlio.sensors import Calibration, Frame, GpsFix, ImuNoise, ImuSamples, Scan
+    from hybridlio.trajectory import Trajectory
+
 __version__ = "0.1.0"
+
+__all__ = [
+    "Calibration",
+    "Frame",
+    "GpsFix",
+    "HybridLioError",
+    "ImuNoise",
+    "ImuSamples",
+    "RelativePose",
+    "Scan",
+    "State",
+    "Trajectory",
+    "__version__",
+]
+
+_HOMES = {
+    "errors": ("HybridLioError",),
+    "estimates": ("RelativePose", "State"),
+    "sensors": ("Calibration", "Frame", "GpsFix", "ImuNoise", "ImuSamples", "Scan"),
+    "trajectory": ("Trajectory",),
+}
+_HOME_OF = {name: f"hybridlio.{module}" for module, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> object:
+    """Load a public name from its module (PEP 562), so that ``import hybridlio`` loads none of the heavy libraries."""
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'hybridlio' has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(_HOME_OF[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,5 @@
+"""``python -m hybridlio``: the command line."""
+
+from hybridlio.cli import app
+
+app()

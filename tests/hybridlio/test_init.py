@@ -1,0 +1,36 @@
+"""The package's front door: names that load when first used."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+from pathlib import Path
+
+import pytest
+
+import hybridlio
+
+
+def names_seen_by_type_checkers() -> dict[str, str]:
+    tree = ast.parse(Path(inspect.getfile(hybridlio)).read_text())
+    guarded = next(node for node in tree.body if isinstance(node, ast.If))
+    imports = [node for node in guarded.body if isinstance(node, ast.ImportFrom)]
+    return {alias.name: str(node.module) for node in imports for alias in node.names}
+
+
+def test_type_checkers_see_the_names_that_load_at_run_time_from_the_same_modules():
+    assert names_seen_by_type_checkers() == hybridlio._HOME_OF
+    assert set(hybridlio.__all__) == {*hybridlio._HOME_OF, "__version__"}
+
+
+@pytest.mark.parametrize("name", sorted(hybridlio.__all__))
+def test_every_public_name_is_its_modules_own(name):
+    home = importlib.import_module(hybridlio._HOME_OF.get(name, "hybridlio"))
+    assert getattr(hybridlio, name) is getattr(home, name)
+    assert name in dir(hybridlio)
+
+
+def test_a_name_that_is_not_there_is_an_attribute_error_that_names_it():
+    with pytest.raises(AttributeError, match="open_squence"):
+        _ = hybridlio.open_squence

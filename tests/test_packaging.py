@@ -1,0 +1,104 @@
+"""The package works from a plain checkout, and as a wheel that knows nothing of the checkout."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import hybridlio
+
+PACKAGES = ("hybridlio", "graph", "learned")
+LINKS = ("hybridlio/graph", "hybridlio/learned")
+
+
+def run_python(*args: str, cwd: Path, path: Path | None = None) -> str:
+    env = {**os.environ, "PYTHONPATH": str(path or "")}
+    done = subprocess.run([sys.executable, *args], cwd=cwd, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def copy_sources(root: Path, target: Path) -> Path:
+    target.mkdir()
+    for package in PACKAGES:
+        shutil.copytree(root / package, target / package, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(root / name, target)
+    return target
+
+
+def build_wheel(sources: Path, target: Path) -> Path:
+    options = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--wheel-dir", str(target)]
+    run_python("-m", "pip", "wheel", *options, str(sources), cwd=target.parent)
+    (wheel,) = target.glob("hybridlio-*.whl")
+    return wheel
+
+
+@pytest.fixture(scope="module")
+def wheel(project_root, tmp_path_factory) -> Path:
+    """The wheel, built from a copy of the sources so that nothing an earlier build left can leak in."""
+    work = tmp_path_factory.mktemp("wheel")
+    return build_wheel(copy_sources(project_root, work / "sources"), work / "out")
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory) -> Path:
+    """A folder with the unpacked wheel alone, to be put on the path."""
+    target = tmp_path_factory.mktemp("installed")
+    options = ["--quiet", "--no-deps", "--no-index", "--target", str(target)]
+    run_python("-m", "pip", "install", *options, str(wheel), cwd=target)
+    return target
+
+
+def shipped_files(root: Path) -> set[str]:
+    """What the wheel must hold, by the names it has there: code, the type marker, page templates and weights."""
+    found = set()
+    for package in PACKAGES:
+        for path in (root / package).rglob("*"):
+            inside = path.relative_to(root).as_posix()
+            if path.suffix in {".py", ".typed", ".jinja", ".safetensors"} and not inside.startswith(LINKS):
+                found.add(inside if package == "hybridlio" else f"hybridlio/{inside}")
+    return found
+
+
+def test_the_wheel_holds_every_module_template_and_weight_once(project_root, wheel):
+    names = zipfile.ZipFile(wheel).namelist()
+    content = [name for name in names if ".dist-info/" not in name]
+    assert sorted(content) == sorted(shipped_files(project_root))
+    assert {"hybridlio/py.typed", "hybridlio/graph/__init__.py", "hybridlio/learned/__init__.py"} <= set(content)
+
+
+def test_the_wheel_does_not_depend_on_the_links_inside_the_checkout(project_root, wheel, tmp_path):
+    sources = copy_sources(project_root, tmp_path / "sources")
+    for link in LINKS:
+        (sources / link).unlink()
+    unlinked = build_wheel(sources, tmp_path / "out")
+    assert sorted(zipfile.ZipFile(unlinked).namelist()) == sorted(zipfile.ZipFile(wheel).namelist())
+
+
+def test_the_installed_wheel_is_whole_outside_the_checkout(installed, tmp_path):
+    modules = "hybridlio, hybridlio.graph, hybridlio.learned, hybridlio.datasets, hybridlio.simulation"
+    code = f"import {modules}; print(*[m.__file__ for m in ({modules})], sep='\\n')"
+    files = run_python("-c", code, cwd=tmp_path, path=installed).splitlines()
+    assert len(files) == 5
+    assert all(Path(file).is_relative_to(installed) for file in files)
+
+
+def test_the_installed_command_line_says_its_version_outside_the_checkout(installed, tmp_path):
+    assert hybridlio.__version__ in run_python("-m", "hybridlio", "--version", cwd=tmp_path, path=installed)
+    script = installed / "bin/hybridlio"
+    assert hybridlio.__version__ in run_python(str(script), "--version", cwd=tmp_path, path=installed)
+
+
+def test_a_plain_checkout_works_without_installing(project_root, tmp_path):
+    checkout = copy_sources(project_root, tmp_path / "checkout")
+    code = "import hybridlio.graph, hybridlio.learned; print(hybridlio.graph.__file__, hybridlio.learned.__file__)"
+    files = run_python("-c", code, cwd=checkout).split()
+    assert all(Path(file).is_relative_to(checkout / "hybridlio") for file in files)
+    assert hybridlio.__version__ in run_python("-m", "hybridlio", "--version", cwd=checkout)
