@@ -84,7 +84,9 @@ class Sequence:
         k = range(len(self))[index]
         end = int(self.stamps_ns[k])
         start = int(self.stamps_ns[k - 1]) if k else self._first_stamp_ns()
-        first, last = (bisect_right(self.gps, t, key=lambda fix: fix.stamp_ns) for t in (start if k else start - 1, end))
+        first, last = (
+            bisect_right(self.gps, t, key=lambda fix: fix.stamp_ns) for t in (start if k else start - 1, end)
+        )
         return Frame(k, self.load_scan(k), self.imu.between(start, end), self.gps[first:last])
 
     def __iter__(self) -> Iterator[Frame]:

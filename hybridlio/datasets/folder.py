@@ -1,0 +1,166 @@
+"""A plain folder: scans in natural order with a stamps file, an IMU CSV and a calibration.
+
+recording/
+    scans/*.bin|.npy|.pcd|.ply   (or directly in the folder, or in lidar/, points/, velodyne/, data/)
+    timestamps.txt or times.txt  one stamp a scan: seconds (1.5), whole nanoseconds, or ISO dates
+    imu.csv                      optional; see `imu_csv`
+    calibration.yaml             T_imu_lidar as four rows of four; needed with imu.csv. Also T_camera_lidar, lidar
+    poses_tum.txt                optional reference: lidar poses on the stamps' clock
+    gps.csv                      optional: stamp_ns,east,north,up,sigma
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridlio import se3
+from hybridlio.datasets.extras import read_gps_csv
+from hybridlio.datasets.imu_csv import read_imu_csv
+from hybridlio.datasets.point_files import SUFFIXES, read_scan
+from hybridlio.datasets.reference import poses_at
+from hybridlio.datasets.sequence import Notes, Sequence
+from hybridlio.datasets.stamps import MISSING_STAMP, increasing, note_coverage, note_gaps, read_stamps
+from hybridlio.errors import DataError
+from hybridlio.sensors import LIDAR_MODELS, Calibration, ImuSamples, LidarModel, Scan
+from hybridlio.trajectory_files import read_tum
+
+LAYOUT = "a folder with .bin, .npy, .pcd or .ply scans (there or in scans/) and timestamps.txt"
+
+_SCAN_FOLDERS = (".", "scans", "lidar", "points", "velodyne", "data")
+_STAMP_FILES = ("timestamps.txt", "times.txt")
+_HOW_TO_CALIBRATE = (
+    "write T_imu_lidar there, which maps lidar points into the IMU's frame, as in\n"
+    "T_imu_lidar:\n  - [1, 0, 0, 0.1]\n  - [0, 1, 0, 0.0]\n  - [0, 0, 1, 0.3]\n  - [0, 0, 0, 1]"
+)
+
+
+@dataclass(frozen=True)
+class PointFiles:
+    """Loads scan ``k`` from ``paths[k]`` with stamp ``stamps_ns[k]``."""
+
+    paths: tuple[Path, ...]
+    stamps_ns: NDArray[np.int64]
+
+    def __call__(self, k: int) -> Scan:
+        """Scan ``k``; a :class:`DataError` names the frame and the file."""
+        try:
+            return read_scan(self.paths[k], int(self.stamps_ns[k]))
+        except DataError as error:
+            raise DataError(f"frame {k}: {error}") from None
+
+
+def find(path: Path) -> dict[str, Path]:
+    """The recording at ``path``, or those in the folders directly below it, by name."""
+    here = [path] if _scan_files(path) else sorted(p for p in path.glob("*") if _stamp_files(p) and _scan_files(p))
+    return {p.resolve().name: p for p in here}
+
+
+def open_folder(folder: Path, raw_root: Path | None = None) -> Sequence:
+    """One recording, laid out as the module says. ``raw_root`` is not used.
+
+    Raises:
+        DataError: stamps missing or not one a scan, an IMU without ``T_imu_lidar``, or a malformed file; says what
+            to write.
+    """
+    del raw_root
+    folder = folder.resolve()
+    notes = Notes(folder.name)
+    stamps, paths = _stamped(folder, _scan_files(folder), notes)
+    calibration, lidar = read_calibration_yaml(folder / "calibration.yaml")
+    imu = read_imu_csv(folder / "imu.csv", notes) if (folder / "imu.csv").is_file() else ImuSamples.empty()
+    if len(imu) and calibration is None:
+        raise DataError(f"{folder / 'calibration.yaml'}: missing, and imu.csv needs it: {_HOW_TO_CALIBRATE}")
+    if not len(imu):
+        notes.add(f"no inertial data: {folder / 'imu.csv'} does not exist")
+    note_coverage(imu.stamps_ns, stamps, "inertial data", notes)
+    poses = read_tum(folder / "poses_tum.txt") if (folder / "poses_tum.txt").is_file() else None
+    return Sequence(
+        name=folder.name,
+        stamps_ns=stamps,
+        load_scan=PointFiles(paths, stamps),
+        imu=imu,
+        calibration=calibration or Calibration(),
+        reference=poses_at(stamps, poses.stamps_ns, poses.poses, "rows of poses_tum.txt", notes) if poses else None,
+        gps=read_gps_csv(folder / "gps.csv"),
+        lidar=lidar,
+        notes=tuple(notes.texts),
+    )
+
+
+def _natural(path: Path) -> list[Any]:
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
+
+
+def _stamp_files(folder: Path) -> list[Path]:
+    return [folder / name for name in _STAMP_FILES if (folder / name).is_file()]
+
+
+def _scan_files(folder: Path) -> tuple[Path, ...]:
+    """The scans of a recording, from the first of the known folders that has any, in natural order."""
+    for name in _SCAN_FOLDERS:
+        found = [p for p in (folder / name).glob("*") if p.suffix in SUFFIXES and not p.name.startswith(".")]
+        if found:
+            return tuple(sorted(found, key=_natural))
+    return ()
+
+
+def _stamped(folder: Path, paths: tuple[Path, ...], notes: Notes) -> tuple[NDArray[np.int64], tuple[Path, ...]]:
+    """Scans with their stamps, without those whose stamps repeat or go backwards."""
+    if not paths:
+        raise DataError(f"{folder}: no scans ({', '.join(SUFFIXES)})")
+    suffixes = sorted({p.suffix for p in paths})
+    if len(suffixes) > 1:
+        raise DataError(f"{paths[0].parent}: scans of several kinds ({', '.join(suffixes)}); keep one kind a folder")
+    files = _stamp_files(folder)
+    if not files:
+        raise DataError(f"{folder}: no {' or '.join(_STAMP_FILES)}; write one stamp a line, in seconds, for each scan")
+    stamps = read_stamps(files[0])
+    if len(stamps) != len(paths) or (stamps == MISSING_STAMP).any():
+        raise DataError(f"{files[0]}: {len(stamps)} lines for {len(paths)} scans; each scan needs one stamp")
+    keep = increasing(stamps)
+    if len(keep) < len(paths):
+        first = paths[int(np.setdiff1d(np.arange(len(paths)), keep)[0])].name
+        notes.add(f"dropped {len(paths) - len(keep)} scans whose stamps repeat or go backwards, first {first}")
+    note_gaps(stamps[keep], "scans", notes, factor=1.5)
+    return stamps[keep], tuple(paths[k] for k in keep)
+
+
+def read_calibration_yaml(path: Path) -> tuple[Calibration | None, LidarModel | None]:
+    """Extrinsics and lidar of a ``calibration.yaml``; None each where the file, or the entry, is missing.
+
+    Raises:
+        DataError: not YAML, an unknown key or lidar, or a matrix that is no rigid transform.
+    """
+    if not path.is_file():
+        return None, None
+    import yaml
+
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise DataError(f"{path}: not YAML ({error})") from None
+    known = ("T_imu_lidar", "T_camera_lidar", "lidar")
+    if not isinstance(content, dict) or set(content) - set(known):
+        raise DataError(f"{path}: expected only the keys {', '.join(known)}; {_HOW_TO_CALIBRATE}")
+    lidar = content.get("lidar")
+    if lidar is not None and lidar not in LIDAR_MODELS:
+        raise DataError(f"{path}: unknown lidar {lidar!r}; known: {', '.join(LIDAR_MODELS)}")
+    T_imu_lidar, T_camera_lidar = (_matrix(path, name, content.get(name)) for name in known[:2])
+    calibration = None if T_imu_lidar is None else Calibration(T_imu_lidar, T_camera_lidar)
+    return calibration, LIDAR_MODELS[lidar] if lidar else None
+
+
+def _matrix(path: Path, name: str, value: Any) -> NDArray[np.float64] | None:
+    if value is None:
+        return None
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (ValueError, TypeError):
+        raise DataError(f"{path}: {name} must be four rows of four numbers; {_HOW_TO_CALIBRATE}") from None
+    return se3.check_pose(matrix, f"{path}: {name}")

@@ -1,0 +1,111 @@
+"""KITTI's navigation rows (OXTS): inertial samples, forward speed, and poses in a local Mercator plane.
+
+The columns are those of the raw data's ``dataformat.txt``; the projection is the one KITTI's own ground truth uses
+(Geiger et al., "Vision meets Robotics: The KITTI Dataset", IJRR 2013).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from hybridlio import se3
+from hybridlio.datasets.kitti_files import numbered
+from hybridlio.datasets.reference import poses_at
+from hybridlio.datasets.sequence import Notes
+from hybridlio.datasets.stamps import MISSING_STAMP, note_gaps, read_stamps, sorted_unique
+from hybridlio.errors import DataError
+from hybridlio.sensors import ImuSamples
+from hybridlio.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+COLUMNS = 30
+_LAT, _LON, _ALT, _ROLL, _PITCH, _YAW, _FORWARD = 0, 1, 2, 3, 4, 5, 8
+_ACCEL, _GYRO = slice(11, 14), slice(17, 20)
+_EARTH_RADIUS_M = 6378137.0
+
+
+@dataclass(frozen=True, eq=False)
+class OxtsRows:
+    """Navigation rows, strictly increasing in time.
+
+    Attributes:
+        stamps_ns: ``(R,)`` int64.
+        values: ``(R, 30)`` in KITTI's units: degrees, metres, radians, m/s, m/s², rad/s.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    values: Array
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @property
+    def imu(self) -> ImuSamples:
+        """Angular velocity and specific force along the body's axes (forward, left, up)."""
+        return ImuSamples(self.stamps_ns, self.values[:, _GYRO], self.values[:, _ACCEL])
+
+    @property
+    def T_enu_imu(self) -> Array:
+        """Poses ``(R, 4, 4)``, east-north-up with its origin at the first row's position."""
+        lat, lon = self.values[:, _LAT], self.values[:, _LON]
+        scale_m = _EARTH_RADIUS_M * np.cos(np.radians(lat[0]))
+        east, north = scale_m * np.radians(lon), scale_m * np.log(np.tan(np.pi / 4 + np.radians(lat) / 2))
+        position = np.column_stack([east, north, self.values[:, _ALT]])
+        attitude = Rotation.from_euler("ZYX", self.values[:, [_YAW, _PITCH, _ROLL]]).as_matrix()
+        return se3.make(attitude, position - position[0])
+
+    def forward_speed_at(self, stamps_ns: NDArray[np.int64]) -> Array:
+        """Forward speed ``(N,)`` in m/s at ``stamps_ns``, interpolated; constant beyond the ends."""
+        at, known = (stamps_ns - self.stamps_ns[0]) / 1e9, (self.stamps_ns - self.stamps_ns[0]) / 1e9
+        return np.asarray(np.interp(at, known, self.values[:, _FORWARD]))
+
+    def lidar_poses_at(self, stamps_ns: NDArray[np.int64], T_imu_lidar: Array, notes: Notes) -> Trajectory | None:
+        """Lidar poses at ``stamps_ns`` in the frame of the first; None, with a note, where the rows do not reach."""
+        return poses_at(stamps_ns, self.stamps_ns, self.T_enu_imu @ T_imu_lidar, "navigation rows", notes)
+
+
+def _read_row(path: Path) -> Array:
+    try:
+        values = np.array(path.read_text(encoding="utf-8").split(), dtype=np.float64)
+    except (ValueError, UnicodeDecodeError):
+        raise DataError(f"{path}: expected {COLUMNS} numbers, found something else; delete or repair it") from None
+    if len(values) != COLUMNS:
+        raise DataError(f"{path}: expected {COLUMNS} columns, found {len(values)}; delete the row's file or repair it")
+    return values
+
+
+def read_oxts(folder: Path, notes: Notes) -> OxtsRows:
+    """The rows of an ``oxts`` folder (``timestamps.txt`` and ``data/NNNNNNNNNN.txt``), in order of time.
+
+    Stamps that repeat or go backwards (as in KITTI's unsynchronised recordings) are sorted and made unique, rows that
+    are not finite are dropped; both are noted.
+
+    Raises:
+        DataError: no rows, a row with another number of columns, or a row without a stamp; names the file.
+    """
+    numbers, paths = numbered(folder / "data", ".txt")
+    if not len(numbers):
+        raise DataError(f"{folder / 'data'}: no navigation rows NNNNNNNNNN.txt")
+    lines = read_stamps(folder / "timestamps.txt")
+    if numbers[-1] >= len(lines) or (lines[numbers] == MISSING_STAMP).any():
+        raise DataError(
+            f"{folder / 'timestamps.txt'}: {len(lines)} lines do not stamp every row up to {paths[-1].name}"
+        )
+    values, stamps = np.array([_read_row(path) for path in paths]), lines[numbers]
+    finite = np.isfinite(values[:, :20]).all(axis=1)
+    if not finite.any():
+        raise DataError(f"{folder}: no navigation row is finite")
+    if not finite.all():
+        notes.add(
+            f"{folder}: dropped {int((~finite).sum())} rows that are not finite, first {paths[finite.argmin()].name}"
+        )
+    values, stamps = values[finite], stamps[finite]
+    order = sorted_unique(stamps, str(folder), notes)
+    note_gaps(stamps[order], str(folder), notes, factor=5.0)
+    return OxtsRows(stamps[order], values[order])

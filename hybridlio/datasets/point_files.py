@@ -1,0 +1,142 @@
+"""One scan from a file: ``.bin`` (KITTI's), ``.npy``, ``.pcd`` or ``.ply``.
+
+Columns are told by name where the format has names: ``x y z``, ``intensity`` (or ``reflectivity``, ``reflectance``)
+and a time, ``t``, ``time``, ``timestamp`` or ``time_offset``: integers are nanoseconds, floating-point numbers seconds,
+either from the scan's stamp or (above 10⁶ s) absolute on the stamps' clock. Intensities above 1 are taken as 0..255.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridlio.datasets.kitti_files import read_bin
+from hybridlio.errors import DataError
+from hybridlio.sensors import NS_PER_S, Scan
+
+SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
+
+_INTENSITIES = ("intensity", "reflectivity", "reflectance")
+_TIMES = ("t", "time", "timestamp", "time_offset")
+_ABSOLUTE_NS = 10**15
+_PLY_BYTES = {"char": 1, "short": 2, "int": 4, "float": 4, "double": 8} | {
+    **{"uchar": 1, "ushort": 2, "uint": 4, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2},
+    **{"int32": 4, "uint32": 4, "float32": 4, "float64": 8},
+}
+
+Columns = dict[str, NDArray[Any]]
+
+
+def read_scan(path: Path, stamp_ns: int) -> Scan:
+    """The scan in ``path``.
+
+    Raises:
+        DataError: the file is missing, truncated, of no points, or its columns cannot be used; names the file.
+    """
+    points, columns = _read(path)
+    try:
+        scan = Scan(stamp_ns, points, _intensity(columns), _offsets_ns(columns, stamp_ns))
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from None
+    if not len(scan):
+        raise DataError(f"{path}: the scan has no finite points")
+    return scan
+
+
+def _read(path: Path) -> tuple[NDArray[Any], Columns]:
+    if not path.is_file():
+        raise DataError(f"{path}: no such scan")
+    if path.suffix == ".bin":
+        points, intensity = read_bin(path)
+        return points, {"intensity": intensity}
+    return _read_npy(path) if path.suffix == ".npy" else _read_open3d(path)
+
+
+def _read_npy(path: Path) -> tuple[NDArray[Any], Columns]:
+    """Rows of x y z or x y z intensity, or a structured array with those names."""
+    try:
+        values = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise DataError(f"{path}: cannot read the scan, perhaps truncated ({error})") from None
+    if values.dtype.names:
+        columns: Columns = {name: values[name].ravel() for name in values.dtype.names}
+        if not {"x", "y", "z"} <= columns.keys():
+            raise DataError(f"{path}: expected fields x y z, found {' '.join(columns)}")
+        return np.column_stack([columns["x"], columns["y"], columns["z"]]), columns
+    if values.ndim != 2 or values.shape[1] not in (3, 4):
+        raise DataError(f"{path}: expected (N, 3) x y z or (N, 4) x y z intensity, found shape {values.shape}")
+    return values[:, :3], {"intensity": values[:, 3]} if values.shape[1] == 4 else {}
+
+
+def _read_open3d(path: Path) -> tuple[NDArray[Any], Columns]:
+    import open3d as o3d
+
+    unread = _check_ply(path) if path.suffix == ".ply" else ()
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        cloud = o3d.t.io.read_point_cloud(path)
+    columns: Columns = {name: cloud.point[name].numpy() for name in cloud.point}
+    if "positions" not in columns or not len(columns["positions"]):
+        raise DataError(f"{path}: no points, or truncated or malformed so that Open3D cannot read it")
+    lost = [name for name in unread if name in _TIMES and name not in columns]
+    if lost:
+        raise DataError(
+            f"{path}: Open3D cannot read the type of the time column '{lost[0]}'; write it as int or double"
+        )
+    return columns.pop("positions"), {name: values.ravel() for name, values in columns.items()}
+
+
+def _check_ply(path: Path) -> tuple[str, ...]:
+    """Names of the vertex properties. Open3D returns uninitialised memory for a truncated file, so sizes are checked.
+
+    Raises:
+        DataError: no header, or fewer bytes (binary) or lines (ascii) after it than the vertices need.
+    """
+    data = path.read_bytes()
+    header, found, body = data.partition(b"end_header\n")
+    if not found:
+        header, found, body = data.partition(b"end_header\r\n")
+    text = header.decode("ascii", "replace")
+    vertices = re.search(r"element vertex (\d+)\s+((?:property[^\n]*\n)*)", text)
+    if not found or not vertices:
+        raise DataError(f"{path}: truncated or malformed PLY header")
+    properties = [line.split() for line in vertices[2].splitlines()]
+    row = 1 if "format ascii" in text else sum(_PLY_BYTES.get(p[1], 0) for p in properties)
+    there = body.count(b"\n") + (not body.endswith(b"\n")) if "format ascii" in text else len(body)
+    if there < int(vertices[1]) * row:
+        raise DataError(f"{path}: truncated, {vertices[1]} points announced but the file ends before")
+    return tuple(p[-1] for p in properties)
+
+
+def _intensity(columns: Columns) -> NDArray[np.float32] | None:
+    values = next((columns[name] for name in _INTENSITIES if name in columns), None)
+    if values is None:
+        return None
+    full_scale = 255 if len(values) and np.nanmax(values) > 1 else 1
+    return np.asarray(values, dtype=np.float32) / np.float32(full_scale)
+
+
+def _offsets_ns(columns: Columns, stamp_ns: int) -> NDArray[np.int64] | None:
+    """Time offsets from the scan's stamp.
+
+    Raises:
+        DataError: not finite, over a second away from the stamp, or all within a millisecond though not equal.
+    """
+    name = next((name for name in _TIMES if name in columns), None)
+    if name is None:
+        return None
+    values = columns[name]
+    if not np.isfinite(values).all():
+        raise DataError(f"column '{name}' holds a time that is not finite")
+    whole = np.issubdtype(values.dtype, np.integer)
+    ns = values.astype(np.int64) if whole else np.round(values.astype(np.float64) * NS_PER_S).astype(np.int64)
+    offsets = ns - stamp_ns if len(ns) and np.median(np.abs(ns)) > _ABSOLUTE_NS else ns
+    unit = "integers are nanoseconds" if whole else "floating-point numbers are seconds"
+    if len(offsets) and np.abs(offsets).max() > NS_PER_S:
+        raise DataError(f"column '{name}' lies over 1 s from the scan's stamp; {unit}, of the stamps' clock")
+    if len(offsets) and 0 < np.ptp(offsets) < NS_PER_S // 1000:
+        raise DataError(f"column '{name}' spans under 1 ms, too short for a sweep; {unit}")
+    return offsets

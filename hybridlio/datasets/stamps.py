@@ -1,0 +1,123 @@
+"""Time stamps as recordings write them: read to nanoseconds, put in order, and their gaps described."""
+
+from __future__ import annotations
+
+import re
+from bisect import bisect_left
+from collections.abc import Callable
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridlio.datasets.sequence import Notes
+from hybridlio.errors import DataError
+from hybridlio.sensors import NS_PER_S
+
+Stamps = NDArray[np.int64]
+
+MISSING_STAMP = int(np.iinfo(np.int64).min)  # what a blank line reads as; NumPy's "not a time" has the same bits
+
+
+def _iso_ns(text: str) -> int:
+    return int(np.datetime64(text.replace(" ", "T").rstrip("Z"), "ns").astype(np.int64))
+
+
+def _seconds_ns(text: str) -> int:
+    return int((Decimal(text) * NS_PER_S).to_integral_value())  # a float64 would round seconds since 1970 to 0.2 µs
+
+
+def _parser(first: str) -> Callable[[str], int]:
+    if re.fullmatch(r"[+-]?\d+", first):
+        return int
+    return _iso_ns if re.match(r"\d{4}-\d\d-\d\d", first) else _seconds_ns
+
+
+def read_stamps(path: Path) -> Stamps:
+    """Stamps ``(N,)`` of a text file with one a line: whole numbers are nanoseconds, numbers with a point (or an
+    exponent) seconds, and dates such as ``2011-09-26 13:04:32.349659964`` ISO 8601 in UTC.
+
+    A blank line, as for a frame that was not recorded, reads as ``MISSING_STAMP``.
+
+    Raises:
+        DataError: the file is missing, empty, or a row does not read like the first; names file and row.
+    """
+    if not path.is_file():
+        raise DataError(f"{path}: no such file; expected one time stamp a line")
+    lines = [line.strip() for line in path.read_text(encoding="utf-8", errors="replace").rstrip().splitlines()]
+    if not any(lines):
+        raise DataError(f"{path}: empty; expected one time stamp a line")
+    parse = _parser(next(filter(None, lines)))
+    stamps = np.full(len(lines), MISSING_STAMP)
+    for row, line in enumerate(lines):
+        try:
+            stamps[row] = parse(line) if line else MISSING_STAMP
+        except (ValueError, InvalidOperation, OverflowError):
+            raise DataError(f"{path}, line {row + 1}: cannot read {line[:40]!r} as a time stamp") from None
+    known = stamps[stamps != MISSING_STAMP]
+    if parse is int and len(known) > 1 and 0 < np.median(np.abs(np.diff(known))) < 1000:
+        raise DataError(f"{path}: whole numbers are nanoseconds, yet these are under 1 µs apart; write seconds as 1.0")
+    return stamps
+
+
+def increasing(stamps: Stamps) -> NDArray[np.intp]:
+    """Indices of a longest strictly increasing part of ``stamps``: what is left when the fewest are dropped."""
+    if (np.diff(stamps) > 0).all():
+        return np.arange(len(stamps))
+    tails: list[int] = []  # smallest last stamp of an increasing run, by its length
+    tail_at: list[int] = []
+    before: list[int] = []
+    for k, stamp in enumerate(stamps.tolist()):
+        length = bisect_left(tails, stamp)
+        before.append(tail_at[length - 1] if length else -1)
+        tails[length : length + 1] = [stamp]
+        tail_at[length : length + 1] = [k]
+    chain, k = [], tail_at[-1]
+    while k >= 0:
+        chain.append(k)
+        k = before[k]
+    return np.array(chain[::-1], dtype=np.intp)
+
+
+def sorted_unique(stamps: Stamps, what: str, notes: Notes) -> NDArray[np.intp]:
+    """Indices that put ``stamps`` in order, each stamp once (the first row that has it); says how many were wrong."""
+    backwards = int((np.diff(stamps) < 0).sum())
+    _, first = np.unique(stamps, return_index=True)
+    repeats = len(stamps) - len(first)
+    if backwards or repeats:
+        notes.add(
+            f"{what}: {backwards} of {len(stamps)} stamps go backwards and {repeats} repeat; sorted, repeats dropped"
+        )
+    return first
+
+
+def note_gaps(stamps: Stamps, what: str, notes: Notes, factor: float) -> None:
+    """Say how many steps in ``stamps`` exceed ``factor`` times the median step, and which is the longest."""
+    steps = np.diff(stamps) / NS_PER_S
+    if not len(steps):
+        return
+    large = int((steps > factor * np.median(steps)).sum())
+    if large:
+        worst = int(steps.argmax())
+        notes.add(f"{what}: {large} gaps, the longest {steps[worst]:.3f} s after row {worst}")
+
+
+def note_coverage(stamps: Stamps, scans: Stamps, what: str, notes: Notes) -> None:
+    """Say where ``stamps``, if there are any, begin after the first scan or end before the last by over 0.15 s.
+
+    Raises:
+        DataError: the two share no time at all, as with clocks of different origin.
+    """
+    if not len(stamps):
+        return
+    if stamps[0] > scans[-1] or stamps[-1] < scans[0]:
+        away = float(stamps[0] - scans[0]) / NS_PER_S
+        raise DataError(
+            f"{notes.name}: {what} begins {away:+.1f} s from the first scan and shares no time with the scans"
+        )
+    late, early = (stamps[0] - scans[0]) / NS_PER_S, (scans[-1] - stamps[-1]) / NS_PER_S
+    if late > 0.15:
+        notes.add(f"{what} starts {late:.2f} s after the first scan")
+    if early > 0.15:
+        notes.add(f"{what} ends {early:.2f} s before the last scan")
