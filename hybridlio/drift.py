@@ -32,12 +32,12 @@ class DriftAverage:
 
     Attributes:
         at: the length in metres, or the speed in metres per second.
-        segments: how many segments it averages.
+        count: how many segments it averages.
         t_rel_percent, r_rel_deg_per_100m: translational and rotational drift.
     """
 
     at: float
-    segments: int
+    count: int
     t_rel_percent: float
     r_rel_deg_per_100m: float
 

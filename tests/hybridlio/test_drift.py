@@ -65,7 +65,7 @@ def test_drift_does_not_depend_on_where_either_trajectory_starts() -> None:
 def test_averages_by_length_and_by_speed_cover_every_segment() -> None:
     drift = kitti_drift(straight(400), straight(400, scale=1.01))
     assert [a.at for a in drift.by_length()] == [100, 200, 300]
-    assert sum(a.segments for a in drift.by_length()) == len(drift)
+    assert sum(a.count for a in drift.by_length()) == len(drift)
     assert {a.at for a in drift.by_speed()} == {8, 10}  # 1 m in 0.1 s, less the one frame that KITTI counts more
     assert drift.by_speed()[1].t_rel_percent == pytest.approx(drift.t_rel_percent)
 

@@ -1,0 +1,257 @@
+"""Everything an estimate is judged by, in one call: drift, ATE, RPE and the consistency of its covariances.
+
+The parts live in `drift`, `trajectory_errors` and `consistency` and are offered here too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridlio import se3
+from hybridlio.consistency import (
+    Anees,
+    PoseConsistency,
+    absolute_consistency,
+    anees,
+    pose_consistency,
+    step_consistency,
+    step_errors,
+)
+from hybridlio.drift import KITTI_LENGTHS_M, Drift, DriftAverage, kitti_drift, lengths_for
+from hybridlio.errors import DataError
+from hybridlio.sensors import NS_PER_S
+from hybridlio.trajectory import Trajectory
+from hybridlio.trajectory_errors import MAX_DIFFERENCE_NS, Association, PoseErrors, align, associate, ate, rpe
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+__all__ = [
+    "KITTI_LENGTHS_M",
+    "Anees",
+    "Association",
+    "Drift",
+    "DriftAverage",
+    "Evaluation",
+    "PoseConsistency",
+    "PoseErrors",
+    "Steps",
+    "absolute_consistency",
+    "align",
+    "anees",
+    "associate",
+    "ate",
+    "evaluate",
+    "evaluation_table",
+    "kitti_drift",
+    "lengths_for",
+    "pose_consistency",
+    "rpe",
+    "step_consistency",
+    "step_errors",
+]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """Estimated motions from each pose of an estimate to the next.
+
+    Attributes:
+        poses: ``(N-1, 4, 4)`` ``T_k_k1``.
+        covariances: ``(N-1, 6, 6)``, rad² and m², rotation first.
+    """
+
+    poses: Array
+    covariances: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """An estimate's errors against a reference; None marks what could not be computed.
+
+    Attributes:
+        poses: how many moments were compared; of them, ``duration_s`` from first to last.
+        length_m, estimate_length_m: path lengths of the reference and of the estimate.
+        t_rel_percent, r_rel_deg_per_100m: KITTI's drift over 100-800 m; None for a path under 100 m.
+        chosen_lengths_m: other segment lengths, those asked for or those that fit a short path; None if not needed.
+        chosen_t_rel_percent, chosen_r_rel_deg_per_100m: drift over the chosen lengths, not comparable with KITTI's.
+        ate_m, ate_deg: root mean square of the absolute errors after rigid alignment.
+        rpe_m, rpe_deg: root mean square of the errors from frame to frame.
+        end_error_m: distance from the true end with the first poses laid on each other.
+        anees_rotation, anees_position: of the poses relative to the first; 1 is consistent, above is overconfident.
+        step_anees_rotation, step_anees_position: of the steps from pose to pose.
+        anees_bounds, step_anees_bounds: where 95 % of consistent estimators with independent errors would lie.
+        segments, segments_by_speed: the drift's averages by length and by speed (over the chosen lengths where
+            KITTI's do not fit).
+        drift, chosen_drift: every segment.
+    """
+
+    poses: int
+    duration_s: float
+    length_m: float
+    estimate_length_m: float
+    t_rel_percent: float | None
+    r_rel_deg_per_100m: float | None
+    chosen_lengths_m: tuple[float, ...] | None
+    chosen_t_rel_percent: float | None
+    chosen_r_rel_deg_per_100m: float | None
+    ate_m: float
+    ate_deg: float
+    rpe_m: float
+    rpe_deg: float
+    end_error_m: float
+    anees_rotation: float | None
+    anees_position: float | None
+    anees_bounds: tuple[float, float] | None
+    step_anees_rotation: float | None
+    step_anees_position: float | None
+    step_anees_bounds: tuple[float, float] | None
+    segments: list[DriftAverage]
+    segments_by_speed: list[DriftAverage]
+    drift: Drift = field(repr=False)
+    chosen_drift: Drift | None = field(repr=False)
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """Every attribute but the single segments, as plain numbers, lists and None."""
+        out = {name: value for name, value in vars(self).items() if name not in ("drift", "chosen_drift")}
+        for name, key in (("segments", "length_m"), ("segments_by_speed", "speed_m_s")):
+            out[name] = [{key if k == "at" else k: v for k, v in asdict(average).items()} for average in out[name]]
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in out.items()}
+
+
+def evaluate(
+    reference: Trajectory,
+    estimate: Trajectory,
+    lengths_m: Sequence[float] | None = None,
+    steps: Steps | None = None,
+    max_difference_ns: int = MAX_DIFFERENCE_NS,
+) -> Evaluation:
+    """Compare an estimate with a reference.
+
+    Args:
+        reference: the truth.
+        estimate: poses of the same sensor; the two may use different world frames. With covariances, of the poses
+            relative to the first, their consistency is judged too.
+        lengths_m: segment lengths for the drift beside KITTI's; by default :func:`lengths_for` a path under 100 m.
+        steps: the motions behind the estimate, to judge their covariances too.
+        max_difference_ns: see :func:`associate`.
+
+    Raises:
+        DataError: the two share less than two moments, or the steps do not fit the estimate.
+    """
+    both = associate(reference, estimate, max_difference_ns)
+    drift = kitti_drift(both.reference, both.estimate)
+    chosen = _chosen_drift(both, lengths_m, bool(len(drift)))
+    shown = drift if len(drift) or chosen is None else chosen
+    absolute, relative = ate(both.reference, both.estimate), rpe(both.reference, both.estimate)
+    poses, step = _absolute(both), _steps(both, estimate, steps)
+    end = se3.between(both.reference.from_first().poses[-1], both.estimate.from_first().poses[-1])
+    return Evaluation(
+        poses=len(both.reference),
+        duration_s=float((both.reference.stamps_ns[-1] - both.reference.stamps_ns[0]) / NS_PER_S),
+        length_m=both.reference.length_m,
+        estimate_length_m=both.estimate.length_m,
+        t_rel_percent=drift.t_rel_percent,
+        r_rel_deg_per_100m=drift.r_rel_deg_per_100m,
+        chosen_lengths_m=chosen.lengths_m if chosen else None,
+        chosen_t_rel_percent=chosen.t_rel_percent if chosen else None,
+        chosen_r_rel_deg_per_100m=chosen.r_rel_deg_per_100m if chosen else None,
+        ate_m=absolute.rmse_m,
+        ate_deg=absolute.rmse_deg,
+        rpe_m=relative.rmse_m,
+        rpe_deg=relative.rmse_deg,
+        end_error_m=float(np.linalg.norm(end[:3, 3])),
+        anees_rotation=poses.rotation.value if poses else None,
+        anees_position=poses.position.value if poses else None,
+        anees_bounds=(poses.rotation.lower, poses.rotation.upper) if poses else None,
+        step_anees_rotation=step.rotation.value if step else None,
+        step_anees_position=step.position.value if step else None,
+        step_anees_bounds=(step.rotation.lower, step.rotation.upper) if step else None,
+        segments=shown.by_length(),
+        segments_by_speed=shown.by_speed(),
+        drift=drift,
+        chosen_drift=chosen,
+    )
+
+
+def evaluation_table(evaluations: Mapping[str, Evaluation], title: str | None = None) -> Table:
+    """A table for the terminal: one column of figures for one evaluation, one row each for several."""
+    from rich.table import Table
+    from rich.text import Text  # plain text: in markup "[m]" would be a style
+
+    rows = {name: figures(evaluation) for name, evaluation in evaluations.items()}
+    headings = list(dict.fromkeys(heading for row in rows.values() for heading in row))
+    table = Table(title=None if title is None else Text(title))
+    if len(rows) == 1:
+        table.add_column("figure")
+        table.add_column(Text(next(iter(rows))), justify="right")
+        for heading in headings:
+            table.add_row(Text(heading), next(iter(rows.values()))[heading])
+        return table
+    table.add_column("run")
+    for heading in headings:
+        table.add_column(Text(heading), justify="right")
+    for name, row in rows.items():
+        table.add_row(Text(name), *(row.get(heading, "–") for heading in headings))
+    return table
+
+
+def figures(evaluation: Evaluation) -> dict[str, str]:
+    """The figures worth a line, under headings that carry their units; what could not be computed is left out."""
+    e = evaluation
+    lengths = "" if e.chosen_lengths_m is None else f"over {e.chosen_lengths_m[0]:g}–{e.chosen_lengths_m[-1]:g} m"
+    values: dict[str, float | None] = {
+        "t_rel [%]": e.t_rel_percent,
+        "r_rel [°/100 m]": e.r_rel_deg_per_100m,
+        f"drift {lengths} [%]": e.chosen_t_rel_percent,
+        f"turn {lengths} [°/100 m]": e.chosen_r_rel_deg_per_100m,
+        "ATE [m]": e.ate_m,
+        "ATE [°]": e.ate_deg,
+        "RPE a frame [m]": e.rpe_m,
+        "RPE a frame [°]": e.rpe_deg,
+        "end error [m]": e.end_error_m,
+        "ANEES rotation": e.anees_rotation,
+        "ANEES position": e.anees_position,
+        "ANEES steps, rotation": e.step_anees_rotation,
+        "ANEES steps, position": e.step_anees_position,
+    }
+    lengths_text = {"length [m]": f"{e.length_m:.1f}", "estimated [m]": f"{e.estimate_length_m:.1f}"}
+    return lengths_text | {heading: f"{value:.3f}" for heading, value in values.items() if value is not None}
+
+
+def _chosen_drift(both: Association, lengths_m: Sequence[float] | None, has_kitti_drift: bool) -> Drift | None:
+    if lengths_m is not None:
+        return kitti_drift(both.reference, both.estimate, lengths_m, step=1)
+    lengths = () if has_kitti_drift else lengths_for(min(both.reference.length_m, KITTI_LENGTHS_M[0]))
+    return kitti_drift(both.reference, both.estimate, lengths, step=1) if lengths else None
+
+
+def _absolute(both: Association) -> PoseConsistency | None:
+    # covariances are relative to the estimate's own first pose: without it among the moments they say nothing here
+    if both.estimate.covariances is None or both.estimate_rows[0] != 0:
+        return None
+    return absolute_consistency(both.reference, both.estimate)
+
+
+def _steps(both: Association, estimate: Trajectory, steps: Steps | None) -> PoseConsistency | None:
+    if steps is None:
+        return None
+    if not len(steps.poses) == len(steps.covariances) == len(estimate) - 1:
+        raise DataError(
+            f"{len(steps.poses)} steps with {len(steps.covariances)} covariances do not fit {len(estimate)} poses"
+        )
+    rows = both.estimate_rows
+    at_own_stamps = estimate.stamps_ns[rows] == both.reference.stamps_ns
+    pairs = np.flatnonzero((np.diff(rows) == 1) & at_own_stamps[:-1] & at_own_stamps[1:])
+    if not len(pairs):
+        return None
+    true = se3.between(both.reference.poses[pairs], both.reference.poses[pairs + 1])
+    errors = se3.log(se3.between(steps.poses[rows[pairs]], true))
+    return pose_consistency(errors, steps.covariances[rows[pairs]])
