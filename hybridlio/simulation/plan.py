@@ -1,0 +1,131 @@
+"""From settings to everything a drive needs: the path, the world along it, and the traffic."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import cKDTree
+
+from hybridlio.simulation.config import SimulationConfig
+from hybridlio.simulation.ground import CAMBER, Ground, Height, land_along, waves
+from hybridlio.simulation.layout import lay_out
+from hybridlio.simulation.path import SmoothPath
+from hybridlio.simulation.pose_files import path_along, read_lidar_poses
+from hybridlio.simulation.rig import LIDAR_HEIGHT_M, SCAN_RATE_HZ, T_IMU_LIDAR
+from hybridlio.simulation.roads import LANE_OFFSET_M, STEP_M, Road, drive, generate_centreline
+from hybridlio.simulation.traffic import MovingCar, traffic
+from hybridlio.simulation.vehicle import FINE_S, drive_path, lane_of
+from hybridlio.simulation.world import World
+
+Array = NDArray[np.float64]
+
+DEFAULT_SECONDS = 60.0
+_MARGIN_S = 1.0
+_BEHIND_M, _AHEAD_M = 70.0, 130.0
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A planned drive.
+
+    Attributes:
+        path: of the IMU, defined from a second before time zero to a second after the last scan.
+        scan_times_s: ``(N,)`` when each scan's stamp is, from zero.
+        world: what stands still.
+        cars: what moves.
+    """
+
+    path: SmoothPath
+    scan_times_s: Array
+    world: World
+    cars: list[MovingCar]
+
+
+def plan(config: SimulationConfig) -> Drive:
+    """The drive that ``config`` describes; the same settings give the same drive.
+
+    Raises:
+        ConfigError, DataError: the pose file is missing or malformed.
+    """
+    return _along_poses(config) if config.poses is not None else _along_generated_road(config)
+
+
+def _ground(land: Height, centreline: Road, config: SimulationConfig) -> Ground:
+    rng = np.random.default_rng([config.seed, 2])
+    points = centreline.at(np.arange(0.0, centreline.length_m, STEP_M))
+    roughness = waves(rng, 24, (1.2, 6.0), 0.05)
+    pavement = waves(rng, 24, (5.0, 25.0), 0.006)
+    return Ground(land, roughness, pavement, cKDTree(points), curbs=config.scene == "town")
+
+
+def _along_generated_road(config: SimulationConfig) -> Drive:
+    rng = np.random.default_rng([config.seed, 1])
+    seconds = config.seconds or DEFAULT_SECONDS
+    length = config.length_m or 1.1 * config.speed_m_s * (seconds + 2 * _MARGIN_S)
+    centreline = generate_centreline(rng, length + _BEHIND_M + _AHEAD_M, config.scene, config.loops)
+    flat = 0.3 if config.scene == "corridor" else 1.0
+    land = waves(np.random.default_rng([config.seed, 3]), 12, (90.0, 500.0), 0.025 * flat)
+    ground = _ground(land, centreline, config)
+    lane = lane_of(centreline, rng)
+    most = 4 * length / config.speed_m_s + 60.0 if config.length_m else seconds
+    times = np.arange(round(-_MARGIN_S / FINE_S), round((most + _MARGIN_S) / FINE_S) + 1) * FINE_S
+    s = _BEHIND_M + drive(lane, _BEHIND_M, config.speed_m_s, times, config.start_moving, rng)
+    if config.length_m:
+        driven = s - s[round(_MARGIN_S / FINE_S)]
+        seconds = max(float(times[min(int(np.searchsorted(driven, config.length_m)), len(times) - 101)]), 0.2)
+    times, s = (v[: round((seconds + 2 * _MARGIN_S) / FINE_S) + 1] for v in (times, s))
+    path = drive_path(lane, s, times, ground)
+    return _furnished(config, path, centreline, lane, ground, seconds)
+
+
+def _along_poses(config: SimulationConfig) -> Drive:
+    lidar_poses = read_lidar_poses(config.require_poses(), config.poses_frame)
+    path = path_along(lidar_poses)
+    seconds = len(lidar_poses) / SCAN_RATE_HZ
+    if config.length_m is not None:
+        driven = np.cumsum(np.linalg.norm(np.diff(lidar_poses[:, :3, 3], axis=0), axis=1))
+        seconds = min(seconds, (float(np.searchsorted(driven, config.length_m)) + 1) / SCAN_RATE_HZ)
+    seconds = min(seconds, config.seconds or np.inf)
+    lidar = path.poses(np.arange(path.start_s, path.end_s, 0.1)) @ T_IMU_LIDAR
+    below = lidar[:, :3, 3] - LIDAR_HEIGHT_M * lidar[:, :3, 2]
+    lane = _road_below(below[:, :2], lidar[:, :2, 0])
+    centreline = Road.through(lane.beside(np.arange(0.0, lane.length_m, STEP_M), LANE_OFFSET_M))
+    land = land_along(below + [0.0, 0.0, CAMBER * LANE_OFFSET_M])
+    return _furnished(config, path, centreline, lane, _ground(land, centreline, config), seconds)
+
+
+def _road_below(points: Array, ahead: Array) -> Road:
+    """The road of a car that was at ``points`` ``(N, 2)``, which may stand or repeat, and a piece before and after."""
+    kept = [0]
+    for i in range(1, len(points)):
+        if np.linalg.norm(points[i] - points[kept[-1]]) > STEP_M:
+            kept.append(i)
+    ahead = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
+    back = points[0] - np.arange(_BEHIND_M, 0.0, -STEP_M)[:, None] * ahead[0]
+    on = points[kept[-1]] + np.arange(STEP_M, _AHEAD_M, STEP_M)[:, None] * ahead[kept[-1]]
+    rough = np.concatenate([back, points[kept], on])
+    dense = Road.through(rough)
+    even = dense.at(np.arange(0.0, dense.length_m, STEP_M))
+    return Road.through(gaussian_filter1d(even, 3.0 / STEP_M, axis=0, mode="nearest"))
+
+
+def _furnished(
+    config: SimulationConfig, path: SmoothPath, centreline: Road, lane: Road, ground: Ground, seconds: float
+) -> Drive:
+    items = lay_out(centreline, ground.centre, config, np.random.default_rng([config.seed, 4]))
+    scans = np.arange(max(round(seconds * SCAN_RATE_HZ), 2)) / SCAN_RATE_HZ
+    times = np.arange(-0.5, scans[-1] + 0.6, 0.1)
+    ego_xy = path.poses(times)[:, :2, 3]
+    ego_s = _arc_length_of(lane, ego_xy)
+    cars = traffic(centreline, lane, ego_s, times, ego_xy, ground, config.traffic_per_km, config.seed)
+    return Drive(path, scans, World(ground, items, config.seed), cars)
+
+
+def _arc_length_of(lane: Road, xy: Array) -> Array:
+    """Arc length ``(N,)`` of successive positions on a lane that may cross itself: each step searched near the last."""
+    start = int(np.argmin(np.linalg.norm(lane.at(np.arange(0.0, 2 * _BEHIND_M, STEP_M)) - xy[0], axis=1))) * STEP_M
+    steps = np.concatenate([[0.0], np.linalg.norm(np.diff(xy, axis=0), axis=1)])
+    return np.asarray(np.minimum(start + np.cumsum(steps), lane.length_m))

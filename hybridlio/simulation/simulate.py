@@ -1,0 +1,144 @@
+"""A simulated drive, written as KITTI raw data."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridlio.errors import DataError
+from hybridlio.files import write_whole
+from hybridlio.sensors import NS_PER_S, Scan
+from hybridlio.simulation.config import SimulationConfig
+from hybridlio.simulation.gps import gps_csv, gps_fixes
+from hybridlio.simulation.imu import add_noise, ideal_imu
+from hybridlio.simulation.kitti_writer import (
+    START_NS,
+    DriveFolders,
+    oxts_rows,
+    pose_rows,
+    stamps_text,
+    write_calibration,
+    write_oxts,
+    write_scan,
+)
+from hybridlio.simulation.lidar import RayPattern, first_hits, measure, ray_pattern
+from hybridlio.simulation.plan import Drive, plan
+from hybridlio.simulation.rig import IMU_RATE_HZ, SCAN_RATE_HZ, T_IMU_LIDAR
+
+Progress = Callable[[int, int], None]
+
+FORMAT_VERSION = 1
+_LEAD_S = 0.2  # the IMU runs so long before the first scan's stamp and after the last one's
+
+
+def simulate(out: Path, config: SimulationConfig, progress: Progress | None = None) -> Path:
+    """Simulate a drive and write it below ``out`` as KITTI raw data.
+
+    The drive appears when it is complete: until then it is in a hidden folder beside, from which an interrupted run
+    with the same settings goes on. A finished drive with the same settings is left as it is.
+
+    Args:
+        out: the folder to write to, made where it is missing.
+        config: the settings.
+        progress: called with scans done and scans in all, after each scan.
+
+    Returns:
+        The drive, ``OUT/<date>/<date>_drive_NNNN_sync``. Beside it lie the 100 Hz rows (``…_extract``), the
+        calibration, ``poses.txt`` (exact lidar poses in the first scan's frame), ``simulation.json`` and, if asked
+        for, ``gps.csv``.
+
+    Raises:
+        DataError: ``out`` holds a drive with other settings, or the pose file is malformed.
+        ConfigError: there is no such pose file.
+    """
+    description = describe(config)
+    done = DriveFolders(Path(out), config.seed % 10000)
+    if done.date.exists():
+        _require_same(done.date, description)
+        return done.sync
+    partial = DriveFolders(Path(out) / f".partial-{_fingerprint(description)}", done.number)
+    drive = plan(config)
+    _write_measurements(partial, drive, config)
+    _write_scans(partial, drive, config, progress)
+    write_whole(partial.date / "simulation.json", json.dumps(description, indent=2) + "\n")
+    partial.date.rename(done.date)
+    shutil.rmtree(partial.root)
+    return done.sync
+
+
+def describe(config: SimulationConfig) -> dict[str, Any]:
+    """What ``simulation.json`` says: settings, sensor, and a pose file's contents by their hash."""
+    description: dict[str, Any] = {"version": FORMAT_VERSION, "config": json.loads(config.model_dump_json())}
+    if config.poses is not None:
+        description["poses_sha256"] = hashlib.sha256(config.require_poses().read_bytes()).hexdigest()
+        description["config"]["poses"] = config.poses.name
+    return description
+
+
+def _fingerprint(description: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def _require_same(date: Path, description: dict[str, Any]) -> None:
+    path = date / "simulation.json"
+    try:
+        found = json.loads(path.read_text())
+    except (OSError, ValueError):
+        raise DataError(f"{date} is there already and is no simulated drive; choose another folder") from None
+    if found != description:
+        raise DataError(f"{path} says that another drive is there (other settings); choose another folder")
+
+
+def _write_measurements(folders: DriveFolders, drive: Drive, config: SimulationConfig) -> None:
+    """Everything but the scans: calibration, stamps, inertial and navigation rows, truth, GPS."""
+    scan_stamps = START_NS + np.round(drive.scan_times_s * NS_PER_S).astype(np.int64)
+    lead = round(_LEAD_S * IMU_RATE_HZ)
+    per_scan = IMU_RATE_HZ // SCAN_RATE_HZ
+    ticks = np.arange(-lead, (len(scan_stamps) - 1) * per_scan + lead + 1)
+    times = ticks / IMU_RATE_HZ
+    rng = np.random.default_rng([config.seed, 6])
+    gyro, accel = add_noise(*ideal_imu(drive.path, times), config.imu_noise, IMU_RATE_HZ, rng)
+    origin = drive.path.poses(0.0)[0, :3, 3]
+    rows = oxts_rows(drive.path.motion(times), origin, gyro, accel)
+    write_calibration(folders.date)
+    write_oxts(folders.extract / "oxts", START_NS + ticks * (NS_PER_S // IMU_RATE_HZ), rows)
+    write_oxts(folders.sync / "oxts", scan_stamps, rows[lead : len(rows) - lead : per_scan])
+    half_turn = round(NS_PER_S / config.lidar_model.rate_hz / 2) if config.motion_distortion else 0
+    for name, shift in (("timestamps", 0), ("timestamps_start", -half_turn), ("timestamps_end", half_turn)):
+        write_whole(folders.velodyne / f"{name}.txt", stamps_text(scan_stamps + shift))
+    write_whole(folders.date / "poses.txt", pose_rows(drive.path.poses(drive.scan_times_s) @ T_IMU_LIDAR))
+    if config.gps:
+        fix_times = np.arange(0.0, drive.scan_times_s[-1] + 1e-9, 1.0 / config.gps_rate_hz)
+        noise = np.random.default_rng([config.seed, 8])
+        fixes = gps_fixes(drive.path, fix_times, START_NS, config.gps_sigma_m, noise)
+        write_whole(folders.date / "gps.csv", gps_csv(fixes))
+
+
+def _write_scans(folders: DriveFolders, drive: Drive, config: SimulationConfig, progress: Progress | None) -> None:
+    pattern, total = ray_pattern(config.lidar_model), len(drive.scan_times_s)
+    for k in range(total):
+        if not (folders.velodyne / "data" / f"{k:010d}.bin").exists():
+            write_scan(folders.velodyne, k, scan_at(drive, k, pattern, config))
+        if progress is not None:
+            progress(k + 1, total)
+
+
+def scan_at(drive: Drive, index: int, pattern: RayPattern, config: SimulationConfig) -> Scan:
+    """Scan ``index`` of a drive, with noise. The same whatever was scanned before."""
+    stamp_s = float(drive.scan_times_s[index])
+    offsets_s: NDArray[np.float64] = np.zeros(1)
+    if config.motion_distortion:
+        offsets_s = pattern.column_offset_ns / NS_PER_S
+    poses = drive.path.poses(stamp_s + offsets_s) @ T_IMU_LIDAR
+    anchor = drive.path.poses(stamp_s)[0, :3, 3]
+    hits = first_hits(drive.world, drive.cars, pattern, poses, stamp_s + offsets_s, anchor)
+    rng = np.random.default_rng([config.seed, 9, index])
+    stamp_ns = START_NS + round(stamp_s * NS_PER_S)
+    return measure(hits, pattern, config.lidar_model, stamp_ns, config.motion_distortion, rng)
