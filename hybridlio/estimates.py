@@ -49,6 +49,7 @@ class RelativePose:
         source: who says so, such as ``preintegration`` or ``scan-matching``.
         degenerate: ``(D, 6)`` unit tangent directions that the measurement does not constrain; often empty.
         ok: False where the source failed and only bridges (the covariance is then wide).
+        from_imu: whether inertial data went into the pose; a graph that has the IMU itself must not count it twice.
         details: the source's own diagnostics by name (inliers, iterations, error …).
     """
 
@@ -57,6 +58,7 @@ class RelativePose:
     source: str
     degenerate: Array = field(default_factory=lambda: np.empty((0, 6)))
     ok: bool = True
+    from_imu: bool = False
     details: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -66,16 +68,18 @@ class RelativePose:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """The backend's estimate at one scan.
+    """The backend's estimate at one scan. World is the IMU's pose at the first scan.
 
     Attributes:
         stamp_ns: the scan's stamp.
-        T_world_imu: ``(4, 4)``; world's z axis points up.
+        T_world_imu: ``(4, 4)``.
         velocity_m_s: ``(3,)`` of the IMU, in world.
         accel_bias_m_s2, gyro_bias_rad_s: ``(3,)`` each.
+        gravity_m_s2: ``(3,)`` in world; near (0, 0, -9.81) where the IMU started level.
         covariance: ``(15, 15)`` of rotation, position (right perturbation of ``T_world_imu``), velocity, accelerometer
             bias, gyroscope bias.
-        has_imu: False where no inertial data informs the state: velocity then comes from the relative poses alone.
+        gravity_covariance: ``(3, 3)``, (m/s²)².
+        has_imu: False where no inertial data informs the state; all but the pose is then meaningless.
     """
 
     stamp_ns: int
@@ -83,7 +87,9 @@ class State:
     velocity_m_s: Array
     accel_bias_m_s2: Array
     gyro_bias_rad_s: Array
+    gravity_m_s2: Array
     covariance: Array
+    gravity_covariance: Array
     has_imu: bool = True
 
 
@@ -120,7 +126,7 @@ class Backend(Protocol):
 
     name: str
 
-    def start(self, frame: Frame, state: State) -> None:
+    def start(self, state: State) -> None:
         """Take the first scan's state as prior, with its covariance."""
         ...
 
@@ -128,6 +134,6 @@ class Backend(Protocol):
         """Add the step to ``frame`` and return the state there."""
         ...
 
-    def pose_covariance(self) -> Array:
-        """Covariance ``(6, 6)`` of the current lidar pose relative to the first scan's."""
+    def last_step(self) -> RelativePose:
+        """The step to the current scan as the backend now sees it, lidar frames."""
         ...

@@ -1,0 +1,125 @@
+"""The online graph: poses, velocities, biases and gravity in iSAM2 (Kaess et al., IJRR 2012)."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, G, V, X
+
+from hybridlio import se3
+from hybridlio.errors import GraphError
+from hybridlio.estimates import RelativePose, State
+from hybridlio.graph import factors
+from hybridlio.graph.preintegration import covers, preintegrate
+from hybridlio.sensors import Calibration, Frame, ImuNoise
+
+# While tilt, speed and biases are still found, every step solves the few poses there are anew; afterwards a change of
+# the newest pose hardly moves the oldest, and iSAM2 need not carry it back (its wildfire threshold, in rad, m, m/s).
+_WARM_UP_STEPS = 20
+_WILDFIRE_THRESHOLD = 1.0
+
+
+def _isam() -> gtsam.ISAM2:
+    params = gtsam.ISAM2Params()
+    params.setFactorization("QR")  # Cholesky finds long straight chains indeterminate
+    params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(_WILDFIRE_THRESHOLD))
+    params.relinearizeSkip = 10
+    thresholds = gtsam.ISAM2ThresholdMap()
+    for kind, sigma in {
+        "x": np.r_[np.full(3, 0.02), np.full(3, 1.0)],
+        "v": np.full(3, 1.0),
+        "b": np.r_[np.full(3, 0.1), np.full(3, 0.01)],
+        "g": np.full(3, 0.1),
+    }.items():
+        thresholds.insert((kind, sigma))
+    params.setRelinearizeThreshold(thresholds)
+    return gtsam.ISAM2(params)
+
+
+class IncrementalBackend:
+    """Every scan a pose; consecutive ones joined by the IMU's samples and by the relative pose of the front end."""
+
+    name = "incremental"
+
+    def __init__(self, calibration: Calibration, noise: ImuNoise) -> None:
+        self._T_imu_lidar = calibration.T_imu_lidar
+        self._T_lidar_imu = se3.inverse(calibration.T_imu_lidar)
+        self._noise = noise
+        self._k = 0
+
+    def start(self, state: State) -> None:
+        """Put the first scan's pose at the origin, the rest at ``state`` with its covariance."""
+        self._k = 0
+        self._state = state
+        self._graph, self._values = factors.start_factors(state)
+        self._isam = _isam()
+        self._isam.update(self._graph, self._values)
+
+    def update(self, frame: Frame, relative: RelativePose) -> State:
+        """Add the step to ``frame``; returns the state there.
+
+        Raises:
+            GraphError: the graph cannot be solved; names the variable.
+        """
+        state, stamp_ns = self._state, frame.scan.stamp_ns
+        usable = state.has_imu and covers(frame.imu, state.stamp_ns, stamp_ns)
+        pim = preintegrate(frame.imu, state, self._noise) if usable else None
+        graph = factors.step_factors(self._k, state, relative, pim, stamp_ns, self._T_imu_lidar)
+        values = gtsam.Values()
+        factors.insert_state(values, self._k + 1, self._guess(frame, relative))
+        try:
+            self._solve(graph, values)
+        except RuntimeError as error:
+            raise GraphError(f"frame {frame.index}: the graph cannot be solved: {str(error).strip()}") from error
+        self._k += 1
+        self._state = self._read(stamp_ns)
+        return self._state
+
+    def last_step(self) -> RelativePose:
+        """The step to the current scan with the covariance that all factors together leave it."""
+        i, j = X(self._k - 1), X(self._k)
+        T_w_i, T_w_j = (self._isam.calculateEstimatePose3(key).matrix() for key in (i, j))
+        joint = self._isam.jointMarginalCovariance([i, j]).fullMatrix()
+        step = se3.between(T_w_i, T_w_j)
+        J = np.hstack([-se3.adjoint(se3.inverse(step)), np.eye(6)])
+        covariance = se3.rotate_covariance(J @ joint @ J.T, self._T_lidar_imu)
+        pose = self._T_lidar_imu @ step @ self._T_imu_lidar
+        return RelativePose(pose, (covariance + covariance.T) / 2, source=self.name, from_imu=self._state.has_imu)
+
+    def _guess(self, frame: Frame, relative: RelativePose) -> State:
+        """Where the new variables start: the relative pose, and the velocity that it means."""
+        state, stamp_ns = self._state, frame.scan.stamp_ns
+        T_world_imu = state.T_world_imu @ self._T_imu_lidar @ relative.pose @ self._T_lidar_imu
+        dt_s = (stamp_ns - state.stamp_ns) / 1e9
+        velocity = (T_world_imu[:3, 3] - state.T_world_imu[:3, 3]) / dt_s
+        return State(
+            stamp_ns, T_world_imu, velocity, state.accel_bias_m_s2, state.gyro_bias_rad_s, state.gravity_m_s2,
+            state.covariance, state.gravity_covariance, state.has_imu,
+        )  # fmt: skip
+
+    def _solve(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        if self._k >= _WARM_UP_STEPS:
+            self._isam.update(graph, values)
+            return
+        self._graph.push_back(graph)
+        self._values.insert(values)
+        params = gtsam.LevenbergMarquardtParams()
+        params.setLinearSolverType("MULTIFRONTAL_QR")
+        self._values = gtsam.LevenbergMarquardtOptimizer(self._graph, self._values, params).optimize()
+        self._isam = _isam()
+        self._isam.update(self._graph, self._values)
+
+    def _read(self, stamp_ns: int) -> State:
+        k, isam = self._k, self._isam
+        pose = isam.calculateEstimatePose3(X(k)).matrix()
+        if not self._state.has_imu:
+            covariance = np.eye(15)
+            covariance[:6, :6] = isam.marginalCovariance(X(k))
+            zero = np.zeros(3)
+            return State(stamp_ns, pose, zero, zero, zero, self._state.gravity_m_s2, covariance, np.eye(3), False)
+        bias = isam.calculateEstimateConstantBias(B(k))
+        covariance = isam.jointMarginalCovariance([X(k), V(k), B(k)]).fullMatrix()
+        return State(
+            stamp_ns, pose, isam.calculateEstimateVector(V(k)), bias.accelerometer(), bias.gyroscope(),
+            isam.calculateEstimateVector(G(k)), (covariance + covariance.T) / 2, isam.marginalCovariance(G(k)),
+        )  # fmt: skip
