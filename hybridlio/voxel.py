@@ -17,7 +17,7 @@ from hybridlio.errors import ConfigError, DataError
 
 Floats = NDArray[np.float32]
 
-_DENSE_CELLS = 1 << 26  # up to 64 MB of flags, counting in a table beats sorting fourfold
+_DENSE_CELLS = 1 << 23  # up to so many, a table of all cells beats sorting the occupied ones
 _FINEST_M, _COARSEST_M = 1e-3, 1e5
 _NARROW = 1e-5  # relative width at which a bracket is at its end
 
@@ -53,12 +53,23 @@ def voxel_average(points: ArrayLike, normals: ArrayLike | None, voxel_size_m: fl
         DataError: points and normals differ in shape.
     """
     points, normals = _checked(points, normals)
-    inverse, count = _labels(_keys(np.ascontiguousarray(points.T), voxel_size_m))
-    weight = np.bincount(inverse, minlength=count)
-    mean = _sums(points, inverse, count) / weight[:, None]
-    if normals is None:
-        return mean.astype(np.float32), None
-    return mean.astype(np.float32), _unit(_sums(normals, inverse, count))
+    labels, count = voxel_labels(points, voxel_size_m)
+    mean = label_means(points, labels, count)
+    return mean, None if normals is None else _unit(_sums(normals, labels, count))
+
+
+def voxel_labels(points: Floats, voxel_size_m: float) -> tuple[NDArray[np.intp], int]:
+    """Which voxel each of the finite points ``(N, 3)`` lies in: numbers from 0, in the order of :func:`voxel_average`.
+
+    Returns:
+        the labels ``(N,)``, and how many voxels hold points.
+    """
+    return _labels(*_keys(np.ascontiguousarray(points.T), voxel_size_m))
+
+
+def label_means(values: Floats, labels: NDArray[np.intp], count: int) -> Floats:
+    """Mean ``(M, C)`` of the values ``(N, C)`` that share a label, of ``count`` labels that all occur."""
+    return (_sums(values, labels, count) / np.bincount(labels, minlength=count)[:, None]).astype(np.float32)
 
 
 def voxel_count(points: ArrayLike, voxel_size_m: float) -> int:
@@ -161,22 +172,20 @@ def _count(columns: Floats, voxel_size_m: float) -> int:
     return int(np.count_nonzero(occupied))
 
 
-def _labels(keys_and_cells: tuple[NDArray[np.int32] | NDArray[np.int64], int]) -> tuple[NDArray[np.intp], int]:
-    """Number the occupied voxels by key; each point's number, and how many there are."""
-    keys, cells = keys_and_cells
+def _labels(keys: NDArray[np.int32] | NDArray[np.int64], cells: int) -> tuple[NDArray[np.intp], int]:
     if cells > _DENSE_CELLS:
         unique, inverse = np.unique(keys, return_inverse=True)
         return inverse, len(unique)
     occupied = np.zeros(cells, bool)
     occupied[keys] = True
     present = np.flatnonzero(occupied)
-    number = np.empty(cells, np.intp)  # written and read at occupied cells only
+    number = np.empty(cells, np.int32)  # written and read at occupied cells only
     number[present] = np.arange(len(present))
-    return number[keys], len(present)
+    return number[keys].astype(np.intp), len(present)
 
 
-def _sums(values: Floats, inverse: NDArray[np.intp], count: int) -> NDArray[np.float64]:
-    return np.stack([np.bincount(inverse, weights=column, minlength=count) for column in values.T], axis=1)
+def _sums(values: Floats, labels: NDArray[np.intp], count: int) -> NDArray[np.float64]:
+    return np.stack([np.bincount(labels, weights=column, minlength=count) for column in values.T], axis=1)
 
 
 def _unit(vectors: NDArray[np.float32] | NDArray[np.float64]) -> Floats:
