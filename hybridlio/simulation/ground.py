@@ -24,7 +24,7 @@ _ASPHALT, _PAVING, _GRASS = 0.22, 0.32, 0.42
 
 def waves(rng: np.random.Generator, count: int, lengths_m: tuple[float, float], slope: float) -> Height:
     """A smooth random surface: ``count`` plane waves of log-uniform length, together of rms slope ``slope``."""
-    length = np.exp(rng.uniform(*np.log(lengths_m), count))
+    length = np.exp(rng.uniform(np.log(lengths_m[0]), np.log(lengths_m[1]), count))
     angle, phase = rng.uniform(0, 2 * np.pi, (2, count))
     k = 2 * np.pi / length
     amplitude = slope * np.sqrt(2 / count) / k

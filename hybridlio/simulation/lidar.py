@@ -14,7 +14,7 @@ from hybridlio.simulation.world import Hits, World
 
 Array = NDArray[np.float64]
 
-# a return is seen where reflectance · cos(incidence) / range² is above this, give or take the spread (of its logarithm):
+# a return is seen where reflectance · cos(incidence) / range² is above this, give or take the spread of its logarithm:
 # asphalt is then lost beyond 60 m or so, and a dark car beyond 90 m
 _THRESHOLD_M2 = 1.6e-6
 _THRESHOLD_SPREAD = 0.35
@@ -115,6 +115,6 @@ def measure(
     measured = hits.range_m[rows] + model.range_sigma_m * rng.standard_normal(len(rows))
     points = (pattern.directions[rows] * measured[:, None]).astype(np.float32)
     shine = hits.reflectance[rows] * (0.55 + 0.45 * hits.cosine[rows])
-    shine = np.round(np.clip(shine + _INTENSITY_SIGMA * rng.standard_normal(len(rows)), 0.0, 1.0), 2)
+    shine += _INTENSITY_SIGMA * rng.standard_normal(len(rows))
     offsets = pattern.column_offset_ns[pattern.column[rows]] if timed else None
-    return Scan(stamp_ns, points, shine.astype(np.float32), offsets)
+    return Scan(stamp_ns, points, np.round(np.clip(shine, 0.0, 1.0), 2).astype(np.float32), offsets)

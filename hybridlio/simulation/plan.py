@@ -71,13 +71,14 @@ def _along_generated_road(config: SimulationConfig) -> Drive:
     ground = _ground(land, centreline, config)
     lane = lane_of(centreline, rng)
     most = 4 * length / config.speed_m_s + 60.0 if config.length_m else seconds
-    times = np.arange(round(-_MARGIN_S / FINE_S), round((most + _MARGIN_S) / FINE_S) + 1) * FINE_S
+    ticks = np.arange(round(-_MARGIN_S / FINE_S), round((most + _MARGIN_S) / FINE_S) + 1)
+    times = np.asarray(ticks * FINE_S, dtype=np.float64)
     s = _BEHIND_M + drive(lane, _BEHIND_M, config.speed_m_s, times, config.start_moving, rng)
     if config.length_m:
         driven = s - s[round(_MARGIN_S / FINE_S)]
         seconds = max(float(times[min(int(np.searchsorted(driven, config.length_m)), len(times) - 101)]), 0.2)
-    times, s = (v[: round((seconds + 2 * _MARGIN_S) / FINE_S) + 1] for v in (times, s))
-    path = drive_path(lane, s, times, ground)
+    used = slice(0, round((seconds + 2 * _MARGIN_S) / FINE_S) + 1)
+    path = drive_path(lane, s[used], times[used], ground)
     return _furnished(config, path, centreline, lane, ground, seconds)
 
 
@@ -93,7 +94,7 @@ def _along_poses(config: SimulationConfig) -> Drive:
     below = lidar[:, :3, 3] - LIDAR_HEIGHT_M * lidar[:, :3, 2]
     lane = _road_below(below[:, :2], lidar[:, :2, 0])
     centreline = Road.through(lane.beside(np.arange(0.0, lane.length_m, STEP_M), LANE_OFFSET_M))
-    land = land_along(below + [0.0, 0.0, CAMBER * LANE_OFFSET_M])
+    land = land_along(below + np.array([0.0, 0.0, CAMBER * LANE_OFFSET_M]))
     return _furnished(config, path, centreline, lane, _ground(land, centreline, config), seconds)
 
 

@@ -126,11 +126,11 @@ def _loop_corners(rng: np.random.Generator, length_m: float) -> Array:
         (i, j), back = walk[-1], walk[-2]
         ways = [n for n in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)) if n in grid and n != back]
         walk.append(ways[rng.integers(len(ways))])
-    return np.array([grid[n] for n in walk]) @ turn.T
+    return np.asarray(np.array([grid[n] for n in walk]) @ turn.T)
 
 
 def speed_limit(road: Road, cruise_m_s: float, rng: np.random.Generator) -> Array:
-    """The speed one would drive at each ``STEP_M`` of the road, from its curves and the driver's mood, braking in time."""
+    """The speed one would drive at each ``STEP_M`` of the road, from its curves and one's mood, braking in time."""
     s = np.arange(0.0, road.length_m, STEP_M)
     mood = 1.0 + 0.12 * np.sin(2 * np.pi * s / rng.uniform(150, 400) + rng.uniform(0, 6)) - 0.08
     bend = np.sqrt(_LATERAL_M_S2 / np.maximum(np.abs(road.curvature(s)), 1e-4))

@@ -43,8 +43,8 @@ def _balconies(width: float, height: float, rng: np.random.Generator) -> Mesh:
     if not len(levels):
         return Mesh.empty()
     low = np.column_stack([0 * levels + x, 0 * levels - 1.1, levels])
-    slab = boxes(low, low + [3.0, 1.1, 0.15], 0.45)
-    rail = boxes(low + [0.0, 0.0, 0.15], low + [3.0, 0.05, 1.0], 0.4)
+    slab = boxes(low, low + np.array([3.0, 1.1, 0.15]), 0.45)
+    rail = boxes(low + np.array([0.0, 0.0, 0.15]), low + np.array([3.0, 0.05, 1.0]), 0.4)
     return merge([slab, rail])
 
 
@@ -187,7 +187,7 @@ def fence(style: str, length: float, height: float) -> Mesh:
         return merge([post, rails])
     x = np.arange(-half + 0.1, half - 0.1, 0.2)
     low = np.column_stack([x, 0 * x - 0.035, 0 * x + 0.08])
-    return merge([post, rails, boxes(low, low + [0.09, 0.015, height - 0.08], 0.4)])
+    return merge([post, rails, boxes(low, low + np.array([0.09, 0.015, height - 0.08]), 0.4)])
 
 
 def _in_ball(rng: np.random.Generator, count: int) -> Array:

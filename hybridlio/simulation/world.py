@@ -54,7 +54,7 @@ class RayScene:
         scene = o3d.t.geometry.RaycastingScene()
         vertices = np.ascontiguousarray(mesh.vertices - origin, dtype=np.float32)
         triangles = np.ascontiguousarray(mesh.triangles, dtype=np.uint32)
-        scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(triangles))
+        scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(triangles))
         return cls(origin, np.append(mesh.reflectance, 0.0), scene)
 
     def cast(self, origins: Array, directions: Array) -> Hits:
@@ -63,7 +63,7 @@ class RayScene:
 
         rays = np.empty((len(directions), 6), dtype=np.float32)
         rays[:, :3], rays[:, 3:] = origins - self.origin, directions
-        answer = self.scene.cast_rays(o3d.core.Tensor(rays))
+        answer = self.scene.cast_rays(o3d.core.Tensor.from_numpy(rays))
         faces = np.minimum(answer["primitive_ids"].numpy(), len(self.reflectance) - 1)
         normals = answer["primitive_normals"].numpy()
         cosine = np.abs(np.einsum("ni,ni->n", normals, rays[:, 3:]))
@@ -92,7 +92,7 @@ class World:
         self._item_z = self.ground.height(np.array([(i.x, i.y) for i in self.items]).reshape(-1, 2))
 
     def scene_around(self, position: Array) -> RayScene:
-        """The scene of everything in sight of ``position`` ``(3,)``; rebuilt when the car has left the last one's middle.
+        """The scene of everything in sight of ``position`` ``(3,)``; rebuilt every _REBUILD_M or so.
 
         Which scene serves a position depends on the position alone, so a resumed drive sees the same triangles.
         """
