@@ -4,9 +4,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # what type checkers and editors see; at run time each name loads when first used
+    from hybridlio.datasets.registry import open_sequence
+    from hybridlio.datasets.sequence import Sequence
     from hybridlio.errors import HybridLioError
     from hybridlio.estimates import RelativePose, State
+    from hybridlio.metrics import evaluate
     from hybridlio.sensors import Calibration, Frame, GpsFix, ImuNoise, ImuSamples, Scan
+    from hybridlio.simulation import SimulationConfig, simulate
     from hybridlio.trajectory import Trajectory
 
 __version__ = "0.1.0"
@@ -20,15 +24,24 @@ __all__ = [
     "ImuSamples",
     "RelativePose",
     "Scan",
+    "Sequence",
+    "SimulationConfig",
     "State",
     "Trajectory",
     "__version__",
+    "evaluate",
+    "open_sequence",
+    "simulate",
 ]
 
 _HOMES = {
+    "datasets.registry": ("open_sequence",),
+    "datasets.sequence": ("Sequence",),
     "errors": ("HybridLioError",),
     "estimates": ("RelativePose", "State"),
+    "metrics": ("evaluate",),
     "sensors": ("Calibration", "Frame", "GpsFix", "ImuNoise", "ImuSamples", "Scan"),
+    "simulation": ("SimulationConfig", "simulate"),
     "trajectory": ("Trajectory",),
 }
 _HOME_OF = {name: f"hybridlio.{module}" for module, names in _HOMES.items() for name in names}
