@@ -64,6 +64,8 @@ def read_simulation(path: Path) -> Simulation | None:
         content = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise DataError(f"{path}: not JSON ({error})") from None
+    if not isinstance(content, dict):
+        raise DataError(f"{path}: expected an object with 'lidar' and 'imu_noise'")
     return Simulation(_lidar(path, content), _imu_noise(content.get("imu_noise")))
 
 

@@ -1,0 +1,143 @@
+"""What every reader promises, on the same ride written in each reader's layout."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hybridlio.datasets import READERS, Sequence, open_sequence, sequence_names
+from hybridlio.errors import DataError
+
+# a new reader is tested by adding how its layout is written: (fixture, folder) -> arguments of open_sequence
+WRITERS: dict[str, Callable[[Any, Path], dict[str, Any]]] = {
+    "kitti-raw": lambda r, root: {"path": r.write_raw(root, r.ride)},
+    "kitti-odometry": lambda r, root: {
+        "path": r.write_odometry(root / "odometry", r.ride),
+        "raw_root": r.write_raw(root / "raw", r.ride).parents[1],
+    },
+    "folder": lambda r, root: {"path": r.write_folder(root, r.ride)},
+}
+
+
+def test_every_reader_is_under_contract() -> None:
+    assert set(WRITERS) == set(READERS)
+
+
+@pytest.fixture(scope="module", params=list(READERS))
+def opened(request: pytest.FixtureRequest, recordings: Any, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Reader's name, the arguments that open the ride, and the sequence."""
+    arguments = WRITERS[request.param](recordings, tmp_path_factory.mktemp(request.param))
+    return request.param, arguments, open_sequence(**arguments)
+
+
+@pytest.fixture
+def sequence(opened: tuple[str, dict[str, Any], Sequence]) -> Sequence:
+    return opened[2]
+
+
+def test_the_reader_is_guessed_as_if_it_were_named(opened: tuple[str, dict[str, Any], Sequence]) -> None:
+    name, arguments, sequence = opened
+    named = open_sequence(**arguments, reader=name)
+    assert named.name == sequence.name
+    np.testing.assert_array_equal(named.stamps_ns, sequence.stamps_ns)
+
+
+def test_names_found_at_a_path_open_there(opened: tuple[str, dict[str, Any], Sequence]) -> None:
+    _, arguments, sequence = opened
+    (name,) = sequence_names(arguments["path"].parent)
+    again = open_sequence(arguments["path"].parent, sequence=name, raw_root=arguments.get("raw_root"))
+    assert again.name == sequence.name
+    assert len(again) == len(sequence)
+
+
+def test_stamps_increase_and_are_the_rides(sequence: Sequence, recordings: Any) -> None:
+    stamps = sequence.stamps_ns
+    assert stamps.dtype == np.int64
+    assert (np.diff(stamps) > 0).all()
+    np.testing.assert_array_equal(stamps - stamps[0], recordings.ride.stamps_ns - recordings.ride.start_ns)
+
+
+def test_frames_carry_the_scans_that_were_written(sequence: Sequence, recordings: Any) -> None:
+    for k, frame in enumerate(sequence):
+        assert frame.index == k
+        assert frame.scan.stamp_ns == sequence.stamps_ns[k]
+        written = recordings.ride.points(k).astype(np.float32)
+        np.testing.assert_array_equal(frame.scan.points, written[:, :3])
+        assert frame.scan.intensity is not None
+        np.testing.assert_array_equal(frame.scan.intensity, written[:, 3])
+
+
+def test_frames_carry_the_inertial_samples_since_the_scan_before(sequence: Sequence) -> None:
+    for k in range(1, len(sequence)):
+        imu = sequence[k].imu
+        assert imu.stamps_ns[0] == sequence.stamps_ns[k - 1]
+        assert imu.stamps_ns[-1] == sequence.stamps_ns[k]
+        assert 10 <= len(imu) <= 12
+    first = sequence[0].imu
+    assert first.stamps_ns[-1] == sequence.stamps_ns[0]
+    assert first.stamps_ns[0] == sequence.imu.stamps_ns[0]
+
+
+def test_the_inertial_samples_are_the_rides_at_the_rides_times(sequence: Sequence, recordings: Any) -> None:
+    ride = recordings.ride
+    expected = ride.imu(ride.imu_stamps_ns(10))
+    since_start = sequence.imu.stamps_ns - sequence.stamps_ns[0]
+    np.testing.assert_array_equal(since_start, expected.stamps_ns - ride.start_ns)
+    np.testing.assert_allclose(sequence.imu.gyro_rad_s, expected.gyro_rad_s, atol=1e-12)
+    np.testing.assert_allclose(sequence.imu.accel_m_s2, expected.accel_m_s2, atol=1e-12)
+
+
+def test_the_extrinsics_are_the_rides(sequence: Sequence, recordings: Any) -> None:
+    np.testing.assert_allclose(sequence.calibration.T_imu_lidar, recordings.ride.T_imu_lidar, atol=1e-12)
+
+
+def test_the_reference_starts_at_the_identity_and_is_the_rides_lidar_path(sequence: Sequence, recordings: Any) -> None:
+    reference = sequence.reference
+    assert reference is not None
+    np.testing.assert_array_equal(reference.stamps_ns, sequence.stamps_ns)
+    np.testing.assert_allclose(reference.poses[0], np.eye(4), atol=1e-12)
+    # KITTI's degrees and quaternions have about this many digits
+    np.testing.assert_allclose(reference.poses, recordings.ride.lidar.poses, atol=1e-5)
+
+
+def test_negative_indices_count_from_the_end_and_others_end_the_sequence(sequence: Sequence) -> None:
+    last = len(sequence) - 1
+    assert sequence[-1].index == last
+    np.testing.assert_array_equal(sequence[-1].scan.points, sequence[last].scan.points)
+    for outside in (len(sequence), -len(sequence) - 1):
+        with pytest.raises(IndexError):
+            sequence[outside]
+
+
+def test_going_through_it_again_gives_the_same(sequence: Sequence) -> None:
+    for a, b in zip(sequence, sequence, strict=True):
+        assert (a.index, a.scan.stamp_ns) == (b.index, b.scan.stamp_ns)
+        np.testing.assert_array_equal(a.scan.points, b.scan.points)
+        np.testing.assert_array_equal(a.imu.stamps_ns, b.imu.stamps_ns)
+
+
+def test_it_can_be_sent_to_another_process(sequence: Sequence) -> None:
+    copy = pickle.loads(pickle.dumps(sequence))
+    np.testing.assert_array_equal(copy[3].scan.points, sequence[3].scan.points)
+
+
+def test_a_scan_cut_short_is_named_when_it_is_asked_for_and_others_still_load(
+    opened: tuple[str, dict[str, Any], Sequence], recordings: Any, tmp_path: Path
+) -> None:
+    arguments = WRITERS[opened[0]](recordings, tmp_path)
+    sequence = open_sequence(**arguments)
+    scan = sorted(p for p in arguments["path"].rglob("*") if p.suffix in (".bin", ".npy"))[3]
+    frame = next(k for k in range(len(sequence)) if sequence.load_scan.paths[k] == scan)  # type: ignore[attr-defined]
+    for data in (scan.read_bytes()[:-7], b""):
+        scan.write_bytes(data)
+        with pytest.raises(DataError, match=rf"frame {frame}: .*{scan.name}"):
+            sequence[frame]
+    scan.unlink()
+    with pytest.raises(DataError, match=rf"frame {frame}: .*{scan.name}"):
+        sequence[frame]
+    assert len(sequence[0].scan) > 0

@@ -1,0 +1,53 @@
+"""Finding the reader that fits a path, and saying what was tried where none does."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hybridlio.datasets import READERS, open_sequence, sequence_names
+from hybridlio.errors import ConfigError, DataError
+
+
+def test_where_no_reader_fits_every_layout_tried_is_listed(tmp_path: Path) -> None:
+    with pytest.raises(DataError) as caught:
+        open_sequence(tmp_path)
+    for name, reader in READERS.items():
+        assert f"{name}: {reader.layout}" in str(caught.value)
+
+
+def test_a_named_reader_alone_is_tried(recordings: Any, tmp_path: Path) -> None:
+    folder = recordings.write_folder(tmp_path, recordings.ride)
+    with pytest.raises(DataError, match="kitti-raw") as caught:
+        open_sequence(folder, reader="kitti-raw")
+    assert "kitti-odometry" not in str(caught.value)
+
+
+def test_an_unknown_reader_lists_those_there_are(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="kitti-raw, kitti-odometry, folder"):
+        open_sequence(tmp_path, reader="rosbag2")
+
+
+def test_a_path_that_is_no_folder_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"nowhere: no such folder"):
+        open_sequence(tmp_path / "nowhere")
+    file = tmp_path / "scan.bin"
+    file.write_bytes(b"")
+    with pytest.raises(DataError, match=r"scan\.bin: not a folder"):
+        open_sequence(str(file))
+
+
+def test_names_of_all_recordings_at_a_path_are_listed(recordings: Any, tmp_path: Path) -> None:
+    for name in ("00", "04", "11"):
+        recordings.write_odometry(tmp_path, recordings.ride, name=name)
+    assert sequence_names(tmp_path) == ("00", "04", "11")
+
+
+def test_listing_readers_loads_no_heavy_library() -> None:
+    code = "import sys, hybridlio.datasets as d; d.READERS; print(*{'open3d', 'torch', 'gtsam'} & sys.modules.keys())"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == ""
