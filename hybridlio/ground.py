@@ -78,7 +78,7 @@ def find_ground(
     Args:
         points: ``(N, 3)`` metres, lidar frame with z up, the sensor in the origin above the ground.
         normals: ``(N, 3)`` or None. With them only points whose surface is level enough propose a plane, which finds
-            the ground where there is little of it, and does not take the foot of walls for it.
+            the ground where there is little of it among walls.
         options: limits, and the seed.
 
     Raises:

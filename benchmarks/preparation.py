@@ -1,0 +1,71 @@
+"""How long each step of preparing a scan takes: ``python benchmarks/preparation.py SCAN.bin [--runs 20]``.
+
+SCAN.bin is a scan as KITTI ships it (float32 x, y, z, reflectance). Prints the median and the least of the runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from hybridlio import se3
+from hybridlio.deskew import constant_twist, deskew
+from hybridlio.ground import find_ground
+from hybridlio.normals import estimate_normals
+from hybridlio.preparation import prepare
+from hybridlio.projection import MAP_GEOMETRIES, normal_map, remap, vertex_map
+from hybridlio.sensors import Scan
+from hybridlio.voxel import voxel_average, voxel_to_count
+
+
+def steps(points: np.ndarray, threads: int) -> dict[str, Callable[[], object]]:
+    cells = MAP_GEOMETRIES["hdl-64e"]
+    vertices = vertex_map(points, cells)
+    normals_of_map, normals = normal_map(vertices), estimate_normals(points, threads=threads)
+    keep = ~find_ground(points, normals).mask
+    turn = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
+    T = se3.exp([0, 0, 0.02, 1.2, 0, 0])
+    sweep, plain = Scan(0, points, None, (turn * 1e8).astype(np.int64)), Scan(0, points)
+    motion = constant_twist(T, -100_000_000, 0)
+    return {
+        "vertex map": lambda: vertex_map(points, cells),
+        "normal map": lambda: normal_map(vertices),
+        "remap": lambda: remap(vertices, normals_of_map, T, cells),
+        "normals": lambda: estimate_normals(points, threads=threads),
+        "normals of raw points": lambda: estimate_normals(points, threads=threads, thin_m=0.0),
+        "ground": lambda: find_ground(points, normals),
+        "voxel average 0.5 m": lambda: voxel_average(points, None, 0.5),
+        "voxel to count, no ground": lambda: voxel_to_count(points[keep], normals[keep]),
+        "voxel to count, whole": lambda: voxel_to_count(points, normals),
+        "deskew": lambda: deskew(sweep, motion),
+        "prepare, thinned only": lambda: prepare(plain).thinned,
+        "prepare, both maps": lambda: prepare(plain).normal_map,
+        "prepare, loss cloud": lambda: prepare(plain).loss_cloud,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scan", type=Path)
+    parser.add_argument("--runs", type=int, default=20)
+    parser.add_argument("--threads", type=int, default=2)
+    options = parser.parse_args()
+    points = np.ascontiguousarray(np.fromfile(options.scan, np.float32).reshape(-1, 4)[:, :3])
+    print(f"{len(points)} points, {options.runs} runs, {options.threads} threads: median and least, ms")
+    for name, step in steps(points, options.threads).items():
+        step()
+        times = []
+        for _ in range(options.runs):
+            start = time.perf_counter()
+            step()
+            times.append(1e3 * (time.perf_counter() - start))
+        print(f"{name:28s} {statistics.median(times):8.2f} {min(times):8.2f}")
+
+
+if __name__ == "__main__":
+    main()
