@@ -50,9 +50,9 @@ def simulate(out: Path, config: SimulationConfig, progress: Progress | None = No
         progress: called with scans done and scans in all, after each scan.
 
     Returns:
-        The drive, ``OUT/<date>/<date>_drive_NNNN_sync``. Beside it lie the 100 Hz rows (``…_extract``), the
-        calibration, ``poses.txt`` (exact lidar poses in the first scan's frame), ``simulation.json`` and, if asked
-        for, ``gps.csv``.
+        The drive, ``OUT/<date>/<date>_drive_NNNN_sync``. In it also lie ``poses.txt`` (exact lidar poses in the first
+        scan's frame), ``simulation.json`` and, if asked for, ``gps.csv``; beside it the calibration and the 100 Hz
+        rows (``…_extract``).
 
     Raises:
         DataError: ``out`` holds a drive with other settings, or the pose file is malformed.
@@ -67,7 +67,7 @@ def simulate(out: Path, config: SimulationConfig, progress: Progress | None = No
     drive = plan(config)
     _write_measurements(partial, drive, config)
     _write_scans(partial, drive, config, progress)
-    write_whole(partial.date / "simulation.json", json.dumps(description, indent=2) + "\n")
+    write_whole(partial.sync / "simulation.json", json.dumps(description, indent=2) + "\n")
     partial.date.rename(done.date)
     shutil.rmtree(partial.root)
     return done.sync
@@ -75,7 +75,9 @@ def simulate(out: Path, config: SimulationConfig, progress: Progress | None = No
 
 def describe(config: SimulationConfig) -> dict[str, Any]:
     """What ``simulation.json`` says: settings, sensor, and a pose file's contents by their hash."""
-    description: dict[str, Any] = {"version": FORMAT_VERSION, "config": json.loads(config.model_dump_json())}
+    settings = json.loads(config.model_dump_json())
+    sensors = {"lidar": settings["lidar"], "imu_noise": settings["imu_noise"]}  # what the reader looks for
+    description: dict[str, Any] = {"version": FORMAT_VERSION, **sensors, "config": settings}
     if config.poses is not None:
         description["poses_sha256"] = hashlib.sha256(config.require_poses().read_bytes()).hexdigest()
         description["config"]["poses"] = config.poses.name
@@ -87,7 +89,7 @@ def _fingerprint(description: dict[str, Any]) -> str:
 
 
 def _require_same(date: Path, description: dict[str, Any]) -> None:
-    path = date / "simulation.json"
+    path = next(date.glob("*_sync/simulation.json"), date)
     try:
         found = json.loads(path.read_text())
     except (OSError, ValueError):
@@ -113,12 +115,12 @@ def _write_measurements(folders: DriveFolders, drive: Drive, config: SimulationC
     half_turn = round(NS_PER_S / config.lidar_model.rate_hz / 2) if config.motion_distortion else 0
     for name, shift in (("timestamps", 0), ("timestamps_start", -half_turn), ("timestamps_end", half_turn)):
         write_whole(folders.velodyne / f"{name}.txt", stamps_text(scan_stamps + shift))
-    write_whole(folders.date / "poses.txt", pose_rows(drive.path.poses(drive.scan_times_s) @ T_IMU_LIDAR))
+    write_whole(folders.sync / "poses.txt", pose_rows(drive.path.poses(drive.scan_times_s) @ T_IMU_LIDAR))
     if config.gps:
         fix_times = np.arange(0.0, drive.scan_times_s[-1] + 1e-9, 1.0 / config.gps_rate_hz)
         noise = np.random.default_rng([config.seed, 8])
         fixes = gps_fixes(drive.path, fix_times, START_NS, config.gps_sigma_m, noise)
-        write_whole(folders.date / "gps.csv", gps_csv(fixes))
+        write_whole(folders.sync / "gps.csv", gps_csv(fixes))
 
 
 def _write_scans(folders: DriveFolders, drive: Drive, config: SimulationConfig, progress: Progress | None) -> None:
