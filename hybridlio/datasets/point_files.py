@@ -7,13 +7,13 @@ either from the scan's stamp or (above 10⁶ s) absolute on the stamps' clock. I
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridlio.datasets.cloud_headers import check_whole
 from hybridlio.datasets.kitti_files import read_bin
 from hybridlio.errors import DataError
 from hybridlio.sensors import NS_PER_S, Scan
@@ -23,11 +23,6 @@ SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
 _INTENSITIES = ("intensity", "reflectivity", "reflectance")
 _TIMES = ("t", "time", "timestamp", "time_offset")
 _ABSOLUTE_NS = 10**15
-_PLY_BYTES = {"char": 1, "short": 2, "int": 4, "float": 4, "double": 8} | {
-    **{"uchar": 1, "ushort": 2, "uint": 4, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2},
-    **{"int32": 4, "uint32": 4, "float32": 4, "float64": 8},
-}
-
 Columns = dict[str, NDArray[Any]]
 
 
@@ -75,40 +70,18 @@ def _read_npy(path: Path) -> tuple[NDArray[Any], Columns]:
 def _read_open3d(path: Path) -> tuple[NDArray[Any], Columns]:
     import open3d as o3d
 
-    unread = _check_ply(path) if path.suffix == ".ply" else ()
+    header = check_whole(path)
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         cloud = o3d.t.io.read_point_cloud(path)
     columns: Columns = {name: cloud.point[name].numpy() for name in cloud.point}
     if "positions" not in columns or not len(columns["positions"]):
-        raise DataError(f"{path}: no points, or truncated or malformed so that Open3D cannot read it")
-    lost = [name for name in unread if name in _TIMES and name not in columns]
+        raise DataError(f"{path}: no points, or malformed so that Open3D cannot read them")
+    lost = [name for name in header.fields if name in _TIMES and name not in columns]
     if lost:
         raise DataError(
             f"{path}: Open3D cannot read the type of the time column '{lost[0]}'; write it as int or double"
         )
     return columns.pop("positions"), {name: values.ravel() for name, values in columns.items()}
-
-
-def _check_ply(path: Path) -> tuple[str, ...]:
-    """Names of the vertex properties. Open3D returns uninitialised memory for a truncated file, so sizes are checked.
-
-    Raises:
-        DataError: no header, or fewer bytes (binary) or lines (ascii) after it than the vertices need.
-    """
-    data = path.read_bytes()
-    header, found, body = data.partition(b"end_header\n")
-    if not found:
-        header, found, body = data.partition(b"end_header\r\n")
-    text = header.decode("ascii", "replace")
-    vertices = re.search(r"element vertex (\d+)\s+((?:property[^\n]*\n)*)", text)
-    if not found or not vertices:
-        raise DataError(f"{path}: truncated or malformed PLY header")
-    properties = [line.split() for line in vertices[2].splitlines()]
-    row = 1 if "format ascii" in text else sum(_PLY_BYTES.get(p[1], 0) for p in properties)
-    there = body.count(b"\n") + (not body.endswith(b"\n")) if "format ascii" in text else len(body)
-    if there < int(vertices[1]) * row:
-        raise DataError(f"{path}: truncated, {vertices[1]} points announced but the file ends before")
-    return tuple(p[-1] for p in properties)
 
 
 def _intensity(columns: Columns) -> NDArray[np.float32] | None:

@@ -129,7 +129,7 @@ class TestEveryKindWithNamedColumns:
     def test_a_file_cut_anywhere_is_refused(self, tmp_path: Path, kind: str) -> None:
         path = write(tmp_path, kind, cloud(t=OFFSETS_NS.astype("<i4")))
         data = path.read_bytes()
-        for keep in (0, 10, len(data) // 4, len(data) // 2, len(data) - 90):
+        for keep in (0, 10, len(data) // 4, len(data) // 2, len(data) - 90, len(data) - 15):
             path.write_bytes(data[:keep])
             with pytest.raises(DataError, match=kind):
                 read_scan(path, STAMP_NS)
@@ -143,6 +143,21 @@ def test_a_time_column_that_open3d_skips_is_refused_rather_than_lost(tmp_path: P
     path = write(tmp_path, "binary.ply", cloud(t=(OFFSETS_NS - OFFSETS_NS[0]).astype("<u4")))
     with pytest.raises(DataError, match="time column 't'"):
         read_scan(path, STAMP_NS)
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary", "compressed"])
+@pytest.mark.parametrize("suffix", [".pcd", ".ply"])
+def test_files_that_open3d_writes_are_read_and_refused_when_cut(tmp_path: Path, suffix: str, form: str) -> None:
+    o3d = pytest.importorskip("open3d")
+    points = cloud()
+    xyz = np.column_stack([points[c] for c in "xyz"])
+    device_cloud = o3d.t.geometry.PointCloud(xyz)
+    path = tmp_path / f"scan{suffix}"
+    o3d.t.io.write_point_cloud(str(path), device_cloud, write_ascii=form == "ascii", compressed=form == "compressed")
+    np.testing.assert_allclose(read_scan(path, 1).points, xyz, rtol=1e-5)
+    path.write_bytes(path.read_bytes()[:-15])
+    with pytest.raises(DataError, match=f"scan{suffix}: truncated"):
+        read_scan(path, 1)
 
 
 @pytest.mark.parametrize("columns", [3, 4])
