@@ -45,6 +45,7 @@ __all__ = [
     "align",
     "anees",
     "associate",
+    "associated_step_errors",
     "ate",
     "evaluate",
     "evaluation_table",
@@ -247,11 +248,22 @@ def _steps(both: Association, estimate: Trajectory, steps: Steps | None) -> Pose
         raise DataError(
             f"{len(steps.poses)} steps with {len(steps.covariances)} covariances do not fit {len(estimate)} poses"
         )
+    rows, errors = associated_step_errors(both, estimate, steps.poses)
+    return pose_consistency(errors, steps.covariances[rows]) if len(rows) else None
+
+
+def associated_step_errors(
+    both: Association, estimate: Trajectory, step_poses: Array
+) -> tuple[NDArray[np.int64], Array]:
+    """Errors of an estimate's steps ``(N-1, 4, 4)`` where the reference has both ends: which steps, ``(M, 6)`` errors.
+
+    Args:
+        both: the estimate associated with the reference.
+        estimate: the same estimate, whole.
+        step_poses: its motions ``T_k_k1`` from each pose to the next.
+    """
     rows = both.estimate_rows
     at_own_stamps = estimate.stamps_ns[rows] == both.reference.stamps_ns
     pairs = np.flatnonzero((np.diff(rows) == 1) & at_own_stamps[:-1] & at_own_stamps[1:])
-    if not len(pairs):
-        return None
     true = se3.between(both.reference.poses[pairs], both.reference.poses[pairs + 1])
-    errors = se3.log(se3.between(steps.poses[rows[pairs]], true))
-    return pose_consistency(errors, steps.covariances[rows[pairs]])
+    return rows[pairs], se3.log(se3.between(step_poses[rows[pairs]], true))
