@@ -48,7 +48,7 @@ def land_along(points: Array, margin_m: float = 150.0, cell_m: float = 4.0) -> H
     np.add.at(total, (index[:, 0], index[:, 1]), points[:, 2])
     np.add.at(weight, (index[:, 0], index[:, 1]), 1.0)
     surface = np.full(shape, float(points[:, 2].mean()))
-    for sigma in (128.0, 32.0, 8.0, 2.0):
+    for sigma in (128.0, 32.0, 8.0, 2.0, 1.0):
         smooth_total, smooth_weight = (gaussian_filter(a, sigma, mode="constant") for a in (total, weight))
         trust = smooth_weight / (smooth_weight + 1e-3 / sigma)
         surface = (1 - trust) * surface + trust * smooth_total / np.maximum(smooth_weight, 1e-12)

@@ -14,6 +14,7 @@ from hybridlio.simulation.ground import CAMBER, Ground, Height, land_along, wave
 from hybridlio.simulation.layout import lay_out
 from hybridlio.simulation.path import SmoothPath
 from hybridlio.simulation.pose_files import path_along, read_lidar_poses
+from hybridlio.simulation.revisits import level_revisits
 from hybridlio.simulation.rig import LIDAR_HEIGHT_M, SCAN_RATE_HZ, T_IMU_LIDAR
 from hybridlio.simulation.roads import LANE_OFFSET_M, STEP_M, Road, drive, generate_centreline
 from hybridlio.simulation.traffic import MovingCar, traffic
@@ -65,7 +66,9 @@ def _along_generated_road(config: SimulationConfig) -> Drive:
     rng = np.random.default_rng([config.seed, 1])
     seconds = config.seconds or DEFAULT_SECONDS
     length = config.length_m or 1.1 * config.speed_m_s * (seconds + 2 * _MARGIN_S)
-    centreline = generate_centreline(rng, length + _BEHIND_M + _AHEAD_M, config.scene, config.loops)
+    # bends and stops halve the speed; two round trips and more fit in any drive of a minute
+    round_trip = float(np.clip(0.25 * length, 220.0, 700.0)) if config.loops else None
+    centreline = generate_centreline(rng, length + _BEHIND_M + _AHEAD_M, config.scene, round_trip)
     flat = 0.3 if config.scene == "corridor" else 1.0
     land = waves(np.random.default_rng([config.seed, 3]), 12, (90.0, 500.0), 0.025 * flat)
     ground = _ground(land, centreline, config)
@@ -83,7 +86,7 @@ def _along_generated_road(config: SimulationConfig) -> Drive:
 
 
 def _along_poses(config: SimulationConfig) -> Drive:
-    lidar_poses = read_lidar_poses(config.require_poses(), config.poses_frame)
+    lidar_poses = level_revisits(read_lidar_poses(config.require_poses(), config.poses_frame))
     path = path_along(lidar_poses)
     seconds = len(lidar_poses) / SCAN_RATE_HZ
     if config.length_m is not None:

@@ -62,9 +62,11 @@ class Road:
         return np.asarray(self.curve(s) + normal * np.asarray(left_m)[..., None])
 
 
-def generate_centreline(rng: np.random.Generator, length_m: float, scene: Scene, loops: bool) -> Road:
-    """A road of ``length_m`` or more that starts at the origin; with ``loops`` it comes back to where it has been."""
-    corners = _loop_corners(rng, length_m) if loops else _open_corners(rng, length_m, scene)
+def generate_centreline(
+    rng: np.random.Generator, length_m: float, scene: Scene, round_trip_m: float | None = None
+) -> Road:
+    """A road of ``length_m`` or more that starts at the origin; back there after ``round_trip_m``, where given."""
+    corners = _loop_corners(rng, length_m, round_trip_m) if round_trip_m else _open_corners(rng, length_m, scene)
     corners = corners + rng.normal(0.0, 0.05, corners.shape)
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     even = np.arange(0.0, s[-1], STEP_M)
@@ -110,10 +112,9 @@ def _clear_of(points: list[Array], end: Array, clearance_m: float = 45.0) -> boo
     return bool(gap.min() > clearance_m)
 
 
-def _loop_corners(rng: np.random.Generator, length_m: float) -> Array:
+def _loop_corners(rng: np.random.Generator, length_m: float, round_trip_m: float) -> Array:
     """A walk over the streets round two blocks: once about both, then wherever junctions lead, never turning back."""
-    round_trip = float(np.clip(0.4 * length_m, 240.0, 800.0))
-    width, depth = round_trip * rng.uniform(0.14, 0.18), round_trip * rng.uniform(0.16, 0.2)
+    width, depth = round_trip_m * rng.uniform(0.14, 0.18), round_trip_m * rng.uniform(0.16, 0.2)
     grid = {(i, j): np.array([i * width, j * depth]) + rng.normal(0.0, 4.0, 2) for i in range(3) for j in range(2)}
     walk = [(0, 0), (1, 0), (2, 0), (2, 1), (1, 1), (0, 1), (0, 0), (1, 0)]
     angle = rng.uniform(-np.pi, np.pi)
