@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hybridlio.sensors import NS_PER_S, LidarModel, Scan
 from hybridlio.simulation.traffic import CAR_RADIUS_M, MovingCar, in_reach
-from hybridlio.simulation.world import Hits, World
+from hybridlio.simulation.world import Hits, RayScene
 
 Array = NDArray[np.float64]
 
@@ -49,18 +49,15 @@ def ray_pattern(model: LidarModel) -> RayPattern:
     return RayPattern(np.stack(parts, axis=-1).reshape(-1, 3), column, offsets)
 
 
-def first_hits(
-    world: World, cars: Sequence[MovingCar], pattern: RayPattern, poses: Array, times_s: Array, anchor: Array
-) -> Hits:
+def first_hits(scene: RayScene, cars: Sequence[MovingCar], pattern: RayPattern, poses: Array, times_s: Array) -> Hits:
     """Exact first hits of a sweep.
 
     Args:
-        world: everything that stands still.
+        scene: everything that stands still, in world coordinates.
         cars: everything that moves.
         pattern: the rays.
         poses: ``(columns, 4, 4)`` ``T_world_lidar`` at each azimuth step, or ``(1, 4, 4)`` for an instant.
         times_s: ``(columns,)`` or ``(1,)`` the times of these poses.
-        anchor: ``(3,)`` the position that decides which part of the world is in sight.
     """
     instant = len(poses) == 1
     if instant:
@@ -70,9 +67,9 @@ def first_hits(
         shape = (-1, len(poses), 3)
         directions = np.einsum("cij,bcj->bci", poses[:, :3, :3], pattern.directions.reshape(shape)).reshape(-1, 3)
         origins = np.tile(poses[:, :3, 3], (len(directions) // len(poses), 1))
-    hits = world.scene_around(anchor).cast(origins, directions)
+    hits = scene.cast(origins, directions)
     middle = len(times_s) // 2
-    for car in in_reach(list(cars), anchor, float(times_s[middle])):
+    for car in in_reach(cars, poses[middle, :3, 3], float(times_s[middle])):
         column = np.zeros(len(directions), np.int64) if instant else pattern.column
         hits = _with_car(hits, car, origins, directions, column, times_s)
     return hits

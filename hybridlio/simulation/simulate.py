@@ -139,8 +139,8 @@ def scan_at(drive: Drive, index: int, pattern: RayPattern, config: SimulationCon
     if config.motion_distortion:
         offsets_s = pattern.column_offset_ns / NS_PER_S
     poses = drive.path.poses(stamp_s + offsets_s) @ T_IMU_LIDAR
-    anchor = drive.path.poses(stamp_s)[0, :3, 3]
-    hits = first_hits(drive.world, drive.cars, pattern, poses, stamp_s + offsets_s, anchor)
+    scene = drive.world.scene_around(drive.path.poses(stamp_s)[0, :3, 3])
+    hits = first_hits(scene, drive.cars, pattern, poses, stamp_s + offsets_s)
     rng = np.random.default_rng([config.seed, 9, index])
     stamp_ns = START_NS + round(stamp_s * NS_PER_S)
     return measure(hits, pattern, config.lidar_model, stamp_ns, config.motion_distortion, rng)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,7 +92,7 @@ def _keeps_clear(motion: CubicSpline, times_s: Array, ego_xy: Array) -> bool:
     return bool(gap.min() > _CLEARANCE_M)
 
 
-def in_reach(cars: list[MovingCar], position: Array, time_s: float) -> list[MovingCar]:
+def in_reach(cars: Sequence[MovingCar], position: Array, time_s: float) -> list[MovingCar]:
     """The cars that are near enough to be seen from ``position`` ``(3,)``."""
     near = []
     for car in cars:
