@@ -34,12 +34,12 @@ class DriveFolders:
 
     @property
     def date(self) -> Path:
-        """Calibration, and beside the drive the truth and the settings."""
+        """Both drives' parent, with the calibration."""
         return self.root / DATE
 
     @property
     def sync(self) -> Path:
-        """Scans, and navigation rows at 10 Hz."""
+        """Scans, navigation rows at 10 Hz, the truth and the settings."""
         return self.date / f"{DATE}_drive_{self.number:04d}_sync"
 
     @property

@@ -59,4 +59,4 @@ def _tilts(ahead: Array, slope: Array) -> Array:
     """Rotations ``(N, 3, 3)`` in world that raise the direction ``ahead`` ``(N, 2)`` by ``slope``."""
     length = np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
     left = np.column_stack([-ahead[:, 1], ahead[:, 0], np.zeros(len(ahead))]) / length
-    return Rotation.from_rotvec(-np.arctan(slope)[:, None] * left).as_matrix().reshape(-1, 3, 3)
+    return np.asarray(Rotation.from_rotvec(-np.arctan(slope)[:, None] * left).as_matrix())

@@ -55,20 +55,23 @@ def simulate(out: Path, config: SimulationConfig, progress: Progress | None = No
         rows (``…_extract``).
 
     Raises:
-        DataError: ``out`` holds a drive with other settings, or the pose file is malformed.
+        DataError: ``out`` holds a drive of this seed with other settings, or the pose file is malformed.
         ConfigError: there is no such pose file.
     """
     description = describe(config)
     done = DriveFolders(Path(out), config.seed % 10000)
-    if done.date.exists():
-        _require_same(done.date, description)
+    if done.sync.exists():
+        _require_same(done.sync, description)
         return done.sync
     partial = DriveFolders(Path(out) / f".partial-{_fingerprint(description)}", done.number)
     drive = plan(config)
     _write_measurements(partial, drive, config)
     _write_scans(partial, drive, config, progress)
     write_whole(partial.sync / "simulation.json", json.dumps(description, indent=2) + "\n")
-    partial.date.rename(done.date)
+    write_calibration(done.date)
+    for source, target in ((partial.extract, done.extract), (partial.sync, done.sync)):
+        shutil.rmtree(target, ignore_errors=True)
+        source.rename(target)
     shutil.rmtree(partial.root)
     return done.sync
 
@@ -88,14 +91,14 @@ def _fingerprint(description: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def _require_same(date: Path, description: dict[str, Any]) -> None:
-    path = next(date.glob("*_sync/simulation.json"), date)
+def _require_same(drive: Path, description: dict[str, Any]) -> None:
+    path = drive / "simulation.json"
     try:
         found = json.loads(path.read_text())
     except (OSError, ValueError):
-        raise DataError(f"{date} is there already and is no simulated drive; choose another folder") from None
+        raise DataError(f"{drive} is there already and is no simulated drive; choose another folder") from None
     if found != description:
-        raise DataError(f"{path} says that another drive is there (other settings); choose another folder")
+        raise DataError(f"{path} says that another drive of this seed is there; choose another folder or seed")
 
 
 def _write_measurements(folders: DriveFolders, drive: Drive, config: SimulationConfig) -> None:
@@ -109,7 +112,6 @@ def _write_measurements(folders: DriveFolders, drive: Drive, config: SimulationC
     gyro, accel = add_noise(*ideal_imu(drive.path, times), config.imu_noise, IMU_RATE_HZ, rng)
     origin = drive.path.poses(0.0)[0, :3, 3]
     rows = oxts_rows(drive.path.motion(times), origin, gyro, accel)
-    write_calibration(folders.date)
     write_oxts(folders.extract / "oxts", START_NS + ticks * (NS_PER_S // IMU_RATE_HZ), rows)
     write_oxts(folders.sync / "oxts", scan_stamps, rows[lead : len(rows) - lead : per_scan])
     half_turn = round(NS_PER_S / config.lidar_model.rate_hz / 2) if config.motion_distortion else 0
