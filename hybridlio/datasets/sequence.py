@@ -87,7 +87,8 @@ class Sequence:
         first, last = (
             bisect_right(self.gps, t, key=lambda fix: fix.stamp_ns) for t in (start if k else start - 1, end)
         )
-        return Frame(k, self.load_scan(k), self.imu.between(start, end), self.gps[first:last])
+        imu = self.imu.between(start, end)
+        return Frame(k, self.load_scan(k), imu, self.gps[first:last], self.calibration, self.imu_noise)
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))
