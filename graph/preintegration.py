@@ -1,4 +1,4 @@
-"""IMU preintegration (Forster et al., "On-Manifold Preintegration", TRO 2017) by GTSAM, and the initial pose from it."""
+"""IMU preintegration (Forster et al., "On-Manifold Preintegration", TRO 2017) by GTSAM; the initial pose from it."""
 
 from __future__ import annotations
 
@@ -105,14 +105,18 @@ class Preintegration:
     def predict(self, frame: Frame, state: State) -> RelativePose:
         """Integrate the frame's samples from ``state``.
 
+        Where samples are missing it carries the state's velocity on, and says so in ``ok`` and the covariance.
+
         Raises:
-            DataError: the frame has no IMU samples that span the time since the last scan.
+            DataError: the recording has no IMU samples at all.
         """
-        if not covers(frame.imu, state.stamp_ns, frame.scan.stamp_ns):
+        if not state.has_imu:
             raise DataError(
-                f"frame {frame.index}: the IMU samples do not span the time since the last scan; "
-                "choose another initial pose, such as constant-velocity, or a recording with IMU"
+                f"frame {frame.index}: no IMU samples; choose another initial pose, such as constant-velocity, "
+                "or a recording with IMU"
             )
+        if not covers(frame.imu, state.stamp_ns, frame.scan.stamp_ns):
+            return self._coast(frame, state)
         step, covariance = predict_step(preintegrate(frame.imu, state, self._noise), state)
         T_lidar_imu = se3.inverse(self._T_imu_lidar)
         return RelativePose(
@@ -120,6 +124,20 @@ class Preintegration:
             se3.rotate_covariance(covariance, T_lidar_imu),
             source=self.name,
             from_imu=True,
+        )
+
+    def _coast(self, frame: Frame, state: State) -> RelativePose:
+        """Straight on at the state's velocity, as unsure as a vehicle is free to accelerate and turn."""
+        dt_s = (frame.scan.stamp_ns - state.stamp_ns) / NS_PER_S
+        step = se3.make(np.eye(3), state.T_world_imu[:3, :3].T @ state.velocity_m_s * dt_s)
+        sigmas = np.r_[np.full(3, _LARGEST_RATE_RAD_S * dt_s), np.full(3, _LARGEST_ACCELERATION_M_S2 * dt_s**2 / 2)]
+        covariance = np.diag(sigmas**2) + np.pad(state.covariance[6:9, 6:9] * dt_s**2, (3, 0))
+        T_lidar_imu = se3.inverse(self._T_imu_lidar)
+        return RelativePose(
+            T_lidar_imu @ step @ self._T_imu_lidar,
+            se3.rotate_covariance(covariance, T_lidar_imu),
+            source=self.name,
+            ok=False,
         )
 
     def correct(self, frame: Frame, estimate: RelativePose) -> None:

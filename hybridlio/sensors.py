@@ -38,15 +38,16 @@ class Scan:
         if points.ndim != 2 or points.shape[1] != 3:
             raise DataError(f"scan at {self.stamp_ns} ns: points must be (N, 3), got {points.shape}")
         columns = {"intensity": (self.intensity, np.float32), "time_offsets_ns": (self.time_offsets_ns, np.int64)}
-        finite = np.isfinite(points).all(axis=1)
+        all_finite = bool(np.isfinite(points).all())
+        finite = np.ones(len(points), dtype=bool) if all_finite else np.isfinite(points).all(axis=1)
         for name, (values, dtype) in columns.items():
             if values is None:
                 continue
             values = np.asarray(values, dtype=dtype)
             if values.shape != points.shape[:1]:
                 raise DataError(f"scan at {self.stamp_ns} ns: {name} must be ({len(points)},), got {values.shape}")
-            object.__setattr__(self, name, values if finite.all() else values[finite])
-        object.__setattr__(self, "points", points if finite.all() else points[finite])
+            object.__setattr__(self, name, values if all_finite else values[finite])
+        object.__setattr__(self, "points", points if all_finite else points[finite])
 
     def __len__(self) -> int:
         return len(self.points)
@@ -125,6 +126,8 @@ class ImuNoise:
     The accelerometer and gyroscope densities are white noise per root hertz, the bias walks random walks, and the two
     ``*_bias_sigma`` say how far the biases may be from zero at power-up.
     """
+
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
 
     gyro_rad_s_sqrt_hz: float = 1.0e-3
     accel_m_s2_sqrt_hz: float = 1.0e-2
@@ -220,9 +223,13 @@ class Frame:
         imu: samples from the previous scan's stamp to this one's, interpolated at both; for the first frame those
             before it, possibly none.
         gps: fixes in that time.
+        calibration: the extrinsics; needed where there are IMU samples.
+        imu_noise: the IMU's noise, where the recording says it.
     """
 
     index: int
     scan: Scan
     imu: ImuSamples = field(default_factory=ImuSamples.empty)
     gps: tuple[GpsFix, ...] = ()
+    calibration: Calibration | None = None
+    imu_noise: ImuNoise | None = None

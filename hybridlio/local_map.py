@@ -1,0 +1,66 @@
+"""The local map: recent keyframes' points with normals in one voxel map, as a surface to register to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import small_gicp
+
+from hybridlio import se3
+from hybridlio.estimates import Array
+from hybridlio.registration import Surface
+
+
+@dataclass(frozen=True)
+class LocalMapSettings:
+    """How the map is kept.
+
+    Attributes:
+        keyframe_m, keyframe_deg: a scan this far from the last keyframe becomes one.
+        voxel_m: cells of the map; each holds up to ten points at least 10 cm apart.
+        horizon_keyframes: a cell that so many keyframes have not touched is forgotten.
+        radius_m: points farther from the keyframe are left out of the surface.
+        neighbours: points to fit a plane to for a normal.
+        threads: for normals and trees.
+    """
+
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
+
+    keyframe_m: float = 1.0
+    keyframe_deg: float = 10.0
+    voxel_m: float = 1.0
+    horizon_keyframes: int = 60
+    radius_m: float = 100.0
+    neighbours: int = 10
+    threads: int = 2
+
+
+class LocalMap:
+    """Starts empty, in the frame of the first keyframe."""
+
+    def __init__(self, settings: LocalMapSettings) -> None:
+        self._settings = settings
+        self._cells = small_gicp.IncrementalVoxelMapNormal(settings.voxel_m)
+        self._cells.set_lru(settings.horizon_keyframes, max(1, settings.horizon_keyframes // 6))
+        self._keyframe: Array | None = None
+        self.surface: Surface | None = None
+
+    def wants(self, T_map_lidar: Array) -> bool:
+        """Whether a scan at this pose should become a keyframe."""
+        if self._keyframe is None:
+            return True
+        step = se3.between(self._keyframe, T_map_lidar)
+        angle_deg = np.rad2deg(np.arccos(np.clip((np.trace(step[:3, :3]) - 1) / 2, -1.0, 1.0)))
+        return bool(np.linalg.norm(step[:3, 3]) > self._settings.keyframe_m or angle_deg > self._settings.keyframe_deg)
+
+    def insert(self, points: Array, T_map_lidar: Array) -> None:
+        """Take a scan's points ``(N, 3)``, lidar frame, as a keyframe at this pose and renew the surface."""
+        cloud = small_gicp.PointCloud(points)
+        small_gicp.estimate_normals(cloud, None, self._settings.neighbours, self._settings.threads)
+        self._cells.insert(cloud, T_map_lidar)
+        self._keyframe = T_map_lidar
+        points, normals = self._cells.voxel_points()[:, :3], self._cells.voxel_normals()[:, :3]
+        near = ((points - T_map_lidar[:3, 3]) ** 2).sum(axis=1) < self._settings.radius_m**2
+        near &= np.abs(normals).sum(axis=1) > 0.5  # small_gicp leaves a normal zero where there are too few neighbours
+        self.surface = Surface(points[near], normals[near], self._settings.threads)

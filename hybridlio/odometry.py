@@ -1,0 +1,201 @@
+"""One step of odometry, from a frame to a pose with covariance: initial pose, residual, graph."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hybridlio import se3
+from hybridlio.config import Config
+from hybridlio.deskew import constant_twist, deskew
+from hybridlio.errors import ConfigError, DataError, EstimationError
+from hybridlio.estimates import Array, Backend, InitialPoseSource, RelativePose, ResidualSource, State
+from hybridlio.record import Record
+from hybridlio.sensors import Calibration, Frame, GpsFix, ImuNoise, ImuSamples
+from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES, Setup, choose
+from hybridlio.startup import start_state
+from hybridlio.trajectory import Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """One step's outcome.
+
+    Attributes:
+        index, stamp_ns: the frame's.
+        pose: ``(4, 4)`` lidar pose in the first scan's frame.
+        covariance: ``(6, 6)`` of a right perturbation of ``pose``, rad² and m², rotation first.
+        initial: the initial relative pose ``T̂``; None at the first frame.
+        relative: the relative pose ``T = δT·T̂`` after the residual source; None at the first frame.
+        step: the relative pose as the backend sees it after all; None at the first frame.
+        seconds: time spent, by stage.
+    """
+
+    index: int
+    stamp_ns: int
+    pose: Array
+    covariance: Array
+    initial: RelativePose | None
+    relative: RelativePose | None
+    step: RelativePose | None
+    seconds: dict[str, float]
+
+    @property
+    def residual(self) -> Array:
+        """``δT`` ``(4, 4)``, by which the residual source moved the initial pose; the identity at the first frame."""
+        if self.initial is None or self.relative is None:
+            return np.eye(4)
+        return np.asarray(self.relative.pose @ se3.inverse(self.initial.pose))
+
+
+class Odometry:
+    """Estimates poses frame by frame, in order.
+
+    Args:
+        initial_pose: name or object of an initial-pose source.
+        residual: name or object of a residual source.
+        backend: name or object of a backend.
+        config: settings; names given as arguments go before those in it.
+
+    Raises:
+        ConfigError: a name is unknown.
+    """
+
+    def __init__(
+        self,
+        initial_pose: str | InitialPoseSource | None = None,
+        residual: str | ResidualSource | None = None,
+        backend: str | Backend | None = None,
+        config: Config | None = None,
+    ) -> None:
+        config = config or Config()
+        self._config = config
+        self._chosen = (initial_pose or config.initial_pose, residual or config.residual, backend or config.backend)
+        kinds = (("initial pose", INITIAL_POSE_SOURCES), ("residual", RESIDUAL_SOURCES), ("backend", BACKENDS))
+        for choice, (kind, known) in zip(self._chosen, kinds, strict=True):
+            if isinstance(choice, str):
+                choose(kind, choice, known)
+        self._state: State | None = None
+        self._first: Frame | None = None
+        self._estimates: list[Estimate] = []
+        self._imu: list[ImuSamples] = []
+        self._gps: list[GpsFix] = []
+
+    def step(self, frame: Frame) -> Estimate:
+        """Estimate the frame's pose.
+
+        Raises:
+            DataError: frames out of order, a first scan without points, or IMU samples without extrinsics.
+        """
+        self._gps.extend(frame.gps)
+        if self._first is None:
+            return self._keep(self._begin(frame))
+        if frame.scan.stamp_ns <= self._estimates[-1].stamp_ns:
+            raise DataError(f"frame {frame.index}: its stamp is not after the last frame's; give frames in order")
+        state = self._state if self._state is not None else self._start(frame)
+        self._imu.append(frame.imu)
+        seconds: dict[str, float] = {}
+        with _timed(seconds, "initial pose"):
+            initial = self._initial_pose.predict(frame, state)
+        with _timed(seconds, "motion compensation"):
+            motion = constant_twist(initial.pose, state.stamp_ns, frame.scan.stamp_ns)
+            frame = replace(frame, scan=deskew(frame.scan, motion))
+        with _timed(seconds, "residual"):
+            relative = self._residual.refine(frame, initial)
+        with _timed(seconds, "graph"):
+            self._state = self._backend.update(frame, relative)
+            step = self._backend.last_step()
+        self._initial_pose.correct(frame, step)
+        pose, covariance = self._lidar_pose(self._state)
+        return self._keep(
+            Estimate(frame.index, frame.scan.stamp_ns, pose, covariance, initial, relative, step, seconds)
+        )  # fmt: skip
+
+    def record(self) -> Record:
+        """Everything so far, for smoothing and for files.
+
+        Raises:
+            EstimationError: there are fewer than two frames yet.
+        """
+        if self._state is None:
+            raise EstimationError("a record needs at least two frames; call step for more")
+        steps = self._estimates[1:]
+        stamps = np.array([e.stamp_ns for e in self._estimates])
+        online = Trajectory(
+            stamps, np.array([e.pose for e in self._estimates]), np.array([e.covariance for e in self._estimates])
+        )
+        return Record(
+            online=online,
+            initial=tuple(e.initial for e in steps if e.initial is not None),
+            relative=tuple(e.relative for e in steps if e.relative is not None),
+            imu=_joined(self._imu),
+            gps=tuple(self._gps),
+            start=self._start_state,
+            calibration=self._setup.calibration,
+            imu_noise=self._setup.imu_noise,
+        )
+
+    def _begin(self, frame: Frame) -> Estimate:
+        """Take the first frame: it defines the origin."""
+        self._setup = _setup(self._config, frame)
+        initial_pose, residual, backend = self._chosen
+        setup = self._setup
+        self._initial_pose = (
+            INITIAL_POSE_SOURCES[initial_pose](setup) if isinstance(initial_pose, str) else initial_pose
+        )
+        self._residual = RESIDUAL_SOURCES[residual](setup) if isinstance(residual, str) else residual
+        self._backend = BACKENDS[backend](setup) if isinstance(backend, str) else backend
+        self._residual.start(frame)
+        self._first = frame
+        covariance = np.eye(6) * 1e-12  # it defines the frame; GTSAM and files want it positive definite
+        return Estimate(frame.index, frame.scan.stamp_ns, np.eye(4), covariance, None, None, None, {})
+
+    def _start(self, frame: Frame) -> State:
+        """Start the graph at the first frame, with the second one's samples to tell where down is."""
+        first = self._first
+        assert first is not None
+        near = ImuSamples.empty() if not len(first.imu) else first.imu.between(
+            first.scan.stamp_ns - 10**9, first.scan.stamp_ns
+        )  # fmt: skip
+        self._start_state = start_state(first.scan.stamp_ns, _joined([near, frame.imu]), self._setup.imu_noise)
+        self._backend.start(self._start_state)
+        return self._start_state
+
+    def _lidar_pose(self, state: State) -> tuple[Array, Array]:
+        T_imu_lidar = self._setup.calibration.T_imu_lidar
+        T_lidar_imu = se3.inverse(T_imu_lidar)
+        covariance = se3.rotate_covariance(state.covariance[:6, :6], T_lidar_imu)
+        return T_lidar_imu @ state.T_world_imu @ T_imu_lidar, covariance
+
+    def _keep(self, estimate: Estimate) -> Estimate:
+        self._estimates.append(estimate)
+        return estimate
+
+
+def _setup(config: Config, frame: Frame) -> Setup:
+    if frame.calibration is None and len(frame.imu):
+        raise ConfigError("the frames carry IMU samples but no calibration: set Frame.calibration (T_imu_lidar)")
+    noise = config.imu_noise or frame.imu_noise or ImuNoise()
+    return Setup(config, frame.calibration or Calibration(), noise)
+
+
+def _joined(parts: list[ImuSamples]) -> ImuSamples:
+    """Samples of consecutive intervals as one; those on a common border once."""
+    parts = [part for part in parts if len(part)]
+    if not parts:
+        return ImuSamples.empty()
+    stamps, first = np.unique(np.concatenate([part.stamps_ns for part in parts]), return_index=True)
+    gyro = np.concatenate([part.gyro_rad_s for part in parts])[first]
+    accel = np.concatenate([part.accel_m_s2 for part in parts])[first]
+    return ImuSamples(stamps, gyro, accel)
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    seconds[stage] = time.perf_counter() - start

@@ -1,0 +1,126 @@
+"""What a run leaves for smoothing: every step's relative poses, inertial samples and fixes, and where it started."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridlio.errors import DataError
+from hybridlio.estimates import RelativePose, State
+from hybridlio.files import writing_whole
+from hybridlio.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
+from hybridlio.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """A run, ready to be smoothed.
+
+    Attributes:
+        online: the backend's estimate at each of ``N`` scans, with covariances.
+        initial: ``N-1`` initial relative poses.
+        relative: ``N-1`` relative poses after the residual source.
+        imu: all samples from the first scan to the last; empty where there were none.
+        gps: the fixes in that time.
+        start: the prior state at the first scan.
+        calibration: the extrinsics.
+        imu_noise: what the IMU was taken to be worth.
+    """
+
+    online: Trajectory
+    initial: tuple[RelativePose, ...]
+    relative: tuple[RelativePose, ...]
+    imu: ImuSamples
+    gps: tuple[GpsFix, ...]
+    start: State
+    calibration: Calibration
+    imu_noise: ImuNoise
+
+    def save(self, path: Path) -> None:
+        """Write everything to one ``.npz`` file of plain arrays."""
+        with writing_whole(path) as part, part.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **_to_arrays(self))
+
+    @classmethod
+    def load(cls, path: Path) -> Record:
+        """Read a record written by :meth:`save`; never executes anything in the file.
+
+        Raises:
+            DataError: no such file, not a record, or of another format version.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                return _from_arrays({name: file[name] for name in file.files})
+        except (OSError, ValueError, KeyError, EOFError) as error:
+            raise DataError(f"{path}: not a record of a run ({error}); run `hybridlio odometry` again") from error
+
+
+def _relative_arrays(prefix: str, steps: tuple[RelativePose, ...]) -> dict[str, Any]:
+    return {
+        f"{prefix}_poses": np.array([s.pose for s in steps]).reshape(-1, 4, 4),
+        f"{prefix}_covariances": np.array([s.covariance for s in steps]).reshape(-1, 6, 6),
+        f"{prefix}_sources": np.array([s.source for s in steps], dtype=np.str_),
+        f"{prefix}_ok": np.array([s.ok for s in steps], dtype=bool),
+        f"{prefix}_from_imu": np.array([s.from_imu for s in steps], dtype=bool),
+        f"{prefix}_degenerate_step": np.array(
+            [k for k, s in enumerate(steps) for _ in range(len(s.degenerate))], dtype=np.int64
+        ),
+        f"{prefix}_degenerate": np.concatenate([s.degenerate for s in steps] + [np.empty((0, 6))]),
+    }
+
+
+def _relatives(prefix: str, arrays: Mapping[str, Any]) -> tuple[RelativePose, ...]:
+    at, directions = arrays[f"{prefix}_degenerate_step"], arrays[f"{prefix}_degenerate"]
+    columns = (arrays[f"{prefix}_{name}"] for name in ("poses", "covariances", "sources", "ok", "from_imu"))
+    return tuple(
+        RelativePose(pose, covariance, str(source), directions[at == k], bool(ok), bool(from_imu))
+        for k, (pose, covariance, source, ok, from_imu) in enumerate(zip(*columns, strict=True))
+    )
+
+
+def _to_arrays(record: Record) -> dict[str, Any]:
+    arrays: dict[str, Any] = {
+        "version": FORMAT_VERSION,
+        "stamps_ns": record.online.stamps_ns,
+        "online_poses": record.online.poses,
+        "online_covariances": record.online.covariances,
+        "imu_stamps_ns": record.imu.stamps_ns,
+        "gyro_rad_s": record.imu.gyro_rad_s,
+        "accel_m_s2": record.imu.accel_m_s2,
+        "gps_stamps_ns": np.array([fix.stamp_ns for fix in record.gps], dtype=np.int64),
+        "gps_positions_m": np.array([fix.position_m for fix in record.gps]).reshape(-1, 3),
+        "gps_covariances_m2": np.array([fix.covariance_m2 for fix in record.gps]).reshape(-1, 3, 3),
+        "T_imu_lidar": record.calibration.T_imu_lidar,
+        "imu_noise": np.array(list(asdict(record.imu_noise).values())),
+    }
+    if record.calibration.T_camera_lidar is not None:
+        arrays["T_camera_lidar"] = record.calibration.T_camera_lidar
+    arrays |= {f"start_{f.name}": getattr(record.start, f.name) for f in fields(State)}
+    return arrays | _relative_arrays("initial", record.initial) | _relative_arrays("relative", record.relative)
+
+
+def _from_arrays(arrays: Mapping[str, Any]) -> Record:
+    if int(arrays["version"]) != FORMAT_VERSION:
+        raise ValueError(f"format version {int(arrays['version'])}, this release reads {FORMAT_VERSION}")
+    start = {f.name: arrays[f"start_{f.name}"] for f in fields(State)}
+    start |= {"stamp_ns": int(start["stamp_ns"]), "has_imu": bool(start["has_imu"])}
+    gps = zip(arrays["gps_stamps_ns"], arrays["gps_positions_m"], arrays["gps_covariances_m2"], strict=True)
+    return Record(
+        online=Trajectory(arrays["stamps_ns"], arrays["online_poses"], arrays["online_covariances"]),
+        initial=_relatives("initial", arrays),
+        relative=_relatives("relative", arrays),
+        imu=ImuSamples(arrays["imu_stamps_ns"], arrays["gyro_rad_s"], arrays["accel_m_s2"]),
+        gps=tuple(GpsFix(int(stamp), position, covariance) for stamp, position, covariance in gps),
+        start=State(**start),
+        calibration=Calibration(arrays["T_imu_lidar"], arrays.get("T_camera_lidar")),
+        imu_noise=ImuNoise(*map(float, arrays["imu_noise"])),
+    )

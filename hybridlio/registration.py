@@ -1,0 +1,174 @@
+"""Point-to-plane registration of one scan to a surface, by robust Gauss-Newton steps.
+
+The cost is the unsupervised loss's first term (UnDeepLIO §3.3, ``L_po2pl``) in a robust squared form: with it the
+residual network is trained, and its Hessian weighs the between-factor. Correspondences are nearest neighbours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import small_gicp
+
+from hybridlio import se3
+from hybridlio.estimates import Array
+
+_ROTATION_CONVERGED_RAD = 2e-5
+_TRANSLATION_CONVERGED_M = 3e-4
+# Normals of a surface are off by a few hundredths of a radian, so that points on one plane alone seem to say something
+# of motion along it: this much of a point's information, per point, is that noise.
+NORMAL_NOISE = 2e-3
+
+
+@dataclass(frozen=True)
+class RegistrationSettings:
+    """How scans are registered.
+
+    Attributes:
+        kernel_m: residual at which the Geman-McClure kernel has pushed a point's weight down to a quarter.
+        max_distance_m: nearest neighbours farther away do not count.
+        max_iterations: Gauss-Newton steps.
+        threads: for the nearest-neighbour search.
+    """
+
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
+
+    kernel_m: float = 0.1
+    max_distance_m: float = 1.0
+    max_iterations: int = 15
+    threads: int = 2
+
+
+class Surface:
+    """Points with normals and a KD-tree over them: what a scan is registered to.
+
+    Args:
+        points: ``(M, 3)`` metres.
+        normals: ``(M, 3)`` unit vectors.
+        threads: for building the tree.
+    """
+
+    def __init__(self, points: Array, normals: Array, threads: int = 2) -> None:
+        self.points = points
+        self.normals = normals
+        self._tree = small_gicp.KdTree(points, threads)
+
+    def nearest(self, queries: Array, threads: int) -> tuple[Array, Array]:
+        """Index ``(N,)`` and squared distance ``(N,)`` of each query's nearest point."""
+        index, distance2 = self._tree.batch_knn_search(queries, 1, threads)
+        return index[:, 0].astype(np.int64), distance2[:, 0]
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """The outcome.
+
+    Attributes:
+        pose: ``(4, 4)``; maps the scan's points to the surface's frame.
+        hessian: ``(6, 6)`` of half the weighted squared residuals at the answer, right perturbation, 1/m² units removed
+            (multiply by 1/σ² for information).
+        sigma_m: robust standard deviation of the residuals.
+        matched: share of points with a neighbour near enough.
+        cost: mean robust cost over all points, between 0 and 1; unmatched points cost 1.
+        iterations: steps taken.
+        converged: whether the last step was small.
+    """
+
+    pose: Array
+    hessian: Array
+    sigma_m: float
+    matched: float
+    cost: float
+    iterations: int
+    converged: bool
+
+
+@dataclass(frozen=True, eq=False)
+class _Linearisation:
+    hessian: Array
+    gradient: Array
+    residuals: Array
+    weights: Array
+
+
+def _linearise(
+    surface: Surface, source: Array, pose: Array, kernel_m: float, max_m: float, threads: int
+) -> _Linearisation:
+    moved = source @ pose[:3, :3].T + pose[:3, 3]
+    index, distance2 = surface.nearest(moved, threads)
+    near = distance2 < max_m**2
+    index = index[near]
+    normals = surface.normals[index]
+    residuals = np.einsum("ij,ij->i", moved[near] - surface.points[index], normals)
+    weights = (kernel_m**2 / (kernel_m**2 + residuals**2)) ** 2
+    normals_in_scan = normals @ pose[:3, :3]
+    J = np.hstack([np.cross(source[near], normals_in_scan), normals_in_scan])
+    weighted = J * weights[:, None]
+    return _Linearisation(weighted.T @ J, weighted.T @ residuals, residuals, weights)
+
+
+def register(
+    surface: Surface, source: Array, initial: Array, settings: RegistrationSettings, kernel_start_m: float = 0.0
+) -> Registration:
+    """Find the pose that lays ``source`` on ``surface``.
+
+    Directions that the points hardly constrain (:func:`degenerate_directions`) stay as in ``initial``
+    (Zhang, Kaess, Singh, "On degeneracy of optimization-based state estimation problems", ICRA 2016).
+
+    Args:
+        surface: points with normals.
+        source: ``(N, 3)`` points of the scan, metres.
+        initial: ``(4, 4)`` pose to start from.
+        settings: kernel, distances, limits.
+        kernel_start_m: a wider kernel to begin with, halved at every step; for an uncertain ``initial``.
+    """
+    pose, kernel, converged, iterations = initial, max(settings.kernel_m, kernel_start_m), False, 0
+    while not converged and iterations < settings.max_iterations:
+        iterations += 1
+        reach = max(settings.max_distance_m, 3 * kernel)
+        system = _linearise(surface, source, pose, kernel, reach, settings.threads)
+        step = _solve(system)
+        pose = pose @ se3.exp(step)
+        small = np.abs(step[:3]).max() < _ROTATION_CONVERGED_RAD and np.abs(step[3:]).max() < _TRANSLATION_CONVERGED_M
+        converged = bool(small and kernel == settings.kernel_m)
+        kernel = max(settings.kernel_m, kernel / 2)
+    return _summary(system, len(source), settings, se3.orthonormalise(pose), iterations, converged)
+
+
+def scaled_spectrum(hessian: Array) -> tuple[Array, Array, Array]:
+    """Eigenvalues ``(6,)``, eigenvectors ``(6, 6)`` as columns, and the scaling ``(6,)`` that makes them comparable.
+
+    Rotations are measured in metres at the points' mean lever arm, so that all six directions have one unit.
+    """
+    lever = np.sqrt(max(np.trace(hessian[:3, :3]), 1e-12) / max(np.trace(hessian[3:, 3:]), 1e-12))
+    scale = np.r_[np.full(3, 1 / lever), np.ones(3)]
+    values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
+    return values, vectors, scale
+
+
+def degenerate_directions(hessian: Array) -> Array:
+    """``(D, 6)`` unit tangent directions along which the points say no more than the noise of their normals."""
+    values, vectors, scale = scaled_spectrum(hessian)
+    weak = values < 3 * NORMAL_NOISE * np.trace(hessian[3:, 3:])
+    directions = (vectors[:, weak] * scale[:, None]).T
+    return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+
+
+def _solve(system: _Linearisation) -> Array:
+    if len(system.residuals) < 6:
+        return np.zeros(6)
+    values, vectors, scale = scaled_spectrum(system.hessian)
+    strong = values >= 3 * NORMAL_NOISE * np.trace(system.hessian[3:, 3:])
+    inverse = np.where(strong, 1 / np.maximum(values, 1e-12), 0.0)
+    return np.asarray(-scale * (vectors @ (inverse * (vectors.T @ (scale * system.gradient)))))
+
+
+def _summary(
+    system: _Linearisation, points: int, settings: RegistrationSettings, pose: Array, iterations: int, converged: bool
+) -> Registration:
+    r2 = system.residuals**2
+    cost = float((r2 / (settings.kernel_m**2 + r2)).sum() + points - len(r2)) / max(points, 1)
+    weight = max(float(system.weights.sum()), 1e-12)
+    sigma = float(np.sqrt((system.weights * r2).sum() / weight))
+    return Registration(pose, system.hessian, sigma, len(r2) / max(points, 1), cost, iterations, converged)

@@ -1,0 +1,173 @@
+"""The classical residual source: registration of each scan to the last one, or to a map of recent keyframes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import small_gicp
+
+from hybridlio import se3
+from hybridlio.errors import DataError
+from hybridlio.estimates import Array, RelativePose
+from hybridlio.local_map import LocalMap, LocalMapSettings
+from hybridlio.registration import (
+    NORMAL_NOISE,
+    Registration,
+    RegistrationSettings,
+    degenerate_directions,
+    register,
+    scaled_spectrum,
+)
+from hybridlio.sensors import NS_PER_S, Frame, Scan
+
+
+@dataclass(frozen=True)
+class ScanMatchingSettings:
+    """How scans are matched.
+
+    Attributes:
+        target: ``local-map`` of recent keyframes, or the ``last-scan`` alone.
+        min_range_m, max_range_m: points outside are not used.
+        map_voxel_m: side of the voxels that thin a scan for the map.
+        source_voxel_m: the same for the points that are registered.
+        min_points: with fewer points a scan is bridged by the initial pose.
+        min_matched: with a smaller share of points matched, too.
+        covariance_scale: how much larger the covariance is than independent residuals would make it; points on one
+            surface share its error.
+        start_speeds_m_s: forward speeds tried where the initial pose is unsure of the translation.
+    """
+
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
+
+    target: Literal["local-map", "last-scan"] = "local-map"
+    min_range_m: float = 2.0
+    max_range_m: float = 100.0
+    map_voxel_m: float = 0.4
+    source_voxel_m: float = 1.0
+    min_points: int = 200
+    min_matched: float = 0.3
+    covariance_scale: float = 10.0
+    start_speeds_m_s: tuple[float, ...] = (0.0, -5.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0)
+    registration: RegistrationSettings = field(default_factory=RegistrationSettings)
+    local_map: LocalMapSettings = field(default_factory=LocalMapSettings)
+
+
+_UNSURE_TRANSLATION_M = 0.5
+_FLOOR_SIGMAS = np.r_[np.full(3, 5e-5), np.full(3, 1e-3)]  # rad, m: no registration is better than this
+_UNKNOWN_SIGMA_M = 10.0  # along a degenerate direction
+
+
+class ScanMatching:
+    """Registers each scan from its initial pose. Its own path starts at the first scan and is never sent back to it."""
+
+    name = "scan-matching"
+
+    def __init__(self, settings: ScanMatchingSettings | None = None) -> None:
+        self._settings = settings or ScanMatchingSettings()
+        self._map = LocalMap(self._settings.local_map)
+        self._T_map_lidar: Array = np.eye(4)
+        self._stamp_ns = 0
+
+    def start(self, frame: Frame) -> None:
+        """Make the first scan the map.
+
+        Raises:
+            DataError: it has too few points.
+        """
+        cloud = self._thin(frame.scan)
+        if cloud.size() < self._settings.min_points:
+            raise DataError(
+                f"frame {frame.index}: only {cloud.size()} points between {self._settings.min_range_m} and "
+                f"{self._settings.max_range_m} m; start at a scan with at least {self._settings.min_points}"
+            )
+        self._map = LocalMap(self._settings.local_map)
+        self._T_map_lidar = np.eye(4)
+        self._map.insert(cloud.points()[:, :3], self._T_map_lidar)
+        self._stamp_ns = frame.scan.stamp_ns
+
+    def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:
+        """Register the scan; where that fails, return the initial pose marked as not ok."""
+        cloud = self._thin(frame.scan)
+        dt_s = (frame.scan.stamp_ns - self._stamp_ns) / NS_PER_S
+        self._stamp_ns = frame.scan.stamp_ns
+        found = self._register(cloud, initial, dt_s) if cloud.size() >= self._settings.min_points else None
+        if found is None or found.matched < self._settings.min_matched:
+            return self._bridge(initial, cloud.size(), found)
+        before, self._T_map_lidar = self._T_map_lidar, found.pose
+        if self._settings.target == "last-scan" or self._map.wants(found.pose):
+            self._keep(cloud)
+        return RelativePose(
+            se3.between(before, found.pose),
+            covariance_of(found, self._settings.covariance_scale),
+            source=self.name,
+            degenerate=degenerate_directions(found.hessian),
+            details=_details(found, cloud.size()),
+        )
+
+    def _thin(self, scan: Scan) -> small_gicp.PointCloud:
+        range2 = np.einsum("ij,ij->i", scan.points, scan.points)
+        near, far = self._settings.min_range_m, self._settings.max_range_m
+        points = scan.points[(range2 > near**2) & (range2 < far**2)].astype(np.float64)
+        # one thread: with more, small_gicp's result depends on their timing
+        return small_gicp.voxelgrid_sampling(points, self._settings.map_voxel_m)
+
+    def _keep(self, cloud: small_gicp.PointCloud) -> None:
+        if self._settings.target == "last-scan":
+            self._map = LocalMap(self._settings.local_map)
+        self._map.insert(cloud.points()[:, :3], self._T_map_lidar)
+
+    def _register(self, cloud: small_gicp.PointCloud, initial: RelativePose, dt_s: float) -> Registration | None:
+        surface = self._map.surface
+        if surface is None:
+            return None
+        source = small_gicp.voxelgrid_sampling(cloud, self._settings.source_voxel_m).points()[:, :3]
+        settings = self._settings.registration
+        sigma_m = float(np.sqrt(initial.covariance[3:, 3:].trace()))
+        starts = [initial.pose]
+        if sigma_m > _UNSURE_TRANSLATION_M:
+            starts = [_ahead(initial.pose, speed * dt_s) for speed in self._settings.start_speeds_m_s]
+        kernel_start_m = min(max(settings.kernel_m, sigma_m), 1.0)
+        tries = [register(surface, source, self._T_map_lidar @ T, settings, kernel_start_m) for T in starts]
+        return min(tries, key=lambda found: found.cost)
+
+    def _bridge(self, initial: RelativePose, points: int, found: Registration | None) -> RelativePose:
+        self._T_map_lidar = self._T_map_lidar @ initial.pose
+        return RelativePose(
+            initial.pose,
+            initial.covariance,
+            source=initial.source,
+            ok=False,
+            from_imu=initial.from_imu,
+            details=_details(found, points) if found else {"points": float(points)},
+        )
+
+
+def covariance_of(found: Registration, scale: float) -> Array:
+    """Covariance ``(6, 6)`` of a registration, from its Hessian less what the normals' noise feigns.
+
+    ``Σ = scale·σ²·H⁻¹`` with the residuals' σ; directions without information get a deviation of 10 m.
+    """
+    values, vectors, to_tangent = scaled_spectrum(found.hessian)
+    information = values - NORMAL_NOISE * np.trace(found.hessian[3:, 3:])
+    variance = np.minimum(scale * found.sigma_m**2 / np.maximum(information, 1e-9), _UNKNOWN_SIGMA_M**2)
+    root = vectors * np.sqrt(variance) * to_tangent[:, None]
+    return np.asarray(root @ root.T + np.diag(_FLOOR_SIGMAS**2))
+
+
+def _ahead(pose: Array, distance_m: float) -> Array:
+    moved = pose.copy()
+    moved[0, 3] += distance_m
+    return moved
+
+
+def _details(found: Registration, points: int) -> dict[str, float]:
+    return {
+        "points": float(points),
+        "matched": found.matched,
+        "iterations": float(found.iterations),
+        "converged": float(found.converged),
+        "sigma_m": found.sigma_m,
+        "cost": found.cost,
+    }
