@@ -13,7 +13,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = {"torch", "gtsam", "open3d", "matplotlib", "small_gicp", "scipy", "pydantic", "typer"}
 # the only modules of hybridlio that may know that graph and learned exist
-TOP = {"hybridlio", "hybridlio.__main__", "hybridlio.cli", "hybridlio.odometry", "hybridlio.run"}
+TOP = {f"hybridlio.{name}" for name in ("__main__", "cli", "odometry", "run", "sources")} | {"hybridlio"}
 MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_IMPORT_S = 300, 60, 0.3
 
 
