@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from hybridlio import se3
 from hybridlio.errors import DataError
@@ -80,6 +79,8 @@ def anees(errors: Array, covariances: Array, probability: float = PROBABILITY) -
 
 def bounds(samples: int, dimension: int, probability: float = PROBABILITY) -> tuple[float, float]:
     """Where the average of independent NEES values, divided by the dimension, lies with the given probability."""
+    from scipy.stats import chi2  # here, as it takes half a second to load
+
     freedom = samples * dimension
     tail = (1 - probability) / 2
     return float(chi2.ppf(tail, freedom) / freedom), float(chi2.ppf(1 - tail, freedom) / freedom)

@@ -5,9 +5,9 @@ The parts live in `drift`, `trajectory_errors` and `consistency` and are offered
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +24,10 @@ from hybridlio.consistency import (
 )
 from hybridlio.drift import KITTI_LENGTHS_M, Drift, DriftAverage, kitti_drift, lengths_for
 from hybridlio.errors import DataError
+from hybridlio.metrics_table import evaluation_table, figures
 from hybridlio.sensors import NS_PER_S
 from hybridlio.trajectory import Trajectory
 from hybridlio.trajectory_errors import MAX_DIFFERENCE_NS, Association, PoseErrors, align, associate, ate, rpe
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 __all__ = [
     "KITTI_LENGTHS_M",
@@ -49,6 +47,7 @@ __all__ = [
     "ate",
     "evaluate",
     "evaluation_table",
+    "figures",
     "kitti_drift",
     "lengths_for",
     "pose_consistency",
@@ -58,6 +57,8 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+
+_FRAMES_DIFFER_DEG = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +92,7 @@ class Evaluation:
         anees_bounds, step_anees_bounds: where 95 % of consistent estimators with independent errors would lie.
         segments, segments_by_speed: the drift's averages by length and by speed (over the chosen lengths where
             KITTI's do not fit).
+        warnings: why not to trust the figures.
         drift, chosen_drift: every segment.
     """
 
@@ -116,6 +118,7 @@ class Evaluation:
     step_anees_bounds: tuple[float, float] | None
     segments: list[DriftAverage]
     segments_by_speed: list[DriftAverage]
+    warnings: list[str]
     drift: Drift = field(repr=False)
     chosen_drift: Drift | None = field(repr=False)
 
@@ -177,54 +180,27 @@ def evaluate(
         step_anees_bounds=(step.rotation.lower, step.rotation.upper) if step else None,
         segments=shown.by_length(),
         segments_by_speed=shown.by_speed(),
+        warnings=_warnings(both),
         drift=drift,
         chosen_drift=chosen,
     )
 
 
-def evaluation_table(evaluations: Mapping[str, Evaluation], title: str | None = None) -> Table:
-    """A table for the terminal: one column of figures for one evaluation, one row each for several."""
-    from rich.table import Table
-    from rich.text import Text  # plain text: in markup "[m]" would be a style
-
-    rows = {name: figures(evaluation) for name, evaluation in evaluations.items()}
-    headings = list(dict.fromkeys(heading for row in rows.values() for heading in row))
-    table = Table(title=None if title is None else Text(title))
-    if len(rows) == 1:
-        table.add_column("figure")
-        table.add_column(Text(next(iter(rows))), justify="right")
-        for heading in headings:
-            table.add_row(Text(heading), next(iter(rows.values()))[heading])
-        return table
-    table.add_column("run")
-    for heading in headings:
-        table.add_column(Text(heading), justify="right")
-    for name, row in rows.items():
-        table.add_row(Text(name), *(row.get(heading, "–") for heading in headings))
-    return table
-
-
-def figures(evaluation: Evaluation) -> dict[str, str]:
-    """The figures worth a line, under headings that carry their units; what could not be computed is left out."""
-    e = evaluation
-    lengths = "" if e.chosen_lengths_m is None else f"over {e.chosen_lengths_m[0]:g}–{e.chosen_lengths_m[-1]:g} m"
-    values: dict[str, float | None] = {
-        "t_rel [%]": e.t_rel_percent,
-        "r_rel [°/100 m]": e.r_rel_deg_per_100m,
-        f"drift {lengths} [%]": e.chosen_t_rel_percent,
-        f"turn {lengths} [°/100 m]": e.chosen_r_rel_deg_per_100m,
-        "ATE [m]": e.ate_m,
-        "ATE [°]": e.ate_deg,
-        "RPE a frame [m]": e.rpe_m,
-        "RPE a frame [°]": e.rpe_deg,
-        "end error [m]": e.end_error_m,
-        "ANEES rotation": e.anees_rotation,
-        "ANEES position": e.anees_position,
-        "ANEES steps, rotation": e.step_anees_rotation,
-        "ANEES steps, position": e.step_anees_position,
-    }
-    lengths_text = {"length [m]": f"{e.length_m:.1f}", "estimated [m]": f"{e.estimate_length_m:.1f}"}
-    return lengths_text | {heading: f"{value:.3f}" for heading, value in values.items() if value is not None}
+def _warnings(both: Association) -> list[str]:
+    """Poses of two sensors (KITTI's camera against the lidar) align well and still make nonsense of relative errors."""
+    steps = [se3.between(t.poses[:-1], t.poses[1:])[:, :3, 3] for t in (both.reference, both.estimate)]
+    ahead = [step.sum(axis=0) for step in steps]
+    lengths = [float(np.linalg.norm(direction)) for direction in ahead]
+    if min(lengths) < 0.5 * both.reference.length_m or min(lengths) < 1.0:
+        return []
+    angle = np.degrees(np.arccos(np.clip(ahead[0] @ ahead[1] / (lengths[0] * lengths[1]), -1.0, 1.0)))
+    if angle < _FRAMES_DIFFER_DEG:
+        return []
+    towards = ["xyz"[int(np.abs(direction).argmax())] for direction in ahead]
+    return [
+        f"the reference moves along its {towards[0]} axis, the estimate along its {towards[1]}, {angle:.0f}° apart: "
+        "these are poses of two different frames (camera and lidar?), whose drift and relative errors mean nothing"
+    ]
 
 
 def _chosen_drift(both: Association, lengths_m: Sequence[float] | None, has_kitti_drift: bool) -> Drift | None:

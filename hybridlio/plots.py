@@ -220,7 +220,8 @@ def _drift_row(axes: NDArray[np.object_], averages: Mapping[str, list[DriftAvera
         axes[1].plot(at, [row.r_rel_deg_per_100m for row in rows], **style)
     for ax, title, unit in zip(axes, ("Translation drift", "Rotation drift"), ("%", "°/100 m"), strict=True):
         ax.set(title=title, xlabel=xlabel, ylabel=f"[{unit}]")
-        ax.set_ylim(bottom=0)
+        highest = max((float(np.max(line.get_ydata())) for line in ax.lines), default=0.0)
+        ax.set_ylim(0, 1.12 * max(highest, 1e-3))
 
 
 def _real_time(ax: Axes, period_s: float | None, highest_ms: float) -> None:

@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hybridlio import __version__
+from hybridlio.consistency import Anees
+from hybridlio.drift import Drift
 from hybridlio.files import write_whole
 from hybridlio.metrics import Evaluation, figures
 from hybridlio.report_data import Findings, ReportData, find
@@ -20,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Findings", "ReportData", "find", "save_pictures", "write_report"]
 
-_PACKAGES = ("hybridlio", "numpy", "scipy", "gtsam", "small_gicp", "open3d", "torch", "filterpy")
+_PACKAGES = ("numpy", "scipy", "gtsam", "small_gicp", "open3d", "torch", "filterpy")
 _FRAMES_LISTED = 200
 
 
@@ -147,7 +150,7 @@ def _figure_rows(findings: Findings) -> list[tuple[str, list[str]]]:
     return [(heading, [column.get(heading, "–") for column in columns]) for heading in headings]
 
 
-def _drift(evaluation: Evaluation) -> Any:
+def _drift(evaluation: Evaluation) -> Drift:
     shown = evaluation.drift
     return shown if len(shown) or evaluation.chosen_drift is None else evaluation.chosen_drift
 
@@ -191,16 +194,22 @@ def _timing_rows(data: ReportData) -> list[tuple[str, list[str]]]:
 
 
 def _consistency_rows(findings: Findings) -> list[tuple[str, list[str]]]:
+    """ANEES, errors in σ, bounds and verdict; absolute poses get neither of the last two, see :class:`Anees`."""
     rows = []
     for what, timed in (("steps", findings.steps), ("poses from the first", findings.poses)):
-        if timed is None:
-            continue
-        for part in ("rotation", "position"):
-            result = getattr(timed.consistency, part)
-            off = f"σ {_digits(np.sqrt(max(result.value, 1 / result.value)))} times too "
-            verdict = "consistent" if result.consistent else off + ("small" if result.value > 1 else "large")
-            rows.append((f"{what}, {part}", [_digits(result.value), f"{result.lower:.3f}–{result.upper:.3f}", verdict]))
+        for part in ("rotation", "position") if timed is not None else ():
+            result = getattr(timed.consistency, part)  # type: ignore[union-attr]
+            judged = [f"{result.lower:.3f}–{result.upper:.3f}", _verdict(result)] if what == "steps" else ["–", "–"]
+            rows.append((f"{what}, {part}", [_digits(result.value), _digits(np.sqrt(result.value)), *judged]))
     return rows
+
+
+def _verdict(result: Anees) -> str:
+    if result.consistent:
+        return "consistent"
+    too_small = result.value > 1
+    factor = np.sqrt(result.value if too_small else 1 / max(result.value, 1e-12))
+    return f"σ {_digits(factor)} times too {'small' if too_small else 'large'}"
 
 
 def _bridged_m(data: ReportData, findings: Findings) -> Any:
@@ -220,7 +229,7 @@ def _digits(value: float) -> str:
 
 
 def _versions() -> dict[str, str]:
-    out = {"Python": platform.python_version()}
+    out = {"hybridlio": __version__, "Python": platform.python_version()}
     for package in _PACKAGES:
         try:
             out[package] = metadata.version(package)

@@ -137,6 +137,7 @@ def find(data: ReportData) -> Findings:
         if both is not None and data.reference is not None:
             is_own = trajectory is data.estimate
             evaluations[name] = evaluate(data.reference, trajectory, steps=steps if is_own else None)
+            notes += [f"{name}: {warning}" for warning in evaluations[name].warnings]
             own = both if is_own else own
     errors = _step_errors(data, own)
     return Findings(paths, evaluations, errors, _steps(data, errors), _poses(data, own), notes)

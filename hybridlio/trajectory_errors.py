@@ -22,6 +22,7 @@ Alignment = Literal["se3", "sim3", "first", "none"]
 DeltaUnit = Literal["frames", "seconds", "metres"]
 
 MAX_DIFFERENCE_NS = NS_PER_S // 10
+LEVER_M = 1.0
 _SAME_MOMENT_NS = 1_000_000  # stamps in files are rounded, some to a microsecond, some to a millisecond
 
 
@@ -98,14 +99,17 @@ def select(trajectory: Trajectory, rows: NDArray[np.int64]) -> Trajectory:
     return Trajectory(trajectory.stamps_ns[rows], trajectory.poses[rows], covariances)
 
 
-def align(reference: Trajectory, estimate: Trajectory, how: Alignment = "se3") -> Trajectory:
+def align(reference: Trajectory, estimate: Trajectory, how: Alignment = "se3", lever_m: float = LEVER_M) -> Trajectory:
     """The estimate moved onto the reference as a whole.
 
     Args:
         reference, estimate: ``M`` poses each, of the same moments.
-        how: ``se3`` for the rigid motion that brings the positions closest; ``sim3`` with a scale too; ``first`` so
-            that the first poses agree; ``none``. What positions leave open (a straight path may turn about itself, one
-            at rest at all) the orientations decide.
+        how: ``se3`` for the rigid motion that brings the poses closest; ``sim3`` with a scale too; ``first`` so that
+            the first poses agree; ``none``.
+        lever_m: beside each position, points so far from it along the pose's axes are brought closest too. Over a
+            path of many metres that changes nothing to speak of; but positions alone leave open how a straight path
+            turns about itself, and how one at rest turns at all, and would let their noise decide. 0 is Umeyama's
+            alignment of positions.
 
     Raises:
         DataError: the trajectories do not have as many poses each.
@@ -120,22 +124,22 @@ def align(reference: Trajectory, estimate: Trajectory, how: Alignment = "se3") -
     if how == "first":
         T = reference.poses[0] @ se3.inverse(estimate.poses[0])
         return Trajectory(estimate.stamps_ns, T @ estimate.poses, estimate.covariances)
-    R, t, scale = _umeyama(reference, estimate, with_scale=how == "sim3")
+    R, t, scale = _closest(reference, estimate, lever_m, with_scale=how == "sim3")
     scaled = se3.make(estimate.poses[:, :3, :3], scale * estimate.poses[:, :3, 3])
     return Trajectory(estimate.stamps_ns, se3.make(R, t) @ scaled, estimate.covariances)
 
 
-def ate(reference: Trajectory, estimate: Trajectory, how: Alignment = "se3") -> PoseErrors:
+def ate(reference: Trajectory, estimate: Trajectory, how: Alignment = "se3", lever_m: float = LEVER_M) -> PoseErrors:
     """Absolute trajectory error: how far each pose is from the reference once the whole is aligned.
 
     Args:
         reference, estimate: ``M`` poses each, of the same moments.
-        how: the alignment, see :func:`align`.
+        how, lever_m: the alignment, see :func:`align`.
 
     Raises:
         DataError, ConfigError, EstimationError: as :func:`align`.
     """
-    error = se3.between(align(reference, estimate, how).poses, reference.poses)
+    error = se3.between(align(reference, estimate, how, lever_m).poses, reference.poses)
     return _errors(error, np.arange(len(reference)))
 
 
@@ -178,21 +182,21 @@ def _partners(reference: Trajectory, delta: float, unit: DeltaUnit) -> tuple[NDA
     return first, last[first]
 
 
-def _umeyama(reference: Trajectory, estimate: Trajectory, with_scale: bool) -> tuple[Array, Array, float]:
+def _closest(
+    reference: Trajectory, estimate: Trajectory, lever_m: float, with_scale: bool
+) -> tuple[Array, Array, float]:
     y, x = reference.poses[:, :3, 3], estimate.poses[:, :3, 3]
     y_mean, x_mean = y.mean(axis=0), x.mean(axis=0)
     cross = (y - y_mean).T @ (x - x_mean) / len(x)
-    # a vanishing share for the orientations: it decides only where the positions' own singular values are zero
     turns = (reference.poses[:, :3, :3] @ np.swapaxes(estimate.poses[:, :3, :3], 1, 2)).mean(axis=0)
-    U, singular, Vt = np.linalg.svd(cross + max(float(np.linalg.norm(cross)), 1e-9) * 1e-10 * turns)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    R = (U * signs) @ Vt
+    U, _, Vt = np.linalg.svd(cross + lever_m**2 * turns)
+    R = (U * [1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
     scale = 1.0
     if with_scale:
         variance = float(((x - x_mean) ** 2).sum() / len(x))
         if variance < 1e-12:
             raise EstimationError("sim3 alignment: the estimate does not move, so it has no scale; align with se3")
-        scale = float((singular * signs).sum() / variance)
+        scale = float((R * cross).sum() / variance)
     return np.asarray(R), np.asarray(y_mean - scale * R @ x_mean), scale
 
 

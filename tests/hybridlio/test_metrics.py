@@ -99,6 +99,18 @@ def test_the_json_has_the_figures_and_nothing_that_json_cannot_hold(rng: np.rand
     }
 
 
+def test_camera_poses_against_lidar_poses_are_warned_of_and_like_against_like_is_not(
+    rng: np.random.Generator,
+) -> None:
+    reference, estimate, _ = drive(rng, 300)
+    T_camera_lidar = se3.make([[0, -1, 0], [0, 0, -1], [1, 0, 0]], [0, -0.08, -0.27])
+    camera = Trajectory(reference.stamps_ns, T_camera_lidar @ reference.poses @ se3.inverse(T_camera_lidar))
+    assert "along its z axis, the estimate along its x" in evaluate(camera, estimate).warnings[0]
+    assert evaluate(reference, estimate).warnings == []
+    still, shaken, _ = drive(rng, 50, speed_m=0.0)
+    assert evaluate(still, shaken).warnings == []
+
+
 def test_steps_are_judged_only_where_the_reference_has_both_ends(rng: np.random.Generator) -> None:
     reference, estimate, steps = drive(rng, 300)
     rows = np.r_[0:100, 150:300]

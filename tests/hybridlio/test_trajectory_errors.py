@@ -42,7 +42,7 @@ def for_evo(trajectory: Trajectory) -> PoseTrajectory3D:
 def test_ate_is_evos_for_every_alignment(how: str) -> None:
     reference = curve()
     estimate = scaled(noisy(reference), 1.05 if how == "sim3" else 1.0)
-    ours = ate(reference, estimate, how)
+    ours = ate(reference, estimate, how, lever_m=0.0)
     theirs = for_evo(estimate)
     if how == "first":
         theirs.align_origin(for_evo(reference))
@@ -73,6 +73,9 @@ def test_on_a_real_drive_ate_agrees_with_evo_and_with_kiss_icps_log(shared_data:
     metric.process_data((for_evo(reference), theirs))
     ours = ate(reference, estimate)
     assert ours.rmse_m == pytest.approx(metric.get_statistic(evo_metrics.StatisticsType.rmse), rel=1e-6)
+    theirs_rotated = evo_metrics.APE(evo_metrics.PoseRelation.rotation_angle_deg)
+    theirs_rotated.process_data((for_evo(reference), theirs))
+    assert ours.rmse_deg == pytest.approx(theirs_rotated.get_statistic(evo_metrics.StatisticsType.rmse), rel=1e-3)
     assert ours.rmse_m == pytest.approx(3.515, abs=1e-3)
     assert np.radians(ours.rmse_deg) == pytest.approx(0.019, abs=5e-4)
 
@@ -95,13 +98,15 @@ def test_a_rigid_motion_of_the_whole_is_undone_exactly_and_a_scale_too() -> None
 
 
 @pytest.mark.parametrize("speed_m", [0.0, 1.0])
-def test_a_straight_path_or_one_at_rest_is_aligned_with_its_orientations_too(speed_m: float) -> None:
-    poses = se3.make(np.tile(np.eye(3), (50, 1, 1)), np.outer(np.arange(50) * speed_m, [1, 0, 0]))
-    reference = Trajectory(np.arange(50), poses)
-    moved = Trajectory(np.arange(50), se3.exp([1, 2, -0.5, 10, 5, -2]) @ poses)
+def test_noise_of_the_positions_does_not_turn_a_straight_path_or_one_at_rest(speed_m: float) -> None:
+    poses = se3.make(np.tile(np.eye(3), (80, 1, 1)), np.outer(np.arange(80) * speed_m, [1, 0, 0]))
+    reference = Trajectory(np.arange(80), poses)
+    noise = np.random.default_rng(4).normal(0, [0.001] * 3 + [0.05] * 3, (80, 6))
+    moved = Trajectory(np.arange(80), se3.exp([1, 2, -0.5, 10, 5, -2]) @ poses @ se3.exp(noise))
     errors = ate(reference, moved)
-    assert errors.rmse_m < 1e-6
-    assert errors.rmse_deg < 1e-4
+    assert errors.rmse_m == pytest.approx(0.05 * np.sqrt(3), rel=0.15)
+    assert errors.rmse_deg < 0.3
+    assert ate(reference, moved, lever_m=0.0).rmse_deg > 10
 
 
 def test_association_at_equal_stamps_changes_nothing() -> None:
