@@ -62,7 +62,8 @@ def open_sequence_folder(folder: Path, raw_root: Path | None = None) -> Sequence
     """One sequence: the scans on disk with their stamps (seconds from the recording's first frame) and references.
 
     With ``raw_root`` (the folder of the date folders) the inertial samples and ``T_imu_lidar`` come from the raw drive
-    that the sequence was cut from, moved to the sequence's clock.
+    that the sequence was cut from, moved to the sequence's clock; without it there are none and ``T_imu_lidar`` is the
+    identity.
 
     Raises:
         DataError: no scans, stamps or poses that do not match them, a missing calibration, or no such raw drive.

@@ -36,10 +36,9 @@ def find(path: Path) -> dict[str, Path]:
     """The drives at or directly below ``path``: folder by name, such as ``2011_09_26_drive_0005``."""
     here = [path, *list(path.parents)[:2]]  # also from inside, as velodyne_points/data
     drives = [p for p in here if (p / "velodyne_points").is_dir()][:1]
-    drives = drives or sorted(p.parent for depth in ("*", "*/*") for p in path.glob(f"{depth}/velodyne_points"))
-    return {
-        drive.resolve().name.removesuffix("_sync"): drive for drive in drives if not drive.name.endswith("_extract")
-    }
+    below = (p.parent for depth in ("*", "*/*") for p in path.glob(f"{depth}/velodyne_points"))
+    drives = drives or sorted(d for d in below if not any(part.startswith(".") for part in d.relative_to(path).parts))
+    return {d.resolve().name.removesuffix("_sync"): d for d in drives if not d.name.endswith("_extract")}
 
 
 def open_drive(drive: Path, raw_root: Path | None = None) -> Sequence:

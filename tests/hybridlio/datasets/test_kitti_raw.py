@@ -57,6 +57,14 @@ class TestFinding:
             with pytest.raises(DataError, match=r"2011_09_30_drive_0016, 2011_10_03_drive_0016"):
                 open_sequence(root, sequence=wanted)
 
+    def test_what_an_interrupted_writer_left_in_hidden_folders_is_not_taken_for_drives(
+        self, recordings: Any, drive: Path
+    ) -> None:
+        recordings.write_raw(drive.parent / ".partial", recordings.ride, name="2011_10_03_drive_0027")
+        recordings.write_raw(drive.parents[1] / ".partial", recordings.ride, name="2011_10_03_drive_0042")
+        (drive.parents[1] / ".partial/2011_10_03").rename(drive.parents[1] / ".2011_10_03")
+        assert list(find(drive.parent)) == list(find(drive.parents[1])) == ["2011_09_30_drive_0016"]
+
     def test_unsynchronised_recordings_are_not_taken_for_drives(self, drive: Path) -> None:
         (drive.with_name("2011_09_30_drive_0016_extract") / "velodyne_points").mkdir()
         assert list(find(drive.parent)) == ["2011_09_30_drive_0016"]
