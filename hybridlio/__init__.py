@@ -4,11 +4,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # what type checkers and editors see; at run time each name loads when first used
+    from hybridlio.config import Config
     from hybridlio.datasets.registry import open_sequence
     from hybridlio.datasets.sequence import Sequence
     from hybridlio.errors import HybridLioError
     from hybridlio.estimates import RelativePose, State
     from hybridlio.metrics import evaluate
+    from hybridlio.odometry import Estimate, Odometry
     from hybridlio.sensors import Calibration, Frame, GpsFix, ImuNoise, ImuSamples, Scan
     from hybridlio.simulation import SimulationConfig, simulate
     from hybridlio.trajectory import Trajectory
@@ -17,11 +19,14 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Calibration",
+    "Config",
+    "Estimate",
     "Frame",
     "GpsFix",
     "HybridLioError",
     "ImuNoise",
     "ImuSamples",
+    "Odometry",
     "RelativePose",
     "Scan",
     "Sequence",
@@ -35,11 +40,13 @@ __all__ = [
 ]
 
 _HOMES = {
+    "config": ("Config",),
     "datasets.registry": ("open_sequence",),
     "datasets.sequence": ("Sequence",),
     "errors": ("HybridLioError",),
     "estimates": ("RelativePose", "State"),
     "metrics": ("evaluate",),
+    "odometry": ("Estimate", "Odometry"),
     "sensors": ("Calibration", "Frame", "GpsFix", "ImuNoise", "ImuSamples", "Scan"),
     "simulation": ("SimulationConfig", "simulate"),
     "trajectory": ("Trajectory",),

@@ -1,0 +1,50 @@
+"""Every example runs, as a user would run it, on a drive of a few seconds."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def run_example(name: str, folder: Path) -> str:
+    command = [sys.executable, str(ROOT / "examples" / name), str(folder), "1.5"]
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """One folder for all examples: they simulate the same drive, once."""
+    return tmp_path_factory.mktemp("examples")
+
+
+def metres(text: str) -> list[float]:
+    return [float(number) for number in re.findall(r"(\d+\.\d+) m\b", text)]
+
+
+def test_odometry_from_python_ends_within_centimetres(folder):
+    length_m, off_m, sigma_m = metres(run_example("odometry_from_python.py", folder))
+    assert length_m > 5
+    assert off_m < 0.1
+    assert 0 < sigma_m < 1
+
+
+def test_own_initial_pose_source_takes_the_place_of_a_built_in_one(folder):
+    text = run_example("own_initial_pose_source.py", folder)
+    assert "wheels-and-gyroscope" in text
+    wheels_m, _ = metres(text)
+    assert wheels_m < 0.1
+
+
+def test_no_example_goes_untested():
+    named = re.findall(r'run_example\("(\w+\.py)"', Path(__file__).read_text())
+    assert sorted(set(named)) == sorted(path.name for path in (ROOT / "examples").glob("*.py"))
