@@ -5,7 +5,7 @@ The parts live in `drift`, `trajectory_errors` and `consistency` and are offered
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -94,6 +94,7 @@ class Evaluation:
             KITTI's do not fit).
         warnings: why not to trust the figures.
         drift, chosen_drift: every segment.
+        pose_consistency, step_consistency: every error with its σ; the poses' lack the first.
     """
 
     poses: int
@@ -121,10 +122,13 @@ class Evaluation:
     warnings: list[str]
     drift: Drift = field(repr=False)
     chosen_drift: Drift | None = field(repr=False)
+    pose_consistency: PoseConsistency | None = field(repr=False)
+    step_consistency: PoseConsistency | None = field(repr=False)
 
     def to_json_dict(self) -> dict[str, Any]:
-        """Every attribute but the single segments, as plain numbers, lists and None."""
-        out = {name: value for name, value in vars(self).items() if name not in ("drift", "chosen_drift")}
+        """Every attribute but the single segments and errors, as plain numbers, lists and None."""
+        arrays = ("drift", "chosen_drift", "pose_consistency", "step_consistency")
+        out = {name: value for name, value in vars(self).items() if name not in arrays}
         for name, key in (("segments", "length_m"), ("segments_by_speed", "speed_m_s")):
             out[name] = [{key if k == "at" else k: v for k, v in asdict(average).items()} for average in out[name]]
         return {name: list(value) if isinstance(value, tuple) else value for name, value in out.items()}
@@ -150,12 +154,18 @@ def evaluate(
     Raises:
         DataError: the two share less than two moments, or the steps do not fit the estimate.
     """
+    if steps is not None and not len(steps.poses) == len(steps.covariances) == len(estimate) - 1:
+        raise DataError(
+            f"{len(steps.poses)} steps with {len(steps.covariances)} covariances do not fit {len(estimate)} poses"
+        )
     both = associate(reference, estimate, max_difference_ns)
     drift = kitti_drift(both.reference, both.estimate)
     chosen = _chosen_drift(both, lengths_m, bool(len(drift)))
     shown = drift if len(drift) or chosen is None else chosen
     absolute, relative = ate(both.reference, both.estimate), rpe(both.reference, both.estimate)
-    poses, step = _absolute(both), _steps(both, estimate, steps)
+    warnings = _warnings(both)
+    poses = _judged(lambda: _absolute(both), "poses", warnings)
+    step = _judged(lambda: _steps(both, estimate, steps), "steps", warnings)
     end = se3.between(both.reference.from_first().poses[-1], both.estimate.from_first().poses[-1])
     return Evaluation(
         poses=len(both.reference),
@@ -180,9 +190,11 @@ def evaluate(
         step_anees_bounds=(step.rotation.lower, step.rotation.upper) if step else None,
         segments=shown.by_length(),
         segments_by_speed=shown.by_speed(),
-        warnings=_warnings(both),
+        warnings=warnings,
         drift=drift,
         chosen_drift=chosen,
+        pose_consistency=poses,
+        step_consistency=step,
     )
 
 
@@ -210,6 +222,15 @@ def _chosen_drift(both: Association, lengths_m: Sequence[float] | None, has_kitt
     return kitti_drift(both.reference, both.estimate, lengths, step=1) if lengths else None
 
 
+def _judged(judge: Callable[[], PoseConsistency | None], what: str, warnings: list[str]) -> PoseConsistency | None:
+    # a covariance that is none must not take drift and ATE away
+    try:
+        return judge()
+    except DataError as error:
+        warnings.append(f"the covariances of the {what} are not judged: {error}")
+        return None
+
+
 def _absolute(both: Association) -> PoseConsistency | None:
     # covariances are relative to the estimate's own first pose: without it among the moments they say nothing here
     if both.estimate.covariances is None or both.estimate_rows[0] != 0:
@@ -220,10 +241,6 @@ def _absolute(both: Association) -> PoseConsistency | None:
 def _steps(both: Association, estimate: Trajectory, steps: Steps | None) -> PoseConsistency | None:
     if steps is None:
         return None
-    if not len(steps.poses) == len(steps.covariances) == len(estimate) - 1:
-        raise DataError(
-            f"{len(steps.poses)} steps with {len(steps.covariances)} covariances do not fit {len(estimate)} poses"
-        )
     rows, errors = associated_step_errors(both, estimate, steps.poses)
     return pose_consistency(errors, steps.covariances[rows]) if len(rows) else None
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlio.consistency import PoseConsistency, absolute_consistency, pose_consistency
+from hybridlio.consistency import PoseConsistency
 from hybridlio.errors import DataError
 from hybridlio.metrics import Evaluation, Steps, associated_step_errors, evaluate
 from hybridlio.sensors import NS_PER_S
@@ -140,7 +140,13 @@ def find(data: ReportData) -> Findings:
             notes += [f"{name}: {warning}" for warning in evaluations[name].warnings]
             own = both if is_own else own
     errors = _step_errors(data, own)
-    return Findings(paths, evaluations, errors, _steps(data, errors), _poses(data, own), notes)
+    judged = evaluations.get(data.estimate_name)
+    timed_steps = timed_poses = None
+    if judged is not None and judged.step_consistency is not None:
+        timed_steps = TimedConsistency(errors["final"][0], judged.step_consistency)
+    if judged is not None and own is not None and judged.pose_consistency is not None:
+        timed_poses = TimedConsistency(data.estimate.times_s[own.estimate_rows[1:]], judged.pose_consistency)
+    return Findings(paths, evaluations, errors, timed_steps, timed_poses, notes)
 
 
 def _associate(reference: Trajectory | None, trajectory: Trajectory, name: str, notes: list[str]) -> Association | None:
@@ -170,18 +176,3 @@ def _step_errors(data: ReportData, own: Association | None) -> dict[str, tuple[A
             if len(rows):
                 out[name] = (data.estimate.times_s[rows + 1], errors)
     return out
-
-
-def _steps(data: ReportData, errors: dict[str, tuple[Array, Array]]) -> TimedConsistency | None:
-    if data.step_covariances is None or "final" not in errors:
-        return None
-    times, final = errors["final"]
-    rows = np.searchsorted(data.estimate.times_s, times) - 1
-    return TimedConsistency(times, pose_consistency(final, np.asarray(data.step_covariances)[rows]))
-
-
-def _poses(data: ReportData, own: Association | None) -> TimedConsistency | None:
-    if own is None or own.estimate.covariances is None or own.estimate_rows[0] != 0:
-        return None
-    times = data.estimate.times_s[own.estimate_rows[1:]]
-    return TimedConsistency(times, absolute_consistency(own.reference, own.estimate))

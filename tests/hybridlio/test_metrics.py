@@ -135,6 +135,18 @@ def test_steps_that_do_not_fit_the_estimate_are_refused(rng: np.random.Generator
         evaluate(reference, estimate, steps=Steps(steps.poses[1:], steps.covariances))
 
 
+def test_a_covariance_that_is_none_leaves_the_other_figures_standing(rng: np.random.Generator) -> None:
+    reference, estimate, steps = drive(rng, 300)
+    assert estimate.covariances is not None
+    broken = Trajectory(estimate.stamps_ns, estimate.poses, -estimate.covariances)
+    result = evaluate(reference, broken, steps=Steps(steps.poses, steps.covariances * np.nan))
+    assert result.t_rel_percent == pytest.approx(evaluate(reference, estimate).t_rel_percent)
+    assert result.anees_rotation is None
+    assert result.step_anees_rotation is None
+    assert "poses are not judged: ANEES: row 298: the covariance is not positive definite" in result.warnings[0]
+    assert "steps are not judged: ANEES: row 0: " in result.warnings[1]
+
+
 def test_the_table_has_a_line_for_each_figure_of_one_run_and_for_each_of_several_runs(
     rng: np.random.Generator,
 ) -> None:
