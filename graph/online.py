@@ -11,29 +11,11 @@ from hybridlio.errors import GraphError
 from hybridlio.estimates import RelativePose, State
 from hybridlio.graph import factors
 from hybridlio.graph.preintegration import covers, preintegrate
+from hybridlio.graph.solver import incremental_solver
 from hybridlio.sensors import Calibration, Frame, ImuNoise
 
-# While tilt, speed and biases are still found, every step solves the few poses there are anew; afterwards a change of
-# the newest pose hardly moves the oldest, and iSAM2 need not carry it back (its wildfire threshold, in rad, m, m/s).
+# While tilt, speed and biases are still found, every step solves the few poses there are anew.
 _WARM_UP_STEPS = 20
-_WILDFIRE_THRESHOLD = 1.0
-
-
-def _isam() -> gtsam.ISAM2:
-    params = gtsam.ISAM2Params()
-    params.setFactorization("QR")  # Cholesky finds long straight chains indeterminate
-    params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(_WILDFIRE_THRESHOLD))
-    params.relinearizeSkip = 10
-    thresholds = gtsam.ISAM2ThresholdMap()
-    for kind, sigma in {
-        "x": np.r_[np.full(3, 0.02), np.full(3, 1.0)],
-        "v": np.full(3, 1.0),
-        "b": np.r_[np.full(3, 0.1), np.full(3, 0.01)],
-        "g": np.full(3, 0.1),
-    }.items():
-        thresholds.insert((kind, sigma))
-    params.setRelinearizeThreshold(thresholds)
-    return gtsam.ISAM2(params)
 
 
 class IncrementalBackend:
@@ -52,7 +34,7 @@ class IncrementalBackend:
         self._k = 0
         self._state = state
         self._graph, self._values = factors.start_factors(state)
-        self._isam = _isam()
+        self._isam = incremental_solver()
         self._isam.update(self._graph, self._values)
 
     def update(self, frame: Frame, relative: RelativePose) -> State:
@@ -106,7 +88,7 @@ class IncrementalBackend:
         params = gtsam.LevenbergMarquardtParams()
         params.setLinearSolverType("MULTIFRONTAL_QR")
         self._values = gtsam.LevenbergMarquardtOptimizer(self._graph, self._values, params).optimize()
-        self._isam = _isam()
+        self._isam = incremental_solver()
         self._isam.update(self._graph, self._values)
 
     def _read(self, stamp_ns: int) -> State:

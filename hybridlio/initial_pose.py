@@ -71,6 +71,6 @@ class NoResidual:
     def start(self, frame: Frame) -> None:
         """Nothing to keep."""
 
-    def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:
+    def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:  # noqa: ARG002
         """The initial pose itself."""
         return initial

@@ -16,7 +16,7 @@ from hybridlio.errors import ConfigError, DataError, EstimationError
 from hybridlio.estimates import Array, Backend, InitialPoseSource, RelativePose, ResidualSource, State
 from hybridlio.record import Record
 from hybridlio.sensors import Calibration, Frame, GpsFix, ImuNoise, ImuSamples
-from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES, Setup, choose
+from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES, Setup, check_names
 from hybridlio.startup import start_state
 from hybridlio.trajectory import Trajectory
 
@@ -75,10 +75,7 @@ class Odometry:
         config = config or Config()
         self._config = config
         self._chosen = (initial_pose or config.initial_pose, residual or config.residual, backend or config.backend)
-        kinds = (("initial pose", INITIAL_POSE_SOURCES), ("residual", RESIDUAL_SOURCES), ("backend", BACKENDS))
-        for choice, (kind, known) in zip(self._chosen, kinds, strict=True):
-            if isinstance(choice, str):
-                choose(kind, choice, known)
+        check_names(*self._chosen)
         self._state: State | None = None
         self._first: Frame | None = None
         self._estimates: list[Estimate] = []

@@ -5,9 +5,8 @@ Each is made when it is asked for, so that only what is used is imported.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TypeVar
 
 from hybridlio.config import Config
 from hybridlio.errors import ConfigError
@@ -36,13 +35,13 @@ def _kalman(setup: Setup) -> InitialPoseSource:
     return Kalman(setup.calibration, setup.imu_noise)
 
 
-def _constant_velocity(setup: Setup) -> InitialPoseSource:
+def _constant_velocity(_: Setup) -> InitialPoseSource:
     from hybridlio.initial_pose import ConstantVelocity
 
     return ConstantVelocity()
 
 
-def _identity(setup: Setup) -> InitialPoseSource:
+def _identity(_: Setup) -> InitialPoseSource:
     from hybridlio.initial_pose import Identity
 
     return Identity()
@@ -54,7 +53,7 @@ def _scan_matching(setup: Setup) -> ResidualSource:
     return ScanMatching(setup.config.scan_matching)
 
 
-def _no_residual(setup: Setup) -> ResidualSource:
+def _no_residual(_: Setup) -> ResidualSource:
     from hybridlio.initial_pose import NoResidual
 
     return NoResidual()
@@ -80,15 +79,18 @@ BACKENDS: dict[str, Callable[[Setup], Backend]] = {
     "incremental": _incremental,
 }
 
-_T = TypeVar("_T")
 
-
-def choose(kind: str, name: str, known: Mapping[str, _T]) -> _T:
-    """The implementation of a seam by name.
+def check_names(initial_pose: object, residual: object, backend: object) -> None:
+    """Check those of the three that are names; objects are taken as they are.
 
     Raises:
-        ConfigError: there is none of that name; lists those there are.
+        ConfigError: there is no implementation of that name; lists those there are.
     """
-    if name not in known:
-        raise ConfigError(f"unknown {kind} {name!r}; choose one of {', '.join(known)}")
-    return known[name]
+    seams: tuple[tuple[str, object, Iterable[str]], ...] = (
+        ("initial pose", initial_pose, INITIAL_POSE_SOURCES),
+        ("residual", residual, RESIDUAL_SOURCES),
+        ("backend", backend, BACKENDS),
+    )
+    for kind, choice, known in seams:
+        if isinstance(choice, str) and choice not in known:
+            raise ConfigError(f"unknown {kind} {choice!r}; choose one of {', '.join(known)}")

@@ -1,0 +1,174 @@
+"""Offline smoothing: all of a run's factors optimised together, from its record alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, G, V, X
+from numpy.typing import NDArray
+
+from hybridlio import se3
+from hybridlio.errors import GraphError
+from hybridlio.estimates import Array, State
+from hybridlio.graph import factors
+from hybridlio.graph.preintegration import covers, preintegrate
+from hybridlio.graph.solver import incremental_solver
+from hybridlio.record import Record
+from hybridlio.trajectory import Trajectory
+
+Progress = Callable[[str, int, int], None]
+
+_MAX_ITERATIONS = 50
+_ROUNDS = 2  # samples are summed up again with the biases that the first round found
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """A smoothed run.
+
+    Attributes:
+        trajectory: ``N`` lidar poses in the first scan's frame, with covariances ``(N, 6, 6)``.
+        velocities_m_s: ``(N, 3)`` of the IMU, in the IMU's first pose; meaningless without IMU.
+        accel_biases_m_s2, gyro_biases_rad_s: ``(N, 3)`` each; meaningless without IMU.
+        gravity_m_s2: ``(3,)`` in the IMU's first pose.
+        error_before, error_after: half the sum of squared, whitened residuals at the online estimate and at the answer.
+        iterations: Levenberg-Marquardt steps of the last round.
+        converged: whether the error had stopped falling.
+    """
+
+    trajectory: Trajectory
+    velocities_m_s: NDArray[np.float64]
+    accel_biases_m_s2: NDArray[np.float64]
+    gyro_biases_rad_s: NDArray[np.float64]
+    gravity_m_s2: NDArray[np.float64]
+    error_before: float
+    error_after: float
+    iterations: int
+    converged: bool
+
+
+def smooth(record: Record, progress: Progress | None = None) -> Smoothed:
+    """Optimise all poses, velocities, biases and gravity of a run at once (Levenberg-Marquardt).
+
+    Args:
+        record: of the run, from :meth:`hybridlio.odometry.Odometry.record` or a run folder's ``odometry.npz``.
+        progress: called with the stage, what is done of it and what there is in all.
+
+    Raises:
+        GraphError: the graph cannot be solved.
+    """
+    report = progress or _silent
+    states = _online_states(record)
+    error_before: float | None = None
+    for number in range(_ROUNDS):
+        report("optimising", number, _ROUNDS)
+        graph, values = _build(record, states)
+        error_before = graph.error(values) if error_before is None else error_before
+        optimiser = _optimiser(graph, values)
+        values = _solve(optimiser)
+        states = _read(values, states)
+    covariances = _covariances(graph, values, len(states), report)
+    return _smoothed(record, states, covariances, error_before or 0.0, optimiser)
+
+
+def _silent(stage: str, done: int, total: int) -> None:
+    """Report to nobody."""
+    del stage, done, total
+
+
+def _online_states(record: Record) -> list[State]:
+    T = record.calibration.T_imu_lidar
+    poses = T @ record.online.poses @ se3.inverse(T)
+    times_s = record.online.times_s
+    velocities = np.gradient(poses[:, :3, 3], times_s, axis=0) if len(poses) > 1 else np.zeros((1, 3))
+    return [
+        replace(record.start, stamp_ns=int(stamp), T_world_imu=pose, velocity_m_s=velocity)
+        for stamp, pose, velocity in zip(record.online.stamps_ns, poses, velocities, strict=True)
+    ]
+
+
+def _build(record: Record, states: list[State]) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    graph, _ = factors.start_factors(record.start)
+    values = gtsam.Values()
+    factors.insert_state(values, 0, states[0])
+    for i, relative in enumerate(record.relative):
+        state, stamp_ns = states[i], states[i + 1].stamp_ns
+        imu = record.imu.between(state.stamp_ns, stamp_ns)
+        usable = state.has_imu and covers(imu, state.stamp_ns, stamp_ns)
+        pim = preintegrate(imu, state, record.imu_noise) if usable else None
+        graph.push_back(factors.step_factors(i, state, relative, pim, stamp_ns, record.calibration.T_imu_lidar))
+        factors.insert_state(values, i + 1, states[i + 1])
+    return graph, values
+
+
+def _optimiser(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.LevenbergMarquardtOptimizer:
+    params = gtsam.LevenbergMarquardtParams()
+    params.setLinearSolverType("MULTIFRONTAL_QR")  # Cholesky finds long straight chains indeterminate
+    params.setRelativeErrorTol(1e-6)
+    params.setMaxIterations(_MAX_ITERATIONS)
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, params)
+
+
+def _solve(optimiser: gtsam.LevenbergMarquardtOptimizer) -> gtsam.Values:
+    try:
+        return optimiser.optimize()
+    except RuntimeError as error:
+        raise GraphError(f"smoothing: the graph cannot be solved: {str(error).strip()}") from error
+
+
+def _read(values: gtsam.Values, states: list[State]) -> list[State]:
+    return [_read_one(values, k, state) for k, state in enumerate(states)]
+
+
+def _read_one(values: gtsam.Values, k: int, state: State) -> State:
+    pose = values.atPose3(X(k)).matrix()
+    if not state.has_imu:
+        return replace(state, T_world_imu=pose)
+    bias = values.atConstantBias(B(k))
+    return replace(
+        state,
+        T_world_imu=pose,
+        velocity_m_s=values.atVector(V(k)),
+        accel_bias_m_s2=bias.accelerometer(),
+        gyro_bias_rad_s=bias.gyroscope(),
+        gravity_m_s2=values.atVector(G(k)),
+    )
+
+
+def _covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, count: int, progress: Progress) -> Array:
+    """``(N, 6, 6)`` marginals of the IMU poses, relative to the first, which is the origin."""
+    isam = incremental_solver()
+    isam.update(graph, values)
+    out = np.empty((count, 6, 6))
+    for k in range(count):
+        progress("covariances", k, count)
+        out[k] = isam.marginalCovariance(X(k))
+    return (out + np.swapaxes(out, 1, 2)) / 2
+
+
+def _smoothed(
+    record: Record,
+    states: list[State],
+    covariances: Array,
+    error_before: float,
+    optimiser: gtsam.LevenbergMarquardtOptimizer,
+) -> Smoothed:
+    T = record.calibration.T_imu_lidar
+    T_inv = se3.inverse(T)
+    poses = T_inv @ np.array([state.T_world_imu for state in states]) @ T
+    stamps = np.array([state.stamp_ns for state in states])
+    iterations = int(optimiser.iterations())
+    return Smoothed(
+        trajectory=Trajectory(stamps, se3.between(poses[0], poses), se3.rotate_covariance(covariances, T_inv)),
+        velocities_m_s=np.array([state.velocity_m_s for state in states]),
+        accel_biases_m_s2=np.array([state.accel_bias_m_s2 for state in states]),
+        gyro_biases_rad_s=np.array([state.gyro_bias_rad_s for state in states]),
+        gravity_m_s2=states[0].gravity_m_s2,
+        error_before=error_before,
+        error_after=float(optimiser.error()),
+        iterations=iterations,
+        converged=iterations < _MAX_ITERATIONS,
+    )

@@ -1,0 +1,29 @@
+"""iSAM2 as hybridlio uses it (Kaess et al., "iSAM2: Incremental Smoothing and Mapping", IJRR 2012)."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+# A change of the newest pose hardly moves the oldest: below this change (rad, m, m/s) it is not carried on to older
+# variables, which would make each update cost as much as the run is long. The newest are always solved in full.
+_WILDFIRE_THRESHOLD = 1.0
+_RELINEARISE = {
+    "x": np.r_[np.full(3, 0.02), np.full(3, 1.0)],  # pose: rad, m
+    "v": np.full(3, 1.0),  # velocity, m/s
+    "b": np.r_[np.full(3, 0.1), np.full(3, 0.01)],  # biases: m/s², rad/s
+    "g": np.full(3, 0.1),  # gravity, m/s²
+}
+
+
+def incremental_solver() -> gtsam.ISAM2:
+    """An empty iSAM2 for graphs of poses ``x``, velocities ``v``, biases ``b`` and gravity ``g``."""
+    params = gtsam.ISAM2Params()
+    params.setFactorization("QR")  # Cholesky finds long straight chains indeterminate
+    params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(_WILDFIRE_THRESHOLD))
+    params.relinearizeSkip = 10
+    thresholds = gtsam.ISAM2ThresholdMap()
+    for kind, change in _RELINEARISE.items():
+        thresholds.insert((kind, change))
+    params.setRelinearizeThreshold(thresholds)
+    return gtsam.ISAM2(params)
