@@ -1,0 +1,86 @@
+"""Make the README's picture: a simulated drive, the map that the odometry draws of it, and one scan.
+
+python docs/make_pictures.py [FOLDER]
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from scipy.spatial import cKDTree
+
+import hybridlio as hl
+from hybridlio import se3
+from hybridlio.projection import map_geometry, vertex_map
+from hybridlio.voxel import voxel_average
+
+IMAGES = Path(__file__).resolve().parent / "images"
+CONFIG = hl.SimulationConfig(seconds=60, seed=5, speed_m_s=9.0)
+BACKGROUND = "#0d1117"
+HEIGHTS = LinearSegmentedColormap.from_list("heights", ["#222b3a", "#2f6f9f", "#5fd0c0", "#ffe08a"])
+
+
+def run(sequence: hl.Sequence) -> tuple[np.ndarray, np.ndarray]:
+    """Estimated poses, and the map they make of the scans, thinned."""
+    odometry = hl.Odometry()
+    poses, clouds = [], []
+    for frame in sequence:
+        estimate = odometry.step(frame)
+        poses.append(estimate.pose)
+        if frame.index % 5 == 0:
+            near = frame.scan.points[np.linalg.norm(frame.scan.points, axis=1) < 50]
+            clouds.append(se3.transform(estimate.pose, near))
+    cloud, _ = voxel_average(np.concatenate(clouds).astype(np.float32), None, 0.25)
+    return np.array(poses), cloud
+
+
+def draw_map(ax: Axes, cloud: np.ndarray, poses: np.ndarray, reference: np.ndarray) -> None:
+    _, nearest = cKDTree(poses[:, :2, 3]).query(cloud[:, :2])
+    above_road_m = cloud[:, 2] - poses[nearest, 2, 3] + 1.73
+    order = np.argsort(above_road_m)
+    height = np.clip(above_road_m[order], 0.0, 5.0)
+    ax.scatter(*cloud[order, :2].T, c=height, s=0.35, lw=0, cmap=HEIGHTS, vmin=0, vmax=5, rasterized=True)
+    ax.plot(reference[:, 0, 3], reference[:, 1, 3], color="white", lw=3.2, label="true path")
+    ax.plot(poses[:, 0, 3], poses[:, 1, 3], color="#ff5c5c", lw=1.2, label="hybridlio")
+    legend = ax.legend(loc="upper left", frameon=False, fontsize=11)
+    plt.setp(legend.get_texts(), color="white")
+    ax.set_aspect("equal")
+    x, y = ax.get_xlim()[0], ax.get_ylim()[0]
+    ax.plot([x + 10, x + 60], [y + 6, y + 6], color="white", lw=2)
+    ax.text(x + 35, y + 9, "50 m", color="white", ha="center", fontsize=10)
+    ax.axis("off")
+
+
+def draw_scan(ax: Axes, scan: hl.Scan) -> None:
+    ranges = np.linalg.norm(vertex_map(scan.points, map_geometry("hdl-64e")), axis=0)
+    ax.imshow(np.where(ranges > 0, ranges, np.nan), aspect="auto", cmap="magma_r", vmin=2, vmax=50)
+    ax.set_title("one scan as a range image: distance by elevation and azimuth", color="white", fontsize=10)
+    ax.axis("off")
+
+
+def main(folder: str | None = None) -> None:
+    root = Path(folder or tempfile.mkdtemp(prefix="hybridlio-"))
+    sequence = hl.open_sequence(hl.simulate(root, CONFIG))
+    poses, cloud = run(sequence)
+    figure, (above, below) = plt.subplots(
+        2, 1, figsize=(10, 7), height_ratios=[6, 1], facecolor=BACKGROUND, layout="constrained"
+    )
+    draw_map(above, cloud, poses, sequence.reference.poses)
+    draw_scan(below, sequence[len(sequence) // 2].scan)
+    IMAGES.mkdir(exist_ok=True)
+    figure.savefig(IMAGES / "drive.png", dpi=110, facecolor=BACKGROUND)
+    evaluation = hl.evaluate(sequence.reference, hl.Trajectory(sequence.stamps_ns, poses))
+    print(f"{IMAGES / 'drive.png'}: {evaluation.length_m:.0f} m, off at the end by {evaluation.end_error_m:.2f} m")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
