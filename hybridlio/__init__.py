@@ -9,6 +9,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time each name l
     from hybridlio.datasets.sequence import Sequence
     from hybridlio.errors import HybridLioError
     from hybridlio.estimates import RelativePose, State
+    from hybridlio.graph.offline import smooth
     from hybridlio.metrics import evaluate
     from hybridlio.odometry import Estimate, Odometry
     from hybridlio.sensors import Calibration, Frame, GpsFix, ImuNoise, ImuSamples, Scan
@@ -37,6 +38,7 @@ __all__ = [
     "evaluate",
     "open_sequence",
     "simulate",
+    "smooth",
 ]
 
 _HOMES = {
@@ -45,6 +47,7 @@ _HOMES = {
     "datasets.sequence": ("Sequence",),
     "errors": ("HybridLioError",),
     "estimates": ("RelativePose", "State"),
+    "graph.offline": ("smooth",),
     "metrics": ("evaluate",),
     "odometry": ("Estimate", "Odometry"),
     "sensors": ("Calibration", "Frame", "GpsFix", "ImuNoise", "ImuSamples", "Scan"),
