@@ -16,6 +16,7 @@ from hybridlio import se3
 from hybridlio.estimates import Array, RelativePose, State
 from hybridlio.graph import noise
 from hybridlio.sensors import NS_PER_S
+from hybridlio.startup import GRAVITY_M_S2, GRAVITY_MAGNITUDE_SIGMA_M_S2
 
 _GAUGE_SIGMA = 1e-6  # the first pose defines world
 _GRAVITY_CHAIN_SIGMA_M_S2 = 1e-6  # per scan; 0.1 mm/s² after 10,000 scans
@@ -32,8 +33,12 @@ def start_factors(state: State) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Value
         velocity_model = noise.gaussian(state.covariance[6:9, 6:9], "start velocity")
         graph.add(gtsam.PriorFactorVector(V(0), state.velocity_m_s, velocity_model))
         graph.add(gtsam.PriorFactorConstantBias(B(0), bias, noise.gaussian(state.covariance[9:, 9:], "start biases")))
-        gravity_model = noise.gaussian(state.gravity_covariance, "gravity")
+        gravity_model = noise.gaussian(state.gravity_covariance, "start gravity")
         graph.add(gtsam.PriorFactorPoint3(G(0), state.gravity_m_s2, gravity_model))
+        # gravity lies on a sphere, which no Gaussian around a direction that may be 0.3 rad off describes; the first
+        # pose is the origin, so that gravity's distance from it is its magnitude
+        magnitude = noise.sigmas(np.array([GRAVITY_MAGNITUDE_SIGMA_M_S2]))
+        graph.add(gtsam.RangeFactor3D(X(0), G(0), GRAVITY_M_S2, magnitude))
     return graph, values
 
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridlio.estimates import Array, State
+from hybridlio.estimates import State
 from hybridlio.sensors import ImuNoise, ImuSamples
 
 GRAVITY_M_S2 = 9.81
-_GRAVITY_MAGNITUDE_SIGMA_M_S2 = 0.03  # 9.78 at the equator, 9.83 at the poles
+GRAVITY_MAGNITUDE_SIGMA_M_S2 = 0.03  # 9.78 at the equator, 9.83 at the poles
 _UNKNOWN_ACCELERATION_SIGMA_M_S2 = 1.5  # braking, cornering: what the mean specific force may be off by
 _UNKNOWN_SPEED_SIGMA_M_S = 20.0
 
@@ -26,7 +26,8 @@ def start_state(stamp_ns: int, imu: ImuSamples, noise: ImuNoise) -> State:
         noise: how far the biases may be from zero.
 
     Returns:
-        The state, at the origin, with speed and biases zero and gravity opposite to the mean specific force.
+        The state, at the origin, with speed and biases zero and gravity opposite to the mean specific force, as unsure
+        every way as the vehicle's own acceleration; that its magnitude is known is for the graph to add.
     """
     speed = np.full(3, _UNKNOWN_SPEED_SIGMA_M_S)
     biases = np.r_[np.full(3, noise.accel_bias_sigma_m_s2), np.full(3, noise.gyro_bias_sigma_rad_s)]
@@ -36,15 +37,7 @@ def start_state(stamp_ns: int, imu: ImuSamples, noise: ImuNoise) -> State:
         down = np.array([0.0, 0.0, -GRAVITY_M_S2])
         return State(stamp_ns, np.eye(4), zero, zero, zero, down, covariance, np.eye(3), has_imu=False)
     mean_force = imu.accel_m_s2.mean(axis=0)
-    down = -mean_force / np.linalg.norm(mean_force)
-    return State(
-        stamp_ns, np.eye(4), zero, zero, zero, GRAVITY_M_S2 * down, covariance, _gravity_covariance(down, imu)
-    )  # fmt: skip
-
-
-def _gravity_covariance(down: Array, imu: ImuSamples) -> Array:
-    """``(3, 3)``: tight along the direction, whose length is known, wide across it."""
+    gravity = -GRAVITY_M_S2 * mean_force / np.linalg.norm(mean_force)
     standard_error = imu.accel_m_s2.std(axis=0).max() / np.sqrt(len(imu))
-    across = _UNKNOWN_ACCELERATION_SIGMA_M_S2**2 + standard_error**2
-    along = np.outer(down, down)
-    return np.asarray(_GRAVITY_MAGNITUDE_SIGMA_M_S2**2 * along + across * (np.eye(3) - along))
+    gravity_covariance = np.eye(3) * (_UNKNOWN_ACCELERATION_SIGMA_M_S2**2 + standard_error**2)
+    return State(stamp_ns, np.eye(4), zero, zero, zero, gravity, covariance, gravity_covariance)
