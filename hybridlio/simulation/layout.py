@@ -199,7 +199,7 @@ def _fence(layout: Layout, s: float, side: float, style: str) -> None:
         build = partial(street.bush, 2.4, 1.4)
     else:
         height = 1.1 if style != "wall" else 1.5
-        build = lambda rng: street.fence(style, 2.4, height)  # noqa: E731, ARG005
+        build = partial(street.fence, style, 2.4, height)
     layout.place(s, at, 0.0, 0.1, build, SIDEWALK_END_M - 0.3)
 
 
@@ -235,8 +235,7 @@ def _corridor(layout: Layout) -> None:
     """Smooth walls on both sides, with a lamp post now and then."""
     for side in (1.0, -1.0):
         for s in np.arange(2.0, layout.road.length_m - 2.0, 4.0):
-            build: Build = lambda rng: street.fence("wall", 4.06, 4.5)  # noqa: E731, ARG005
-            layout.place(float(s), side * 8.5, 0.0, 0.1, build, 7.0)
+            layout.place(float(s), side * 8.5, 0.0, 0.1, partial(street.fence, "wall", 4.06, 4.5), 7.0)
         for s in np.arange(30.0, layout.road.length_m, 120.0):
             _lamp(layout, float(s), side)
 

@@ -58,8 +58,8 @@ def _ground(land: Height, centreline: Road, config: SimulationConfig) -> Ground:
     rng = np.random.default_rng([config.seed, 2])
     points = centreline.at(np.arange(0.0, centreline.length_m, STEP_M))
     roughness = waves(rng, 24, (1.2, 6.0), 0.05)
-    pavement = waves(rng, 24, (5.0, 25.0), 0.006)
-    return Ground(land, roughness, pavement, cKDTree(points), curbs=config.scene == "town")
+    bumps, cracks = waves(rng, 24, (5.0, 25.0), 0.008), waves(rng, 24, (1.5, 5.0), 0.008)
+    return Ground(land, roughness, lambda xy: bumps(xy) + cracks(xy), cKDTree(points), curbs=config.scene == "town")
 
 
 def _along_generated_road(config: SimulationConfig) -> Drive:

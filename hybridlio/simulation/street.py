@@ -172,22 +172,22 @@ def sign(rng: np.random.Generator) -> Mesh:
     return merge([post, plate])
 
 
-def fence(style: str, length: float, height: float) -> Mesh:
+def fence(style: str, length: float, height: float, rng: np.random.Generator) -> Mesh:
     """A piece of ``wall``, ``picket`` or ``rail`` fence along x, centred."""
-    half = length / 2
+    half, shade = length / 2, rng.uniform(0.3, 0.5)
     if style == "wall":
-        return boxes((-half, -0.12, -_FOUNDATION_M), (half, 0.12, height), 0.4)
-    post = boxes((-half - 0.05, -0.05, -_FOUNDATION_M), (-half + 0.05, 0.05, height + 0.1), 0.4)
+        return boxes((-half, -0.12, -_FOUNDATION_M), (half, 0.12, height), shade)
+    post = boxes((-half - 0.05, -0.05, -_FOUNDATION_M), (-half + 0.05, 0.05, height + 0.1), shade)
     rails = boxes(
         [[-half, -0.02, 0.25 * height], [-half, -0.02, 0.8 * height]],
         [[half, 0.02, 0.25 * height + 0.08], [half, 0.02, 0.8 * height + 0.08]],
-        0.4,
+        shade,
     )
     if style == "rail":
         return merge([post, rails])
     x = np.arange(-half + 0.1, half - 0.1, 0.2)
     low = np.column_stack([x, 0 * x - 0.035, 0 * x + 0.08])
-    return merge([post, rails, boxes(low, low + np.array([0.09, 0.015, height - 0.08]), 0.4)])
+    return merge([post, rails, boxes(low, low + np.array([0.09, 0.015, height - 0.08]), shade)])
 
 
 def _in_ball(rng: np.random.Generator, count: int) -> Array:

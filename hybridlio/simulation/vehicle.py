@@ -72,4 +72,4 @@ def _suspension(signal: Array) -> Array:
     b, a = numerator.ravel(), denominator.ravel()
     settled = lfilter_zi(b, a) * signal[0]
     filtered, _ = lfilter(b, a, signal, zi=settled)
-    return np.asarray(gaussian_filter1d(filtered, 3.0, mode="nearest"))
+    return np.asarray(gaussian_filter1d(filtered, 1.5, mode="nearest"))
