@@ -27,10 +27,10 @@ class LocalMapSettings:
 
     __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
 
-    keyframe_m: float = 1.0
+    keyframe_m: float = 2.0
     keyframe_deg: float = 10.0
-    voxel_m: float = 1.0
-    horizon_keyframes: int = 60
+    voxel_m: float = 2.0
+    horizon_keyframes: int = 30
     radius_m: float = 100.0
     neighbours: int = 10
     threads: int = 2

@@ -16,6 +16,8 @@ from hybridlio.estimates import Array
 
 _ROTATION_CONVERGED_RAD = 2e-5
 _TRANSLATION_CONVERGED_M = 3e-4
+_REMATCH_ROTATION_RAD = 2e-4  # a centimetre at 50 m
+_REMATCH_TRANSLATION_M = 5e-3
 # Normals of a surface are off by a few hundredths of a radian, so that points on one plane alone seem to say something
 # of motion along it: this much of a point's information, per point, is that noise.
 NORMAL_NOISE = 2e-3
@@ -85,6 +87,16 @@ class Registration:
 
 
 @dataclass(frozen=True, eq=False)
+class _Matches:
+    """Which points of the scan lie near which of the surface, at the pose at which they were looked for."""
+
+    pose: Array
+    source: Array
+    target: Array
+    normals: Array
+
+
+@dataclass(frozen=True, eq=False)
 class _Linearisation:
     hessian: Array
     gradient: Array
@@ -92,20 +104,27 @@ class _Linearisation:
     weights: Array
 
 
-def _linearise(
-    surface: Surface, source: Array, pose: Array, kernel_m: float, max_m: float, threads: int
-) -> _Linearisation:
-    moved = source @ pose[:3, :3].T + pose[:3, 3]
-    index, distance2 = surface.nearest(moved, threads)
-    near = distance2 < max_m**2
+def _match(surface: Surface, source: Array, pose: Array, reach_m: float, threads: int) -> _Matches:
+    index, distance2 = surface.nearest(source @ pose[:3, :3].T + pose[:3, 3], threads)
+    near = distance2 < reach_m**2
     index = index[near]
-    normals = surface.normals[index]
-    residuals = np.einsum("ij,ij->i", moved[near] - surface.points[index], normals)
+    return _Matches(pose, source[near], surface.points[index], surface.normals[index])
+
+
+def _linearise(matches: _Matches, pose: Array, kernel_m: float) -> _Linearisation:
+    moved = matches.source @ pose[:3, :3].T + pose[:3, 3]
+    residuals = np.einsum("ij,ij->i", moved - matches.target, matches.normals)
     weights = (kernel_m**2 / (kernel_m**2 + residuals**2)) ** 2
-    normals_in_scan = normals @ pose[:3, :3]
-    J = np.hstack([np.cross(source[near], normals_in_scan), normals_in_scan])
+    normals_in_scan = matches.normals @ pose[:3, :3]
+    J = np.hstack([np.cross(matches.source, normals_in_scan), normals_in_scan])
     weighted = J * weights[:, None]
     return _Linearisation(weighted.T @ J, weighted.T @ residuals, residuals, weights)
+
+
+def _moved(matches: _Matches, pose: Array) -> bool:
+    """Whether the pose is so far from where neighbours were looked for that others may be nearer."""
+    step = se3.log(se3.between(matches.pose, pose))
+    return bool(np.abs(step[:3]).max() > _REMATCH_ROTATION_RAD or np.abs(step[3:]).max() > _REMATCH_TRANSLATION_M)
 
 
 def register(
@@ -124,10 +143,12 @@ def register(
         kernel_start_m: a wider kernel to begin with, halved at every step; for an uncertain ``initial``.
     """
     pose, kernel, converged, iterations = initial, max(settings.kernel_m, kernel_start_m), False, 0
+    matches = _match(surface, source, pose, max(settings.max_distance_m, 3 * kernel), settings.threads)
     while not converged and iterations < settings.max_iterations:
         iterations += 1
-        reach = max(settings.max_distance_m, 3 * kernel)
-        system = _linearise(surface, source, pose, kernel, reach, settings.threads)
+        if _moved(matches, pose):
+            matches = _match(surface, source, pose, max(settings.max_distance_m, 3 * kernel), settings.threads)
+        system = _linearise(matches, pose, kernel)
         step = _solve(system)
         pose = pose @ se3.exp(step)
         small = np.abs(step[:3]).max() < _ROTATION_CONVERGED_RAD and np.abs(step[3:]).max() < _TRANSLATION_CONVERGED_M

@@ -44,11 +44,11 @@ class ScanMatchingSettings:
     target: Literal["local-map", "last-scan"] = "local-map"
     min_range_m: float = 2.0
     max_range_m: float = 100.0
-    map_voxel_m: float = 0.4
+    map_voxel_m: float = 0.6
     source_voxel_m: float = 1.0
     min_points: int = 200
     min_matched: float = 0.3
-    covariance_scale: float = 10.0
+    covariance_scale: float = 4.0
     start_speeds_m_s: tuple[float, ...] = (0.0, -5.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0)
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
     local_map: LocalMapSettings = field(default_factory=LocalMapSettings)
