@@ -13,7 +13,8 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time each name l
     from hybridlio.metrics import evaluate
     from hybridlio.odometry import Estimate, Odometry
     from hybridlio.sensors import Calibration, Frame, GpsFix, ImuNoise, ImuSamples, Scan
-    from hybridlio.simulation import SimulationConfig, simulate
+    from hybridlio.simulation.config import SimulationConfig
+    from hybridlio.simulation.simulate import simulate
     from hybridlio.trajectory import Trajectory
 
 __version__ = "0.1.0"

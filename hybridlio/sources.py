@@ -7,11 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from hybridlio.config import Config
 from hybridlio.errors import ConfigError
-from hybridlio.estimates import Backend, InitialPoseSource, ResidualSource
-from hybridlio.sensors import Calibration, ImuNoise
+
+if TYPE_CHECKING:  # the command line lists the names, and must start quickly
+    from hybridlio.config import Config
+    from hybridlio.estimates import Backend, InitialPoseSource, ResidualSource
+    from hybridlio.sensors import Calibration, ImuNoise
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = {"torch", "gtsam", "open3d", "matplotlib", "small_gicp", "scipy", "pydantic", "typer"}
 # the only modules of hybridlio that may know that graph and learned exist
-TOP = {f"hybridlio.{name}" for name in ("__main__", "cli", "odometry", "run", "sources")} | {"hybridlio"}
+JOINING = ("__main__", "cli", "compare", "odometry", "run", "run_folder", "run_outputs", "sources")
 MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_IMPORT_S = 300, 60, 0.3
 
 
@@ -65,6 +65,7 @@ def inside(package: str) -> set[str]:
     return {module for module in MODULES if module == package or module.startswith(package + ".")}
 
 
+TOP = {f"hybridlio.{name}" for name in JOINING} | inside("hybridlio.commands") | {"hybridlio"}
 GRAPH, LEARNED = inside("hybridlio.graph"), inside("hybridlio.learned")
 
 

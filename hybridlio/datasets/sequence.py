@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,15 +80,51 @@ class Sequence:
         return len(self.stamps_ns)
 
     def __getitem__(self, index: int) -> Frame:
-        """Frame ``index`` (negative counts from the end), its scan read now."""
+        """Frame ``index`` (negative counts from the end), its scan read now.
+
+        Raises:
+            DataError: the scan cannot be read; :meth:`without_scan` gives the frame all the same.
+        """
         k = range(len(self))[index]
+        return self._frame(k, self.load_scan(k))
+
+    def without_scan(self, index: int) -> Frame:
+        """Frame ``index`` with a scan of no points, for going on where the scan cannot be read."""
+        k = range(len(self))[index]
+        return self._frame(k, Scan(int(self.stamps_ns[k]), np.empty((0, 3), np.float32)))
+
+    def part(self, start: int | None, stop: int | None) -> Sequence:
+        """Frames ``start`` to before ``stop`` as a sequence of its own, counted from 0, in its first scan's frame.
+
+        All inertial samples are kept: those before the first scan help to find where down is.
+
+        Raises:
+            DataError: no frame is left.
+        """
+        rows = slice(*slice(start, stop).indices(len(self))[:2])
+        if rows.start >= rows.stop:
+            raise DataError(f"{self.name}: no scans from {start} to {stop}; there are {len(self)}")
+        before = int(self.stamps_ns[rows.start - 1]) if rows.start else self._first_stamp_ns() - 1
+        reference = self.reference
+        if reference is not None:
+            reference = Trajectory(reference.stamps_ns[rows], reference.poses[rows]).from_first()
+        return replace(
+            self,
+            stamps_ns=self.stamps_ns[rows],
+            load_scan=lambda k: self.load_scan(k + rows.start),
+            reference=reference,
+            gps=tuple(fix for fix in self.gps if fix.stamp_ns > before),
+            forward_speed_m_s=None if self.forward_speed_m_s is None else self.forward_speed_m_s[rows],
+        )
+
+    def _frame(self, k: int, scan: Scan) -> Frame:
         end = int(self.stamps_ns[k])
         start = int(self.stamps_ns[k - 1]) if k else self._first_stamp_ns()
         first, last = (
             bisect_right(self.gps, t, key=lambda fix: fix.stamp_ns) for t in (start if k else start - 1, end)
         )
         imu = self.imu.between(start, end)
-        return Frame(k, self.load_scan(k), imu, self.gps[first:last], self.calibration, self.imu_noise)
+        return Frame(k, scan, imu, self.gps[first:last], self.calibration, self.imu_noise)
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))

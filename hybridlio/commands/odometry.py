@@ -1,0 +1,100 @@
+"""``hybridlio odometry``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hybridlio.commands import common
+from hybridlio.commands.common import FAILED, guarded
+from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
+from hybridlio.terminal import complain, progress, say, say_table
+
+if TYPE_CHECKING:
+    from hybridlio.config import Config
+    from hybridlio.report_data import Findings
+    from hybridlio.run import Run
+
+
+@guarded
+def odometry(
+    data: common.Data,
+    sequence: common.SequenceName = None,
+    reader: common.ReaderName = None,
+    raw_root: common.RawRoot = None,
+    initial_pose: Annotated[
+        str | None, typer.Option("--initial-pose", metavar="NAME", help=", ".join(INITIAL_POSE_SOURCES))
+    ] = None,
+    residual: Annotated[str | None, typer.Option(metavar="NAME", help=", ".join(RESIDUAL_SOURCES))] = None,
+    backend: Annotated[str | None, typer.Option(metavar="NAME", help=", ".join(BACKENDS))] = None,
+    config: common.ConfigFile = None,
+    frames: common.Frames = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", metavar="RUN", help="The run folder; by default runs/<sequence>-<date-time>."),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run that is in -o.")] = False,
+    _verbose: common.Verbose = 0,
+) -> None:
+    """Estimate a recording's trajectory and leave it, with covariances, graph, metrics and report, in a run folder.
+
+    Without -o, runs/latest is a link to the newest. Ctrl-C keeps what was estimated so far.
+    """
+    from hybridlio import run_folder
+    from hybridlio.odometry import Odometry
+    from hybridlio.run import run_odometry
+
+    chosen = common.settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
+    estimator = Odometry(config=chosen)
+    recording = common.open_data(data, sequence, reader, raw_root, frames)
+    folder = run_folder.new_run_folder(recording.name, out, overwrite)
+    with progress("odometry") as tick:
+        run = run_odometry(recording, estimator, lambda done, total, metres: tick(done, total, f"{metres:.1f} m"))
+    _finish(folder, run, chosen)
+    if out is None:
+        run_folder.point_latest_at(folder)
+
+
+def _finish(folder: Path, run: Run, config: Config) -> None:
+    """Write the run and say what came of it; an interrupted or failed one ends with its exit code."""
+    from hybridlio.run_outputs import write_run
+
+    if run.stopped is not None and not run.estimates:
+        _remove_if_empty(folder)
+        common.fail(run.stopped)
+    if isinstance(run.stopped, KeyboardInterrupt):
+        complain("interrupted: writing what was estimated so far (again to give it up)", "yellow")
+    findings = write_run(folder, run, config)
+    _say_result(folder, run, findings)
+    if run.stopped is None:
+        return
+    complain(f"kept {run.done} of {len(run.sequence)} scans in {folder}", "yellow")
+    if isinstance(run.stopped, KeyboardInterrupt):
+        raise typer.Exit(common.INTERRUPTED)
+    complain(f"frame {run.done}:", "red")
+    common.fail(run.stopped, FAILED)
+
+
+def _say_result(folder: Path, run: Run, findings: Findings) -> None:
+    from hybridlio.metrics import evaluation_table
+    from hybridlio.run_folder import POSES, REPORT
+    from hybridlio.run_outputs import forward_speed_length_m, ms_per_scan
+
+    metres, ms = run.estimated_trajectory.length_m, ms_per_scan(run).get("total")
+    speed = "" if ms is None else f", {ms:.0f} ms a scan"
+    say(f"{run.sequence.name}: {run.done} scans, {metres:.2f} m in {run.seconds:.1f} s{speed}")
+    if (driven := forward_speed_length_m(run)) is not None:
+        say(f"by its own forward speed the vehicle drove {driven:.2f} m")
+    if run.bridged:
+        say(f"bridged scans: {', '.join(map(str, run.bridged[:20]))}{' …' if len(run.bridged) > 20 else ''}")
+    if findings.evaluations:
+        say_table(evaluation_table(findings.evaluations))
+    say(f"poses   {folder / POSES}")
+    say(f"report  {folder / REPORT}")
+
+
+def _remove_if_empty(folder: Path) -> None:
+    if not any(folder.iterdir()):
+        folder.rmdir()

@@ -1,0 +1,29 @@
+"""``hybridlio view``."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hybridlio.commands.common import Verbose, guarded
+from hybridlio.errors import DataError
+from hybridlio.terminal import say
+
+
+@guarded
+def view(run: Annotated[Path, typer.Argument(help="A run folder.", show_default=False)], _verbose: Verbose = 0) -> None:
+    """Open a run's report in the browser; without a display, print where it is."""
+    import webbrowser
+
+    from hybridlio.run_folder import REPORT
+
+    report = (run / REPORT).absolute()
+    if not report.is_file():
+        raise DataError(f"{report}: no such report; `hybridlio odometry` and `hybridlio smooth` make run folders")
+    has_display = sys.platform in ("darwin", "win32") or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
+    if not (has_display and webbrowser.open(report.as_uri())):
+        say(f"{report}")

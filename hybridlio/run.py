@@ -1,0 +1,200 @@
+"""The loop: a sequence through an odometry, from the first scan to the last or to where it is stopped."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridlio.datasets.sequence import Sequence
+from hybridlio.errors import ConfigError, DataError
+from hybridlio.estimates import Array
+from hybridlio.initial_pose import unknown_motion_covariance
+from hybridlio.metrics import Steps
+from hybridlio.odometry import Estimate, Odometry
+from hybridlio.record import Record
+from hybridlio.sensors import NS_PER_S, Frame
+from hybridlio.trajectory import Trajectory
+
+_log = logging.getLogger(__name__)
+
+Progress = Callable[[int, int, float], None]
+
+
+@dataclass(eq=False)
+class Run:
+    """What a run came to, whole or up to where it stopped.
+
+    Scans before the first usable one have no estimate: :attr:`trajectory` holds the first pose there, with the
+    covariance of a motion of which nothing is known, and :attr:`estimated` is False.
+
+    Attributes:
+        sequence: the recording.
+        odometry: in the state it was left in.
+        estimates: one for each scan from the first usable one on.
+        skipped: scans before that one.
+        unreadable: why, by frame, where a scan could not be read or not be started at; bridged where there is an
+            estimate before.
+        reading_s: seconds spent reading, one for each estimate.
+        seconds: wall time of the whole loop.
+        stopped: what stopped the run before its end, such as a KeyboardInterrupt; None for a whole one.
+    """
+
+    sequence: Sequence
+    odometry: Odometry
+    estimates: list[Estimate] = field(default_factory=list)
+    skipped: int = 0
+    unreadable: dict[int, str] = field(default_factory=dict)
+    reading_s: list[float] = field(default_factory=list)
+    seconds: float = 0.0
+    stopped: BaseException | None = None
+
+    @property
+    def done(self) -> int:
+        """Scans dealt with: the rows of the trajectory."""
+        return self.skipped + len(self.estimates) if self.estimates else 0
+
+    @property
+    def estimated(self) -> NDArray[np.bool_]:
+        """``(done,)``; False before the first usable scan."""
+        return np.arange(self.done) >= self.skipped
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """``done`` poses in the first usable scan's frame, with covariances."""
+        own = self.estimated_trajectory
+        stamps = self.sequence.stamps_ns[: self.skipped]
+        before = (int(own.stamps_ns[0]) - stamps) / NS_PER_S
+        covariances = [unknown_motion_covariance(float(dt_s)) for dt_s in before]
+        return Trajectory(
+            np.concatenate([stamps, own.stamps_ns]),
+            np.concatenate([np.tile(np.eye(4), (self.skipped, 1, 1)), own.poses]),
+            np.concatenate([np.reshape(covariances, (-1, 6, 6)), [e.covariance for e in self.estimates]]),
+        )
+
+    @property
+    def estimated_trajectory(self) -> Trajectory:
+        """The estimates alone, without what :attr:`trajectory` fills in before them."""
+        estimates = self.estimates
+        return Trajectory(
+            np.array([e.stamp_ns for e in estimates]),
+            np.array([e.pose for e in estimates]).reshape(-1, 4, 4),
+            np.array([e.covariance for e in estimates]).reshape(-1, 6, 6),
+        )
+
+    @property
+    def steps(self) -> Steps:
+        """The backend's motions from estimate to estimate."""
+        steps = [e.step for e in self.estimates if e.step is not None]
+        return Steps(
+            np.array([s.pose for s in steps]).reshape(-1, 4, 4),
+            np.array([s.covariance for s in steps]).reshape(-1, 6, 6),
+        )
+
+    @property
+    def initial_poses(self) -> Array:
+        """Initial relative poses ``(N-1, 4, 4)`` of the ``N`` estimates."""
+        return np.array([e.initial.pose for e in self.estimates if e.initial is not None]).reshape(-1, 4, 4)
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """``(N-1,)``; False where the residual source failed and the initial pose bridges."""
+        return np.array([e.relative.ok for e in self.estimates if e.relative is not None], dtype=bool)
+
+    @property
+    def degenerate(self) -> NDArray[np.bool_]:
+        """``(N-1,)``; True where the scan left a direction unconstrained."""
+        return np.array([len(e.relative.degenerate) > 0 for e in self.estimates if e.relative is not None], dtype=bool)
+
+    @property
+    def bridged(self) -> list[int]:
+        """The frames of which :attr:`ok` is False."""
+        return (np.flatnonzero(~self.ok) + self.skipped + 1).tolist()
+
+    @property
+    def timings_s(self) -> dict[str, Array]:
+        """Seconds by stage, one for each estimate after the first; reading the scan is a stage."""
+        stages = dict.fromkeys(stage for e in self.estimates[1:] for stage in e.seconds)
+        spent = {stage: np.array([e.seconds.get(stage, 0.0) for e in self.estimates[1:]]) for stage in stages}
+        return {"reading": np.array(self.reading_s[1:]), **spent} if spent else {}
+
+    @property
+    def record(self) -> Record | None:
+        """What smoothing needs; None for less than two estimates."""
+        return self.odometry.record() if len(self.estimates) > 1 else None
+
+
+def run_odometry(sequence: Sequence, odometry: Odometry, progress: Progress | None = None) -> Run:
+    """Give every frame of a sequence to an odometry.
+
+    A scan that cannot be read is bridged as one of no points is, with a warning. What stops the run is kept in
+    :attr:`Run.stopped` rather than raised, so that what was estimated before is not lost.
+
+    Args:
+        sequence: the recording.
+        odometry: a fresh one.
+        progress: called after each scan with scans done, scans in all and metres travelled.
+    """
+    run = Run(sequence, odometry)
+    start = time.perf_counter()
+    distance_m = 0.0
+    try:
+        for k in range(len(sequence)):
+            _advance(run, k)
+            if len(run.estimates) > 1:
+                last = run.estimates[-2].pose[:3, 3], run.estimates[-1].pose[:3, 3]
+                distance_m += float(np.linalg.norm(last[1] - last[0]))
+            if progress is not None:
+                progress(k + 1, len(sequence), distance_m)
+        if not run.estimates:
+            raise DataError(f"{sequence.name}: no scan to start at; the first: {next(iter(run.unreadable.values()))}")
+    except (KeyboardInterrupt, Exception) as error:
+        run.stopped = error
+    run.seconds = time.perf_counter() - start
+    return run
+
+
+def _advance(run: Run, k: int) -> None:
+    """Read frame ``k`` and estimate it; before the first estimate a frame that cannot be started at is skipped."""
+    start = time.perf_counter()
+    frame = _frame(run, k)
+    read = time.perf_counter() - start
+    try:
+        if not run.estimates and k in run.unreadable:
+            raise DataError(run.unreadable[k])
+        estimate = run.odometry.step(frame)
+    except DataError as error:
+        if run.estimates:
+            raise
+        run.unreadable[k] = str(error)
+        run.skipped += 1
+        _log.warning("frame %d: cannot start here, trying the next: %s", k, error)
+        return
+    run.reading_s.append(read)
+    run.estimates.append(estimate)
+
+
+def _frame(run: Run, k: int) -> Frame:
+    try:
+        return run.sequence[k]
+    except DataError as error:
+        run.unreadable[k] = str(error)
+        if run.estimates:
+            _log.warning("frame %d: bridged by the initial pose: %s", k, error)
+        return run.sequence.without_scan(k)
+
+
+def part_of(sequence: Sequence, frames: str | None) -> Sequence:
+    """The frames ``A:B`` of a sequence, as Python counts them; all without a range."""
+    if frames is None:
+        return sequence
+    ends = frames.split(":")
+    try:
+        start, stop = (int(end) if end.strip() else None for end in ends)
+    except ValueError:
+        raise ConfigError(f"frames {frames!r}: give a range such as 100:200, 100: or :200") from None
+    return sequence.part(start, stop)

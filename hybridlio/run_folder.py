@@ -1,0 +1,160 @@
+"""A run folder: what a run leaves, and how it is found and read again.
+
+``metrics.json`` is written last: a folder that has it is complete.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+import shutil
+from collections.abc import Sequence as Items
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybridlio.errors import ConfigError, DataError
+from hybridlio.estimates import RelativePose
+from hybridlio.files import write_whole, writing_whole
+from hybridlio.metrics import Steps
+from hybridlio.trajectory import Trajectory
+from hybridlio.trajectory_errors import select
+from hybridlio.trajectory_files import read_tum, write_kitti, write_tum
+
+POSES, KITTI, COVARIANCES, GRAPH = "poses_tum.txt", "poses_kitti.txt", "covariances.npz", "graph.g2o"
+RECORD, CONFIG, METRICS, REFERENCE = "odometry.npz", "config.yaml", "metrics.json", "reference_tum.txt"
+REPORT, PICTURE, SMOOTHED = "report.html", "trajectory.png", "smoothed"
+FILES = (POSES, KITTI, COVARIANCES, GRAPH, RECORD, CONFIG, METRICS, REFERENCE, REPORT, PICTURE)
+
+
+@dataclass(frozen=True, eq=False)
+class StoredRun:
+    """A run as read from its folder.
+
+    Attributes:
+        path: the folder.
+        trajectory: what was estimated, with covariances where there are any; rows filled in before the first usable
+            scan are left out.
+        steps: the motions between, where the folder has their covariances.
+        reference: the truth that came with the recording, at the same rows, or None.
+        metrics: what ``metrics.json`` says.
+    """
+
+    path: Path
+    trajectory: Trajectory
+    steps: Steps | None
+    reference: Trajectory | None
+    metrics: dict[str, Any]
+
+    @property
+    def T_camera_lidar(self) -> NDArray[np.float64] | None:
+        """``(4, 4)`` where KITTI pose files of this recording are in a camera's frame, else None."""
+        T = self.metrics.get("T_camera_lidar")
+        return None if T is None else np.array(T, dtype=np.float64)
+
+
+def new_run_folder(sequence: str, out: Path | None, overwrite: bool) -> Path:
+    """The folder to write a run to, made now, so that a place without rights is noticed before the work.
+
+    Without ``out`` it is ``runs/<sequence>-<date-time>``.
+
+    Raises:
+        ConfigError: ``out`` holds a run already, and ``overwrite`` is not set.
+        DataError: the folder cannot be made.
+    """
+    if out is None:
+        now = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+        names = [f"{sequence}-{now}", *(f"{sequence}-{now}-{n}" for n in range(2, 100))]
+        out = next(path for name in names if not (path := Path("runs") / name).exists())
+    if (out / METRICS).exists() and not overwrite:
+        raise ConfigError(f"{out} holds a run already; choose another folder, or --overwrite it")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"cannot make the run folder {out}: {error.strerror}; choose another with -o") from None
+    return out
+
+
+def clear(folder: Path) -> None:
+    """Remove a run's files, what says that it is complete first; leave anything else in the folder."""
+    (folder / METRICS).unlink(missing_ok=True)
+    for name in FILES:
+        (folder / name).unlink(missing_ok=True)
+    shutil.rmtree(folder / SMOOTHED, ignore_errors=True)
+
+
+def point_latest_at(folder: Path) -> None:
+    """Make ``latest`` beside the folder a link to it, replacing an older one in one move."""
+    link = folder.parent / "latest"
+    if link.exists() and not link.is_symlink():
+        return
+    temporary = folder.parent / f".latest.{os.getpid()}"
+    temporary.unlink(missing_ok=True)
+    temporary.symlink_to(folder.name)
+    temporary.replace(link)
+
+
+def write_trajectory(
+    folder: Path,
+    trajectory: Trajectory,
+    T_camera_lidar: ArrayLike | None,
+    steps: Steps | None = None,
+    estimated: NDArray[np.bool_] | None = None,
+) -> None:
+    """Write the poses in both text formats, and ``covariances.npz``.
+
+    The latter holds ``stamps_ns`` ``(N,)``, ``absolute`` ``(N, 6, 6)``, ``estimated`` ``(N,)`` and, with ``steps``,
+    ``relative_poses`` ``(N-1, 4, 4)`` and ``relative`` ``(N-1, 6, 6)``; rad² and m², rotation first.
+    """
+    write_tum(folder / POSES, trajectory)
+    write_kitti(folder / KITTI, trajectory, T_camera_lidar)
+    arrays: dict[str, Any] = {"stamps_ns": trajectory.stamps_ns, "absolute": trajectory.covariances}
+    arrays["estimated"] = np.ones(len(trajectory), bool) if estimated is None else estimated
+    if steps is not None:
+        arrays |= {"relative_poses": steps.poses, "relative": steps.covariances}
+    with writing_whole(folder / COVARIANCES) as part, part.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def write_graph(folder: Path, poses: NDArray[np.float64], relative: Items[RelativePose], first: int = 0) -> None:
+    """Write ``N`` poses, numbered from ``first``, and the ``N-1`` relative poses between them as ``graph.g2o``."""
+    from hybridlio.graph.g2o import write_g2o
+
+    write_g2o(folder / GRAPH, poses, [(k, k + 1, step) for k, step in enumerate(relative, first)], first)
+
+
+def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
+    """Write ``metrics.json``, by which the folder counts as complete."""
+    write_whole(folder / METRICS, json.dumps(metrics, indent=2, ensure_ascii=False) + "\n")
+
+
+def is_run_folder(path: Path) -> bool:
+    """Whether there is a run at ``path``."""
+    return (path / METRICS).is_file() and (path / POSES).is_file()
+
+
+def read_run(path: Path) -> StoredRun:
+    """Read a run folder.
+
+    Raises:
+        DataError: there is no complete run, or one of its files is malformed.
+    """
+    if not is_run_folder(path):
+        what = "no such folder" if not path.exists() else f"no run in it (it has no {METRICS})"
+        raise DataError(f"{path}: {what}; `hybridlio odometry` makes run folders")
+    whole = read_tum(path / POSES)
+    reference = read_tum(path / REFERENCE) if (path / REFERENCE).is_file() else None
+    try:
+        metrics = json.loads((path / METRICS).read_text())
+        with np.load(path / COVARIANCES, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        rows = np.flatnonzero(arrays["estimated"])
+        trajectory = select(Trajectory(whole.stamps_ns, whole.poses, arrays["absolute"]), rows)
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise DataError(f"{path}: its {METRICS} or {COVARIANCES} cannot be read ({error}); run again") from error
+    steps = Steps(arrays["relative_poses"], arrays["relative"]) if "relative" in arrays else None
+    return StoredRun(path, trajectory, steps, reference, metrics)

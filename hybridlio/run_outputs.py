@@ -1,0 +1,141 @@
+"""What is written of a run: its files, its metrics, its report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hybridlio import __version__, run_folder
+from hybridlio.config import Config, config_to_yaml
+from hybridlio.errors import EstimationError
+from hybridlio.files import write_whole
+from hybridlio.metrics import Evaluation
+from hybridlio.report import pictures, write_report
+from hybridlio.report_data import Findings, ReportData, find
+from hybridlio.run import Run
+from hybridlio.trajectory_files import write_tum
+
+_ONLINE = "odometry"
+
+
+def write_run(folder: Path, run: Run, config: Config) -> Findings:
+    """Write everything of a run, whole or interrupted, in place of what an earlier run left in the folder.
+
+    Returns:
+        What the evaluation found.
+
+    Raises:
+        EstimationError: there is not a single estimate.
+        DataError: a file cannot be written.
+    """
+    if not run.estimates:
+        raise EstimationError(f"{run.sequence.name}: nothing was estimated")
+    run_folder.clear(folder)
+    sequence, trajectory, record = run.sequence, run.trajectory, run.record
+    if record is not None:
+        record.save(folder / run_folder.RECORD)
+        run_folder.write_graph(folder, trajectory.poses[run.skipped :], record.relative, run.skipped)
+    run_folder.write_trajectory(folder, trajectory, T_pose_files(run), run.steps, run.estimated)
+    if sequence.reference is not None:
+        write_tum(folder / run_folder.REFERENCE, sequence.reference)
+    text = config_to_yaml(config)
+    write_whole(folder / run_folder.CONFIG, text)
+    data = report_data(run, config, text)
+    findings = find(data)
+    write_pages(folder, data, findings)
+    run_folder.write_metrics(folder, metrics(run, config, findings.evaluations.get(_ONLINE)))
+    return findings
+
+
+def write_pages(folder: Path, data: ReportData, findings: Findings) -> None:
+    """Write ``report.html``, and the picture of the path alone."""
+    from hybridlio.plots import to_png
+
+    write_report(folder / run_folder.REPORT, data, findings)
+    write_whole(folder / run_folder.PICTURE, to_png(pictures(data, findings)["trajectory"]))
+
+
+def T_pose_files(run: Run) -> Any:
+    """``T_camera_lidar`` where KITTI pose files of the recording are in the camera's frame, else None."""
+    sequence = run.sequence
+    return sequence.calibration.T_camera_lidar if sequence.pose_file_frame == "camera" else None
+
+
+def notes(run: Run) -> list[str]:
+    """What a reader should know before trusting the figures."""
+    out = list(run.sequence.notes)
+    if run.stopped is not None:
+        why = "interrupted" if isinstance(run.stopped, KeyboardInterrupt) else f"stopped by an error ({run.stopped})"
+        out.append(f"{why} after {run.done} of {len(run.sequence)} scans")
+    if run.skipped:
+        out.append(f"the first {run.skipped} scans could not be used: the run starts at scan {run.skipped}")
+    if run.bridged:
+        out.append(f"{len(run.bridged)} scans could not be used and are bridged by the initial pose")
+    return out + [f"frame {k}: {why}" for k, why in run.unreadable.items()]
+
+
+def report_data(run: Run, config: Config, config_text: str) -> ReportData:
+    """The run for its report."""
+    return ReportData(
+        name=run.sequence.name,
+        estimate=run.estimated_trajectory,
+        reference=run.sequence.reference,
+        estimate_name=_ONLINE,
+        initial_poses=run.initial_poses,
+        final_poses=run.steps.poses,
+        step_covariances=run.steps.covariances,
+        timings_s=run.timings_s,
+        ok=run.ok,
+        degenerate=run.degenerate,
+        facts={"initial pose": config.initial_pose, "residual": config.residual, "backend": config.backend},
+        config=config_text,
+        warnings=notes(run),
+    )
+
+
+def metrics(run: Run, config: Config, evaluation: Evaluation | None) -> dict[str, Any]:
+    """The figures of a run as plain values: what was done, how quickly and, with a reference, how well."""
+    T = T_pose_files(run)
+    out: dict[str, Any] = {
+        "hybridlio": __version__,
+        "sequence": run.sequence.name,
+        "initial_pose": config.initial_pose,
+        "residual": config.residual,
+        "backend": config.backend,
+        "frames": len(run.sequence),
+        "frames_done": run.done,
+        "interrupted": run.stopped is not None,
+        "skipped": run.skipped,
+        "bridged": run.bridged,
+        "degenerate": (np.flatnonzero(run.degenerate) + run.skipped + 1).tolist(),
+        "unreadable": {str(k): why for k, why in run.unreadable.items()},
+        "notes": notes(run),
+        "path_length_m": run.estimated_trajectory.length_m,
+        "forward_speed_length_m": forward_speed_length_m(run),
+        "seconds": run.seconds,
+        "ms_per_scan": ms_per_scan(run),
+        "pose_file_frame": run.sequence.pose_file_frame,
+    }
+    if T is not None:
+        out["T_camera_lidar"] = T.tolist()
+    return out | (evaluation.to_json_dict() if evaluation is not None else {})
+
+
+def ms_per_scan(run: Run) -> dict[str, float]:
+    """Median milliseconds a scan by stage, and ``total`` without reading; empty for a single estimate."""
+    stages = run.timings_s
+    if not stages:
+        return {}
+    total = np.sum([spent for stage, spent in stages.items() if stage != "reading"], axis=0)
+    return {stage: 1e3 * float(np.median(spent)) for stage, spent in {**stages, "total": total}.items()}
+
+
+def forward_speed_length_m(run: Run) -> float | None:
+    """How far the vehicle went over the estimated scans by its own forward speed (trapezoidal rule), if known."""
+    speed = run.sequence.forward_speed_m_s
+    if speed is None or len(run.estimates) < 2:
+        return None
+    rows = slice(run.skipped, run.done)
+    return float(np.trapezoid(speed[rows], run.sequence.stamps_ns[rows] / 1e9))

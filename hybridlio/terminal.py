@@ -1,0 +1,124 @@
+"""What the commands print: results on stdout; progress, warnings and errors on stderr."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+
+class Tick(Protocol):
+    """Says how far a loop is."""
+
+    def __call__(self, done: int, total: int, detail: str = "") -> None:
+        """Say that ``done`` of ``total`` is done, and a word on it."""
+        ...
+
+
+_TABLE_WIDTH = 240  # where the output is no terminal: nobody's columns to fit into
+
+
+def say(text: str) -> None:
+    """Print a line of results, as it is."""
+    Console().print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def say_table(table: Table) -> None:
+    """Print a table; a file or pipe gets it at full width."""
+    console = Console()
+    (console if console.is_terminal else Console(width=_TABLE_WIDTH)).print(table)
+
+
+def complain(text: str, style: str = "red") -> None:
+    """Print a line of trouble to stderr."""
+    _stderr().print(Text(text, style=style), soft_wrap=True)
+
+
+def set_up_logging(verbosity: int) -> None:
+    """Show the library's log: warnings, with 1 also what it does, with 2 everything and where it comes from."""
+    logger = logging.getLogger("hybridlio")
+    for handler in [h for h in logger.handlers if isinstance(h, _Handler)]:
+        logger.removeHandler(handler)
+    logger.addHandler(_Handler(verbosity))
+    logger.setLevel((logging.WARNING, logging.INFO, logging.DEBUG)[min(verbosity, 2)])
+    logger.propagate = False
+    logging.getLogger("matplotlib").setLevel(logging.WARNING if verbosity else logging.ERROR)
+
+
+class _Handler(logging.Handler):
+    """Lines such as ``warning: …``, above a progress bar where one runs."""
+
+    def __init__(self, verbosity: int) -> None:
+        super().__init__()
+        self._verbosity = verbosity
+
+    def emit(self, record: logging.LogRecord) -> None:
+        where = f" ({record.name})" if self._verbosity > 1 else ""
+        style = {logging.WARNING: "yellow", logging.ERROR: "red"}.get(record.levelno, "dim")
+        complain(f"{record.levelname.lower()}: {record.getMessage()}{where}", style)
+
+
+@contextmanager
+def progress(what: str, unit: str = "scans") -> Iterator[Tick]:
+    """Show how far a loop is: a bar on a terminal, else a line every tenth.
+
+    Yields:
+        A function to call with what is done, what there is in all, and a word on it, such as the distance.
+    """
+    with (_bar if _stderr().is_terminal else _lines)(what, unit) as tick:
+        yield tick
+
+
+@contextmanager
+def _bar(what: str, unit: str) -> Iterator[Tick]:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[detail]}"),
+    )
+    start = time.perf_counter()
+    with Progress(*columns, console=_stderr()) as bar:
+        task = bar.add_task(what, total=None, rate="", detail="")
+
+        def tick(done: int, total: int, detail: str = "") -> None:
+            bar.update(task, completed=done, total=total, rate=_rate(done, start, unit), detail=detail)
+
+        yield tick
+
+
+@contextmanager
+def _lines(what: str, unit: str) -> Iterator[Tick]:
+    start, shown = time.perf_counter(), 0
+
+    def tick(done: int, total: int, detail: str = "") -> None:
+        nonlocal shown
+        tenth = 10 * done // max(total, 1)
+        if tenth > shown:
+            shown = tenth
+            left = (time.perf_counter() - start) * (total - done) / done
+            words = [f"{done}/{total} {unit} ({100 * done // total} %)", _rate(done, start, unit), f"{left:.0f} s left"]
+            complain(f"{what}: {', '.join([*words, *([detail] if detail else [])])}", "none")
+
+    yield tick
+
+
+def _rate(done: int, start: float, unit: str) -> str:
+    return f"{done / max(time.perf_counter() - start, 1e-9):.1f} {unit}/s"
+
+
+@functools.cache
+def _stderr() -> Console:
+    """One console for all, so that lines and bars do not write over each other; it finds stderr anew each time."""
+    return Console(stderr=True)
