@@ -52,7 +52,8 @@ _HOMES = {
     "metrics": ("evaluate",),
     "odometry": ("Estimate", "Odometry"),
     "sensors": ("Calibration", "Frame", "GpsFix", "ImuNoise", "ImuSamples", "Scan"),
-    "simulation": ("SimulationConfig", "simulate"),
+    "simulation.config": ("SimulationConfig",),
+    "simulation.simulate": ("simulate",),
     "trajectory": ("Trajectory",),
 }
 _HOME_OF = {name: f"hybridlio.{module}" for module, names in _HOMES.items() for name in names}
