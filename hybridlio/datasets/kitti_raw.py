@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hybridlio import se3
 from hybridlio.datasets.extras import read_gps_csv, read_simulation
 from hybridlio.datasets.kitti_files import BinScans, numbered, read_calibration, read_rigid, rows_of
-from hybridlio.datasets.oxts import KITTI_GYRO_LAG_NS, OxtsRows, read_oxts
+from hybridlio.datasets.oxts import OxtsRows, read_oxts
 from hybridlio.datasets.sequence import Notes, Sequence
 from hybridlio.datasets.stamps import MISSING_STAMP, increasing, note_coverage, note_gaps, read_stamps
 from hybridlio.errors import DataError
@@ -45,8 +45,9 @@ def open_drive(drive: Path, raw_root: Path | None = None) -> Sequence:
     """One drive. ``raw_root`` is not needed here: calibration and 100 Hz data lie beside the drive.
 
     Stamps are the scans' own, or else those of the navigation rows with the same numbers. The inertial samples are
-    the 100 Hz ones of the sibling ``*_extract`` folder where it exists, else the 10 Hz ones, with a warning; KITTI's
-    angular rates are late, and moved to when they were (:meth:`hybridlio.datasets.oxts.OxtsRows.imu`).
+    the 100 Hz ones of the sibling ``*_extract`` folder where it exists, else the 10 Hz ones, with a warning. Angular
+    rates that are late against the attitudes, as KITTI's are, move to when they were, with a note
+    (:func:`hybridlio.datasets.gyro_lag.gyro_lag_ns`).
 
     Raises:
         DataError: no scans, stamps that do not match them, malformed navigation rows, or a missing calibration.
@@ -59,7 +60,7 @@ def open_drive(drive: Path, raw_root: Path | None = None) -> Sequence:
     oxts = read_oxts(drive / "oxts", notes) if (drive / "oxts").is_dir() else None
     calibration = read_drive_calibration(drive.parent, needs_imu=oxts is not None)
     simulation = read_simulation(drive / "simulation.json")
-    imu = drive_imu(drive, oxts, notes, gyro_lag_ns=0 if simulation else KITTI_GYRO_LAG_NS)
+    imu = drive_imu(drive, oxts, notes)
     note_coverage(imu.stamps_ns, stamps, "inertial data", notes)
     return Sequence(
         name=notes.name,
@@ -113,18 +114,25 @@ def _scans(drive: Path, notes: Notes) -> tuple[NDArray[np.int64], NDArray[np.int
     return numbers, lines[numbers], tuple(paths[k] for k in keep)
 
 
-def drive_imu(drive: Path, oxts: OxtsRows | None, notes: Notes, gyro_lag_ns: int = KITTI_GYRO_LAG_NS) -> ImuSamples:
+def drive_imu(drive: Path, oxts: OxtsRows | None, notes: Notes) -> ImuSamples:
     """The inertial samples of a drive: 100 Hz from the sibling ``*_extract`` folder, else those of ``oxts``."""
     extract = drive.with_name(drive.name.removesuffix("_sync") + "_extract")
     if (extract / "oxts").is_dir():
-        return read_oxts(extract / "oxts", notes).imu(gyro_lag_ns)
+        return _in_time(read_oxts(extract / "oxts", notes), notes)
     if oxts is None:
         notes.add(f"no inertial data: neither {drive / 'oxts'} nor {extract / 'oxts'} exists")
         return ImuSamples.empty()
     rate = 1e9 / float(np.median(np.diff(oxts.stamps_ns))) if len(oxts) > 1 else 0.0
     if rate < 50:
         notes.add(_SLOW_IMU.format(rate=rate, folder=drive / "oxts", extract=extract.name))
-    return oxts.imu(gyro_lag_ns)
+    return _in_time(oxts, notes)
+
+
+def _in_time(rows: OxtsRows, notes: Notes) -> ImuSamples:
+    lag_ns = rows.gyro_lag_ns
+    if lag_ns:
+        notes.add(f"angular rates are {lag_ns / 1e6:.0f} ms late against the attitudes of the same rows; moved back")
+    return rows.imu(lag_ns)
 
 
 def read_drive_calibration(date: Path, needs_imu: bool) -> Calibration:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hybridlio import se3
+from hybridlio.datasets.gyro_lag import gyro_lag_ns
 from hybridlio.datasets.kitti_files import numbered
 from hybridlio.datasets.reference import poses_at
 from hybridlio.datasets.sequence import Notes
@@ -25,16 +26,10 @@ from hybridlio.trajectory import Trajectory
 Array = NDArray[np.float64]
 
 COLUMNS = 30
-_LAT, _LON, _ALT, _ROLL, _PITCH, _YAW, _FORWARD = 0, 1, 2, 3, 4, 5, 8
-_ACCEL, _GYRO = slice(11, 14), slice(17, 20)
+_LAT, _LON, _ALT, _FORWARD = 0, 1, 2, 8
+_ATTITUDE, _ACCEL, _GYRO = slice(3, 6), slice(11, 14), slice(17, 20)  # roll pitch yaw; forward left up
 _EARTH_RADIUS_M = 6378137.0
 _SLOW_NS = 20_000_000
-
-# By how much KITTI's angular rates are late against the attitudes of the same rows, which agree with the scans. The
-# shift that fits best is 54, 55 and 59 ms about x, y and z in the median of 43 drives of all five dates, alike at 10
-# and 100 Hz, and takes the error of 0.1 s of integrated rates from 0.05° to 0.03° (x, y) and from 0.025° to 0.009° (z).
-# The specific forces are late by 10 to 20 ms at most and stay.
-KITTI_GYRO_LAG_NS = 56_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +50,9 @@ class OxtsRows:
     def imu(self, gyro_lag_ns: int) -> ImuSamples:
         """Angular velocity and specific force along the body's axes (forward, left, up), both at their own times.
 
-        The angular velocities of a row are those of ``gyro_lag_ns`` before (:data:`KITTI_GYRO_LAG_NS`; 0 for a
-        simulated drive), so they are moved there by linear interpolation. Slow rows keep the samples of both, at the
-        stamps of both; the last angular velocity is held for as long as the lag.
+        The angular velocities of a row are those of ``gyro_lag_ns`` before, so they are moved there by linear
+        interpolation. Slow rows keep the samples of both, at the stamps of both; the last angular velocity is held for
+        as long as the lag. KITTI's specific forces are late by 10 to 20 ms at most and stay.
         """
         stamps, moved = self.stamps_ns, self.stamps_ns - gyro_lag_ns
         if len(self) > 1 and np.median(np.diff(stamps)) > _SLOW_NS:
@@ -68,13 +63,18 @@ class OxtsRows:
         return ImuSamples(stamps, np.column_stack(gyro), np.column_stack(accel))
 
     @property
+    def gyro_lag_ns(self) -> int:
+        """By how much the angular velocities are late, see :func:`hybridlio.datasets.gyro_lag.gyro_lag_ns`."""
+        return gyro_lag_ns(self.stamps_ns, self.values[:, _ATTITUDE], self.values[:, _GYRO])
+
+    @property
     def T_enu_imu(self) -> Array:
         """Poses ``(R, 4, 4)``, east-north-up with its origin at the first row's position."""
         lat, lon = self.values[:, _LAT], self.values[:, _LON]
         scale_m = _EARTH_RADIUS_M * np.cos(np.radians(lat[0]))
         east, north = scale_m * np.radians(lon), scale_m * np.log(np.tan(np.pi / 4 + np.radians(lat) / 2))
         position = np.column_stack([east, north, self.values[:, _ALT]])
-        attitude = Rotation.from_euler("ZYX", self.values[:, [_YAW, _PITCH, _ROLL]]).as_matrix()
+        attitude = Rotation.from_euler("ZYX", self.values[:, _ATTITUDE][:, ::-1]).as_matrix()
         return se3.make(attitude, position - position[0])
 
     def forward_speed_at(self, stamps_ns: NDArray[np.int64]) -> Array:

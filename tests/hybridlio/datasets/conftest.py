@@ -86,8 +86,12 @@ def put_bin(path: Path, points: Array) -> Path:
 
 
 def put_oxts(folder: Path, ride: Ride, stamps_ns: NDArray[np.int64]) -> None:
+    put_rows(folder, stamps_ns, ride.oxts_rows(stamps_ns))
+
+
+def put_rows(folder: Path, stamps_ns: NDArray[np.int64], rows: Array) -> None:
     put(folder / "timestamps.txt", "".join(f"{iso(t)}\n" for t in stamps_ns))
-    for k, row in enumerate(ride.oxts_rows(stamps_ns)):
+    for k, row in enumerate(rows):
         put(folder / f"data/{k:010d}.txt", " ".join(f"{v:.14g}" for v in row) + "\n")
 
 
@@ -166,6 +170,7 @@ class Recordings:
     put = staticmethod(put)
     put_bin = staticmethod(put_bin)
     put_oxts = staticmethod(put_oxts)
+    put_rows = staticmethod(put_rows)
     imu_csv = staticmethod(imu_csv)
     iso = staticmethod(iso)
 

@@ -15,6 +15,8 @@ from scipy.integrate import trapezoid
 
 from hybridlio.datasets import open_sequence
 from hybridlio.datasets.kitti_raw import find
+from hybridlio.datasets.oxts import read_oxts
+from hybridlio.datasets.sequence import Notes
 from hybridlio.errors import DataError
 from hybridlio.sensors import LIDAR_MODELS, ImuNoise, ImuSamples
 from hybridlio.trajectory import Trajectory
@@ -82,7 +84,39 @@ class TestInertialData:
         assert "less accurate" in record.getMessage()
         assert "2011_09_30_drive_0016_extract" in record.getMessage()
         assert sequence.notes == (record.getMessage().removeprefix(f"{sequence.name}: "),)
-        assert set(recordings.ride.stamps_ns + 4 * MS) < set(sequence.imu.stamps_ns)
+        np.testing.assert_array_equal(sequence.imu.stamps_ns, recordings.ride.stamps_ns + 4 * MS)
+
+    @pytest.mark.parametrize("lag_ms", [0, 56])
+    @pytest.mark.parametrize("fast", [False, True])
+    def test_rates_that_are_late_in_the_drives_own_rows_move_to_when_they_were_with_a_note(
+        self, recordings: Any, drive: Path, lag_ms: int, fast: bool
+    ) -> None:
+        extract = drive.with_name("2011_09_30_drive_0016_extract") / "oxts"
+        oxts, period_ms = (extract, 10) if fast else (drive / "oxts", 100)
+        shutil.rmtree(extract)
+        stamps = recordings.ride.start_ns + np.arange(-20, 4000, period_ms) * MS
+        rows, seconds = recordings.ride.oxts_rows(stamps), (stamps - recordings.ride.start_ns) / 1e9
+        rows[:, 3:6] = np.outer(0.1 * np.sin(3 * seconds), [0, 0, 1])
+        rows[:, 17:20] = np.outer(0.3 * np.cos(3 * (seconds - lag_ms / 1e3)), [0, 0, 1])
+        recordings.put_rows(oxts, stamps, rows)
+        sequence = open_sequence(drive)
+        seconds = (sequence.imu.stamps_ns - recordings.ride.start_ns) / 1e9
+        known = seconds < 3.8
+        np.testing.assert_allclose(sequence.imu.gyro_rad_s[known, 2], 0.3 * np.cos(3 * seconds[known]), atol=0.005)
+        assert [note for note in sequence.notes if "late against" in note] == (
+            [f"angular rates are {lag_ms} ms late against the attitudes of the same rows; moved back"] if lag_ms else []
+        )
+
+    def test_a_simulated_drives_rates_are_found_in_time_without_being_told_that_it_is_simulated(
+        self, tmp_path: Path
+    ) -> None:
+        from hybridlio.simulation import SimulationConfig, simulate
+
+        drive = simulate(tmp_path, SimulationConfig(seconds=3, lidar="16-beam", scene="field", seed=3))
+        (drive / "simulation.json").unlink()
+        for name in (drive.name, drive.name.replace("sync", "extract")):
+            assert read_oxts(drive.with_name(name) / "oxts", Notes("drive")).gyro_lag_ns == 0
+        assert not any("late against" in note for note in open_sequence(drive).notes)
 
     def test_a_frame_before_the_first_sample_carries_none(self, recordings: Any, tmp_path: Path) -> None:
         sequence = open_sequence(recordings.write_raw(tmp_path, recordings.ride, extract=False))
@@ -249,9 +283,6 @@ class TestReference:
 
     def test_the_projection_agrees_with_geodesy(self, drive: Path) -> None:
         pymap3d = pytest.importorskip("pymap3d")
-        from hybridlio.datasets.oxts import read_oxts
-        from hybridlio.datasets.sequence import Notes
-
         rows = read_oxts(drive / "oxts", Notes("drive"))
         lat, lon, alt = rows.values[:, :3].T
         enu = np.column_stack(pymap3d.geodetic2enu(lat, lon, alt, lat[0], lon[0], alt[0]))
