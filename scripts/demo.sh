@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# The main job by the public commands: simulate a drive, run the odometry, smooth it, evaluate both, leave reports.
+# The main job by the public commands: simulate a drive, run the odometry, say how good it is, leave a report.
 # Usage: demo.sh [FOLDER] [SECONDS]
 set -euo pipefail
 
@@ -7,6 +7,14 @@ folder=${1:-demo}
 seconds=${2:-60}
 read -r -a hybridlio <<<"${HYBRIDLIO:-hybridlio}"
 
-"${hybridlio[@]}" simulate "$folder/drive" --seconds "$seconds" --seed 1
-"${hybridlio[@]}" odometry "$folder/drive" -o "$folder/runs"
-"${hybridlio[@]}" smooth "$folder/runs/latest" --loops -o "$folder/smoothed"
+step() {
+    echo
+    echo "\$ hybridlio $*"
+    "${hybridlio[@]}" "$@"
+}
+
+step simulate "$folder/drive-${seconds}s" --seconds "$seconds" --seed 1
+step odometry "$folder/drive-${seconds}s" -o "$folder/odometry" --overwrite
+
+echo
+echo "Everything is in $folder; open $folder/odometry/report.html"
