@@ -84,7 +84,8 @@ class Evaluation:
         t_rel_percent, r_rel_deg_per_100m: KITTI's drift over 100-800 m; None for a path under 100 m.
         chosen_lengths_m: other segment lengths, those asked for or those that fit a short path; None if not needed.
         chosen_t_rel_percent, chosen_r_rel_deg_per_100m: drift over the chosen lengths, not comparable with KITTI's.
-        ate_m, ate_deg: root mean square of the absolute errors after rigid alignment.
+        ate_m: root mean square of the position errors after rigid alignment of the positions (Umeyama's, as in evo).
+        ate_deg: of the orientation errors, after an alignment that minds orientations too (:func:`align`).
         rpe_m, rpe_deg: root mean square of the errors from frame to frame.
         end_error_m: distance from the true end with the first poses laid on each other.
         anees_rotation, anees_position: of the poses relative to the first; 1 is consistent, above is overconfident.
@@ -177,7 +178,7 @@ def evaluate(
         chosen_lengths_m=chosen.lengths_m if chosen else None,
         chosen_t_rel_percent=chosen.t_rel_percent if chosen else None,
         chosen_r_rel_deg_per_100m=chosen.r_rel_deg_per_100m if chosen else None,
-        ate_m=absolute.rmse_m,
+        ate_m=ate(both.reference, both.estimate, lever_m=0.0).rmse_m,
         ate_deg=absolute.rmse_deg,
         rpe_m=relative.rmse_m,
         rpe_deg=relative.rmse_deg,
