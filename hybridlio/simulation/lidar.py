@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridlio import se3
 from hybridlio.sensors import NS_PER_S, LidarModel, Scan
 from hybridlio.simulation.traffic import CAR_RADIUS_M, MovingCar, in_reach
 from hybridlio.simulation.world import Hits, RayScene
@@ -19,6 +20,7 @@ Array = NDArray[np.float64]
 _THRESHOLD_M2 = 1.6e-6
 _THRESHOLD_SPREAD = 0.35
 _INTENSITY_SIGMA = 0.03
+_MARGIN_RAD = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +37,18 @@ class RayPattern:
     directions: Array
     column: NDArray[np.int64]
     column_offset_ns: NDArray[np.int64]
+
+    def rays_near(self, centre: Array, radius_m: float) -> NDArray[np.intp]:
+        """The rays that may meet a sphere about ``centre`` ``(3,)``, lidar frame, with a margin for its motion."""
+        columns, away = len(self.column_offset_ns), float(np.hypot(centre[0], centre[1]))
+        if away <= radius_m:
+            return np.arange(len(self.column))
+        middle = (np.arctan2(centre[1], centre[0]) / (2 * np.pi) + 0.5) * columns
+        half = (np.arcsin(radius_m / away) + _MARGIN_RAD) / (2 * np.pi) * columns
+        window = np.unique(np.arange(int(middle - half), int(middle + half) + 1) % columns)
+        rows = (np.arange(len(self.column) // columns)[:, None] * columns + window).reshape(-1)
+        along = self.directions[rows] @ centre
+        return np.asarray(rows[(along > 0) & (centre @ centre - along**2 < 1.5 * radius_m**2)])
 
 
 def ray_pattern(model: LidarModel) -> RayPattern:
@@ -70,31 +84,14 @@ def first_hits(scene: RayScene, cars: Sequence[MovingCar], pattern: RayPattern, 
     hits = scene.cast(origins, directions)
     middle = len(times_s) // 2
     for car in in_reach(cars, poses[middle, :3, 3], float(times_s[middle])):
-        column = np.zeros(len(directions), np.int64) if instant else pattern.column
-        hits = _with_car(hits, car, origins, directions, column, times_s)
+        T_world_car = car.poses(times_s)
+        centre = se3.between(poses[middle], T_world_car[middle])[:3, 3] + [0.0, 0.0, 1.0]
+        rows = pattern.rays_near(centre, CAR_RADIUS_M)
+        at = np.zeros(len(rows), np.int64) if instant else pattern.column[rows]
+        R, t = T_world_car[at, :3, :3], T_world_car[at, :3, 3]
+        local_origins = np.einsum("nji,nj->ni", R, origins[rows] - t)
+        hits.take_nearer(rows, car.scene.cast(local_origins, np.einsum("nji,nj->ni", R, directions[rows])))
     return hits
-
-
-def _with_car(
-    hits: Hits, car: MovingCar, origins: Array, directions: Array, column: NDArray[np.int64], times_s: Array
-) -> Hits:
-    """The hits, or the moving car's where it is nearer: its rays are cast in its own frame, at each ray's time."""
-    T_world_car = car.poses(times_s)
-    towards = T_world_car[len(times_s) // 2, :3, 3] + [0.0, 0.0, 1.0] - origins[0]
-    along = directions @ towards
-    beside_squared = towards @ towards - along**2
-    near = np.flatnonzero((along > 0) & (beside_squared < CAR_RADIUS_M**2))
-    if not len(near):
-        return hits
-    R, t = T_world_car[column[near], :3, :3], T_world_car[column[near], :3, 3]
-    local_origins = np.einsum("nji,nj->ni", R, origins[near] - t)
-    found = car.scene.cast(local_origins, np.einsum("nji,nj->ni", R, directions[near]))
-    closer = found.range_m < hits.range_m[near]
-    rows = near[closer]
-    merged = Hits(hits.range_m.copy(), hits.cosine.copy(), hits.reflectance.copy())
-    merged.range_m[rows], merged.cosine[rows] = found.range_m[closer], found.cosine[closer]
-    merged.reflectance[rows] = found.reflectance[closer]
-    return merged
 
 
 def measure(

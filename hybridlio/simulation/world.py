@@ -37,6 +37,12 @@ class Hits:
     cosine: Array
     reflectance: Array
 
+    def take_nearer(self, rows: NDArray[np.intp], others: Hits) -> None:
+        """Put ``others``, hits of the rays ``rows``, where they are nearer."""
+        nearer = others.range_m < self.range_m[rows]
+        for mine, theirs in zip(vars(self).values(), vars(others).values(), strict=True):
+            mine[rows[nearer]] = theirs[nearer]
+
 
 @dataclass(eq=False)
 class RayScene:
