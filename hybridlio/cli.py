@@ -8,10 +8,12 @@ import typer
 
 from hybridlio import __version__
 from hybridlio.commands.common import start_quietly
+from hybridlio.commands.compare import compare
 from hybridlio.commands.config import config
 from hybridlio.commands.evaluate import evaluate
 from hybridlio.commands.odometry import odometry
 from hybridlio.commands.simulate import simulate
+from hybridlio.commands.smooth import smooth
 from hybridlio.commands.view import view
 
 app = typer.Typer(
@@ -41,5 +43,5 @@ def main(
     """Lidar-inertial odometry: from a drive to a trajectory with covariances, a pose graph and a report."""
 
 
-for _command in (simulate, odometry, evaluate, config, view):
+for _command in (simulate, odometry, smooth, compare, evaluate, config, view):
     app.command()(_command)

@@ -12,24 +12,16 @@ if TYPE_CHECKING:
 
 
 def evaluation_table(evaluations: Mapping[str, Evaluation], title: str | None = None) -> Table:
-    """A table for the terminal: one column of figures for one evaluation, one row each for several."""
+    """A table for the terminal: a row for each figure, a column for each evaluation."""
     from rich.table import Table
     from rich.text import Text  # plain text: in markup "[m]" would be a style
 
-    rows = {name: figures(evaluation) for name, evaluation in evaluations.items()}
-    headings = list(dict.fromkeys(heading for row in rows.values() for heading in row))
-    table = Table(title=None if title is None else Text(title))
-    if len(rows) == 1:
-        table.add_column("figure")
-        table.add_column(Text(next(iter(rows))), justify="right")
-        for heading in headings:
-            table.add_row(Text(heading), next(iter(rows.values()))[heading])
-        return table
-    table.add_column("run")
-    for heading in headings:
-        table.add_column(Text(heading), justify="right")
-    for name, row in rows.items():
-        table.add_row(Text(name), *(row.get(heading, "–") for heading in headings))
+    columns = {name: figures(evaluation) for name, evaluation in evaluations.items()}
+    table = Table("figure", title=None if title is None else Text(title))
+    for name in columns:
+        table.add_column(Text(name), justify="right")
+    for heading in dict.fromkeys(heading for column in columns.values() for heading in column):
+        table.add_row(Text(heading), *(column.get(heading, "–") for column in columns.values()))
     return table
 
 

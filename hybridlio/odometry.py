@@ -129,8 +129,8 @@ class Odometry:
             online=online,
             initial=tuple(e.initial for e in steps if e.initial is not None),
             relative=tuple(e.relative for e in steps if e.relative is not None),
-            imu=_joined(self._imu),
-            gps=tuple(self._gps),
+            imu=_joined(self._imu[: len(steps)]),  # a step that was interrupted may have added more
+            gps=tuple(fix for fix in self._gps if fix.stamp_ns <= stamps[-1]),
             start=self._start_state,
             calibration=self._setup.calibration,
             imu_noise=self._setup.imu_noise,

@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.errors import ConfigError, DataError
 from hybridlio.estimates import Array
-from hybridlio.initial_pose import unknown_motion_covariance
 from hybridlio.metrics import Steps
 from hybridlio.odometry import Estimate, Odometry
 from hybridlio.record import Record
-from hybridlio.sensors import NS_PER_S, Frame
+from hybridlio.sensors import Frame
 from hybridlio.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
@@ -28,9 +27,6 @@ Progress = Callable[[int, int, float], None]
 @dataclass(eq=False)
 class Run:
     """What a run came to, whole or up to where it stopped.
-
-    Scans before the first usable one have no estimate: :attr:`trajectory` holds the first pose there, with the
-    covariance of a motion of which nothing is known, and :attr:`estimated` is False.
 
     Attributes:
         sequence: the recording.
@@ -55,36 +51,23 @@ class Run:
 
     @property
     def done(self) -> int:
-        """Scans dealt with: the rows of the trajectory."""
+        """Scans dealt with, those before the first usable one too."""
         return self.skipped + len(self.estimates) if self.estimates else 0
 
     @property
-    def estimated(self) -> NDArray[np.bool_]:
-        """``(done,)``; False before the first usable scan."""
-        return np.arange(self.done) >= self.skipped
-
-    @property
     def trajectory(self) -> Trajectory:
-        """``done`` poses in the first usable scan's frame, with covariances."""
-        own = self.estimated_trajectory
-        stamps = self.sequence.stamps_ns[: self.skipped]
-        before = (int(own.stamps_ns[0]) - stamps) / NS_PER_S
-        covariances = [unknown_motion_covariance(float(dt_s)) for dt_s in before]
-        return Trajectory(
-            np.concatenate([stamps, own.stamps_ns]),
-            np.concatenate([np.tile(np.eye(4), (self.skipped, 1, 1)), own.poses]),
-            np.concatenate([np.reshape(covariances, (-1, 6, 6)), [e.covariance for e in self.estimates]]),
-        )
-
-    @property
-    def estimated_trajectory(self) -> Trajectory:
-        """The estimates alone, without what :attr:`trajectory` fills in before them."""
+        """The estimates, in the first usable scan's frame, with covariances."""
         estimates = self.estimates
         return Trajectory(
             np.array([e.stamp_ns for e in estimates]),
             np.array([e.pose for e in estimates]).reshape(-1, 4, 4),
             np.array([e.covariance for e in estimates]).reshape(-1, 6, 6),
         )
+
+    @property
+    def stamps_before(self) -> NDArray[np.int64]:
+        """``(skipped,)`` stamps of the scans before the first usable one."""
+        return self.sequence.stamps_ns[: self.skipped]
 
     @property
     def steps(self) -> Steps:

@@ -20,7 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 from hybridlio.errors import ConfigError, DataError
 from hybridlio.estimates import RelativePose
 from hybridlio.files import write_whole, writing_whole
+from hybridlio.initial_pose import unknown_motion_covariance
 from hybridlio.metrics import Steps
+from hybridlio.sensors import NS_PER_S
 from hybridlio.trajectory import Trajectory
 from hybridlio.trajectory_errors import select
 from hybridlio.trajectory_files import read_tum, write_kitti, write_tum
@@ -37,8 +39,8 @@ class StoredRun:
 
     Attributes:
         path: the folder.
-        trajectory: what was estimated, with covariances where there are any; rows filled in before the first usable
-            scan are left out.
+        trajectory: what was estimated, with covariances; without the rows filled in before the first usable scan.
+        stamps_before: ``(K,)`` stamps of those rows, often none.
         steps: the motions between, where the folder has their covariances.
         reference: the truth that came with the recording, at the same rows, or None.
         metrics: what ``metrics.json`` says.
@@ -46,6 +48,7 @@ class StoredRun:
 
     path: Path
     trajectory: Trajectory
+    stamps_before: NDArray[np.int64]
     steps: Steps | None
     reference: Trajectory | None
     metrics: dict[str, Any]
@@ -103,21 +106,34 @@ def write_trajectory(
     trajectory: Trajectory,
     T_camera_lidar: ArrayLike | None,
     steps: Steps | None = None,
-    estimated: NDArray[np.bool_] | None = None,
+    stamps_before: NDArray[np.int64] | None = None,
 ) -> None:
     """Write the poses in both text formats, and ``covariances.npz``.
 
     The latter holds ``stamps_ns`` ``(N,)``, ``absolute`` ``(N, 6, 6)``, ``estimated`` ``(N,)`` and, with ``steps``,
-    ``relative_poses`` ``(N-1, 4, 4)`` and ``relative`` ``(N-1, 6, 6)``; rad² and m², rotation first.
+    ``relative_poses`` ``(M-1, 4, 4)`` and ``relative`` ``(M-1, 6, 6)`` of the ``M`` poses that are estimated; rad² and
+    m², rotation first. Scans before the first usable one have a row too: the first pose, with the covariance of a
+    motion of which nothing is known, and ``estimated`` False.
     """
-    write_tum(folder / POSES, trajectory)
-    write_kitti(folder / KITTI, trajectory, T_camera_lidar)
-    arrays: dict[str, Any] = {"stamps_ns": trajectory.stamps_ns, "absolute": trajectory.covariances}
-    arrays["estimated"] = np.ones(len(trajectory), bool) if estimated is None else estimated
+    whole = trajectory if stamps_before is None else _filled_before(trajectory, stamps_before)
+    write_tum(folder / POSES, whole)
+    write_kitti(folder / KITTI, whole, T_camera_lidar)
+    estimated = np.arange(len(whole)) >= len(whole) - len(trajectory)
+    arrays: dict[str, Any] = {"stamps_ns": whole.stamps_ns, "absolute": whole.covariances, "estimated": estimated}
     if steps is not None:
         arrays |= {"relative_poses": steps.poses, "relative": steps.covariances}
     with writing_whole(folder / COVARIANCES) as part, part.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def _filled_before(trajectory: Trajectory, stamps_ns: NDArray[np.int64]) -> Trajectory:
+    before_s = (int(trajectory.stamps_ns[0]) - stamps_ns) / NS_PER_S
+    covariances = np.array([unknown_motion_covariance(float(dt_s)) for dt_s in before_s]).reshape(-1, 6, 6)
+    return Trajectory(
+        np.concatenate([stamps_ns, trajectory.stamps_ns]),
+        np.concatenate([np.tile(trajectory.poses[0], (len(stamps_ns), 1, 1)), trajectory.poses]),
+        None if trajectory.covariances is None else np.concatenate([covariances, trajectory.covariances]),
+    )
 
 
 def write_graph(folder: Path, poses: NDArray[np.float64], relative: Items[RelativePose], first: int = 0) -> None:
@@ -152,9 +168,10 @@ def read_run(path: Path) -> StoredRun:
         metrics = json.loads((path / METRICS).read_text())
         with np.load(path / COVARIANCES, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        rows = np.flatnonzero(arrays["estimated"])
-        trajectory = select(Trajectory(whole.stamps_ns, whole.poses, arrays["absolute"]), rows)
+        estimated = arrays["estimated"]
+        covered = Trajectory(whole.stamps_ns, whole.poses, arrays["absolute"])
+        trajectory = select(covered, np.flatnonzero(estimated))
     except (OSError, ValueError, KeyError, EOFError) as error:
         raise DataError(f"{path}: its {METRICS} or {COVARIANCES} cannot be read ({error}); run again") from error
     steps = Steps(arrays["relative_poses"], arrays["relative"]) if "relative" in arrays else None
-    return StoredRun(path, trajectory, steps, reference, metrics)
+    return StoredRun(path, trajectory, whole.stamps_ns[~estimated], steps, reference, metrics)

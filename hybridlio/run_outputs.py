@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,12 +12,16 @@ from hybridlio.config import Config, config_to_yaml
 from hybridlio.errors import EstimationError
 from hybridlio.files import write_whole
 from hybridlio.metrics import Evaluation
+from hybridlio.record import Record
 from hybridlio.report import pictures, write_report
 from hybridlio.report_data import Findings, ReportData, find
 from hybridlio.run import Run
 from hybridlio.trajectory_files import write_tum
 
-_ONLINE = "odometry"
+if TYPE_CHECKING:
+    from hybridlio.graph.offline import Smoothed
+
+_ONLINE, _SMOOTHED = "odometry", "smoothed"
 
 
 def write_run(folder: Path, run: Run, config: Config) -> Findings:
@@ -36,8 +40,8 @@ def write_run(folder: Path, run: Run, config: Config) -> Findings:
     sequence, trajectory, record = run.sequence, run.trajectory, run.record
     if record is not None:
         record.save(folder / run_folder.RECORD)
-        run_folder.write_graph(folder, trajectory.poses[run.skipped :], record.relative, run.skipped)
-    run_folder.write_trajectory(folder, trajectory, T_pose_files(run), run.steps, run.estimated)
+        run_folder.write_graph(folder, trajectory.poses, record.relative, run.skipped)
+    run_folder.write_trajectory(folder, trajectory, T_pose_files(run), run.steps, run.stamps_before)
     if sequence.reference is not None:
         write_tum(folder / run_folder.REFERENCE, sequence.reference)
     text = config_to_yaml(config)
@@ -80,7 +84,7 @@ def report_data(run: Run, config: Config, config_text: str) -> ReportData:
     """The run for its report."""
     return ReportData(
         name=run.sequence.name,
-        estimate=run.estimated_trajectory,
+        estimate=run.trajectory,
         reference=run.sequence.reference,
         estimate_name=_ONLINE,
         initial_poses=run.initial_poses,
@@ -112,7 +116,7 @@ def metrics(run: Run, config: Config, evaluation: Evaluation | None) -> dict[str
         "degenerate": (np.flatnonzero(run.degenerate) + run.skipped + 1).tolist(),
         "unreadable": {str(k): why for k, why in run.unreadable.items()},
         "notes": notes(run),
-        "path_length_m": run.estimated_trajectory.length_m,
+        "path_length_m": run.trajectory.length_m,
         "forward_speed_length_m": forward_speed_length_m(run),
         "seconds": run.seconds,
         "ms_per_scan": ms_per_scan(run),
@@ -139,3 +143,40 @@ def forward_speed_length_m(run: Run) -> float | None:
         return None
     rows = slice(run.skipped, run.done)
     return float(np.trapezoid(speed[rows], run.sequence.stamps_ns[rows] / 1e9))
+
+
+def write_smoothed(folder: Path, stored: run_folder.StoredRun, record: Record, smoothed: Smoothed) -> Findings:
+    """Write a smoothed run as a run folder of its own, its report showing the trajectory before and after.
+
+    Returns:
+        What the evaluation of both found.
+
+    Raises:
+        DataError: a file cannot be written.
+    """
+    run_folder.clear(folder)
+    trajectory, T = smoothed.trajectory, stored.T_camera_lidar
+    run_folder.write_trajectory(folder, trajectory, T, stamps_before=stored.stamps_before)
+    run_folder.write_graph(folder, trajectory.poses, record.relative, len(stored.stamps_before))
+    if stored.reference is not None:
+        write_tum(folder / run_folder.REFERENCE, stored.reference)
+    data = ReportData(
+        name=stored.metrics["sequence"],
+        estimate=trajectory,
+        reference=stored.reference,
+        estimate_name=_SMOOTHED,
+        others={_ONLINE: stored.trajectory},
+        ok=np.array([step.ok for step in record.relative]),
+        degenerate=np.array([len(step.degenerate) > 0 for step in record.relative]),
+        facts={"smoothed": f"{smoothed.iterations} iterations", "run": stored.path.name},
+        warnings=stored.metrics["notes"],
+    )
+    findings = find(data)
+    write_pages(folder, data, findings)
+    kept = ("hybridlio", "sequence", "pose_file_frame", "T_camera_lidar", "frames", "frames_done", "notes")
+    figures = {name: stored.metrics[name] for name in kept if name in stored.metrics}
+    figures |= {name: getattr(smoothed, name) for name in ("error_before", "error_after", "iterations", "converged")}
+    figures |= {"path_length_m": trajectory.length_m}
+    judged = findings.evaluations.get(_SMOOTHED)
+    run_folder.write_metrics(folder, figures | (judged.to_json_dict() if judged is not None else {}))
+    return findings

@@ -22,6 +22,7 @@ class Tick(Protocol):
         ...
 
 
+_LINES_APART_S = 1.0
 _TABLE_WIDTH = 240  # where the output is no terminal: nobody's columns to fit into
 
 
@@ -67,7 +68,7 @@ class _Handler(logging.Handler):
 
 @contextmanager
 def progress(what: str, unit: str = "scans") -> Iterator[Tick]:
-    """Show how far a loop is: a bar on a terminal, else a line every tenth.
+    """Show how far a loop is: a bar on a terminal, else a line every tenth, a second apart at least.
 
     Yields:
         A function to call with what is done, what there is in all, and a word on it, such as the distance.
@@ -100,14 +101,14 @@ def _bar(what: str, unit: str) -> Iterator[Tick]:
 
 @contextmanager
 def _lines(what: str, unit: str) -> Iterator[Tick]:
-    start, shown = time.perf_counter(), 0
+    start, shown, last_s = time.perf_counter(), 0, 0.0
 
     def tick(done: int, total: int, detail: str = "") -> None:
-        nonlocal shown
-        tenth = 10 * done // max(total, 1)
-        if tenth > shown:
-            shown = tenth
-            left = (time.perf_counter() - start) * (total - done) / done
+        nonlocal shown, last_s
+        tenth, spent_s = 10 * done // max(total, 1), time.perf_counter() - start
+        if (tenth > shown and spent_s > last_s + _LINES_APART_S) or (done == total > 0 and shown < 10):
+            shown, last_s = tenth, spent_s
+            left = spent_s * (total - done) / done
             words = [f"{done}/{total} {unit} ({100 * done // total} %)", _rate(done, start, unit), f"{left:.0f} s left"]
             complain(f"{what}: {', '.join([*words, *([detail] if detail else [])])}", "none")
 

@@ -82,7 +82,7 @@ def _say_result(folder: Path, run: Run, findings: Findings) -> None:
     from hybridlio.run_folder import POSES, REPORT
     from hybridlio.run_outputs import forward_speed_length_m, ms_per_scan
 
-    metres, ms = run.estimated_trajectory.length_m, ms_per_scan(run).get("total")
+    metres, ms = run.trajectory.length_m, ms_per_scan(run).get("total")
     speed = "" if ms is None else f", {ms:.0f} ms a scan"
     say(f"{run.sequence.name}: {run.done} scans, {metres:.2f} m in {run.seconds:.1f} s{speed}")
     if (driven := forward_speed_length_m(run)) is not None:

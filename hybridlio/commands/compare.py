@@ -1,0 +1,78 @@
+"""``hybridlio compare``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hybridlio.commands import common
+from hybridlio.commands.common import guarded
+from hybridlio.errors import ConfigError
+from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
+from hybridlio.terminal import complain, progress, say, say_table
+
+
+def _several(names: tuple[str, ...]) -> str:
+    return f"Some of {', '.join(names)}, with commas between; `all` for each."
+
+
+@guarded
+def compare(
+    data: common.Data,
+    sequence: common.SequenceName = None,
+    reader: common.ReaderName = None,
+    raw_root: common.RawRoot = None,
+    initial_pose: Annotated[
+        str, typer.Option("--initial-pose", metavar="A,B,…", help=_several(tuple(INITIAL_POSE_SOURCES)))
+    ] = "all",
+    residual: Annotated[
+        str | None, typer.Option(metavar="A,B,…", help=_several(tuple(RESIDUAL_SOURCES)), show_default=False)
+    ] = None,
+    backend: Annotated[
+        str | None, typer.Option(metavar="A,B,…", help=_several(tuple(BACKENDS)), show_default=False)
+    ] = None,
+    config: common.ConfigFile = None,
+    frames: common.Frames = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Write compare.json and compare.md there.")
+    ] = None,
+    _verbose: common.Verbose = 0,
+) -> None:
+    """Run every combination of sources over the same scans, and show them side by side."""
+    from hybridlio.compare import combinations, table, write_comparison
+    from hybridlio.compare import compare as run_all
+
+    settings = common.settings(config)
+    configs = combinations(
+        _names(initial_pose, tuple(INITIAL_POSE_SOURCES), "--initial-pose"),
+        _names(residual or settings.residual, tuple(RESIDUAL_SOURCES), "--residual"),
+        _names(backend or settings.backend, tuple(BACKENDS), "--backend"),
+        settings,
+    )
+    recording = common.open_data(data, sequence, reader, raw_root, frames)
+    with progress("comparing") as tick:
+        comparison = run_all(recording, configs, lambda name, done, total: tick(done, total, name))
+    say_table(table(comparison))
+    say("step errors are medians over the scans")
+    if out is not None:
+        write_comparison(out, comparison)
+        say(f"written to {out / 'compare.md'} and {out / 'compare.json'}")
+    failed = [row for row in comparison.rows if row.error]
+    for row in failed:
+        complain(f"error: {row.initial_pose} + {row.residual} ended after {row.scans} scans: {row.error}")
+    if failed:
+        raise typer.Exit(common.FAILED)
+
+
+def _names(text: str, known: tuple[str, ...], option: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    if names == ("all",):
+        return known
+    unknown = [name for name in names if name not in known]
+    if unknown or not names:
+        raise ConfigError(
+            f"{option} {text!r}: {'no name' if not names else f'unknown {unknown[0]!r}'}; {_several(known)}"
+        )
+    return names

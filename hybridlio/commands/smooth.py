@@ -1,0 +1,63 @@
+"""``hybridlio smooth``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hybridlio.commands.common import Verbose, guarded
+from hybridlio.errors import ConfigError
+from hybridlio.terminal import complain, progress, say, say_table
+
+if TYPE_CHECKING:
+    from hybridlio.graph.offline import Smoothed
+    from hybridlio.record import Record
+
+
+@guarded
+def smooth(
+    run: Annotated[Path, typer.Argument(help="A run folder that `hybridlio odometry` made.", show_default=False)],
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Where to write; by default RUN/smoothed.")
+    ] = None,
+    _verbose: Verbose = 0,
+) -> None:
+    """Optimise all poses of a finished run at once, and leave the better trajectory with a report of its own."""
+    from hybridlio.metrics import evaluation_table
+    from hybridlio.record import Record
+    from hybridlio.run_folder import POSES, RECORD, REPORT, SMOOTHED, read_run
+    from hybridlio.run_outputs import write_smoothed
+
+    stored = read_run(run)
+    folder = run / SMOOTHED if out is None else out
+    if folder.resolve() == run.resolve():
+        raise ConfigError(f"{folder} is the run itself; choose another folder with -o")
+    record = Record.load(run / RECORD)
+    smoothed = _smooth(record)
+    findings = write_smoothed(folder, stored, record, smoothed)
+    error = (
+        f"error {smoothed.error_before:.4g} before, {smoothed.error_after:.4g} after {smoothed.iterations} iterations"
+    )
+    say(f"{stored.metrics['sequence']}: {len(smoothed.trajectory)} poses, {error}")
+    if not smoothed.converged:
+        complain("warning: the optimiser stopped before the error had stopped falling", "yellow")
+    if findings.evaluations:
+        say_table(evaluation_table(findings.evaluations))
+    say(f"poses   {folder / POSES}")
+    say(f"report  {folder / REPORT}")
+
+
+def _smooth(record: Record) -> Smoothed:
+    from hybridlio.graph.offline import smooth as optimise
+
+    with progress("smoothing", "poses") as tick:
+
+        def show(stage: str, done: int, total: int) -> None:
+            if stage == "covariances":
+                tick(done + 1, total, stage)
+            else:
+                tick(0, len(record.online), f"{stage}, round {done + 1} of {total}")
+
+        return optimise(record, show)

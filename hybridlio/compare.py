@@ -1,0 +1,246 @@
+"""The same frames through several combinations of sources, side by side."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from collections.abc import Sequence as Items
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hybridlio.config import Config
+from hybridlio.datasets.sequence import Sequence
+from hybridlio.errors import DataError
+from hybridlio.estimates import Array
+from hybridlio.files import write_whole
+from hybridlio.metrics import Evaluation, associate, associated_step_errors, evaluate
+from hybridlio.odometry import Odometry
+from hybridlio.run import Run, run_odometry
+from hybridlio.run_outputs import forward_speed_length_m
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class StepErrors:
+    """Errors of relative poses against the reference's: of half of the steps they are below the median."""
+
+    median_m: float
+    median_deg: float
+    rms_m: float
+    rms_deg: float
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """One combination's run.
+
+    Attributes:
+        initial_pose, residual, backend: the combination.
+        scans: how many were estimated.
+        bridged: of how many of them the residual source could make nothing.
+        path_length_m: of the estimate.
+        ms_median, ms_p90: milliseconds a scan, without reading it; None for fewer than two scans.
+        initial, final: errors of the steps before and after looking at the scans; None without reference.
+        evaluation: None without reference.
+        error: why the run ended early, or None.
+    """
+
+    initial_pose: str
+    residual: str
+    backend: str
+    scans: int
+    bridged: int
+    path_length_m: float
+    ms_median: float | None
+    ms_p90: float | None
+    initial: StepErrors | None
+    final: StepErrors | None
+    evaluation: Evaluation | None
+    error: str | None
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """Every attribute as plain values, the evaluation's under ``evaluation``."""
+        out: dict[str, Any] = dict(vars(self))
+        for name in ("initial", "final"):
+            out[name] = None if out[name] is None else vars(out[name])
+        return out | {"evaluation": self.evaluation.to_json_dict() if self.evaluation else None}
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Several runs over the same frames.
+
+    Attributes:
+        sequence: its name.
+        scans: how many frames each run was given.
+        reference_length_m: the reference's path length, or None.
+        forward_speed_length_m: how far the vehicle went by its own forward speed, or None.
+        rows: one run each.
+    """
+
+    sequence: str
+    scans: int
+    reference_length_m: float | None
+    forward_speed_length_m: float | None
+    rows: tuple[Compared, ...]
+
+
+def combinations(
+    initial_poses: Items[str], residuals: Items[str], backends: Items[str], config: Config
+) -> list[Config]:
+    """The configuration with every combination of the names."""
+    names = ("initial_pose", "residual", "backend")
+    combined = product(initial_poses, residuals, backends)
+    return [config.model_copy(update=dict(zip(names, c, strict=True))) for c in combined]
+
+
+def compare(sequence: Sequence, configs: Iterable[Config], progress: Progress | None = None) -> Comparison:
+    """Run every configuration over the whole sequence, one after the other.
+
+    A run that fails has a row too, with what it had estimated until then; an interrupt ends the comparison.
+
+    Args:
+        sequence: the recording.
+        configs: see :func:`combinations`.
+        progress: called with the combination's name, scans done and scans in all, of all runs together.
+
+    Raises:
+        ConfigError: a source is unknown.
+        KeyboardInterrupt: while a run was going on.
+    """
+    odometries = [(config, Odometry(config=config)) for config in configs]  # wrong names fail before the work
+    runs: list[tuple[Config, Run]] = []
+    for config, odometry in odometries:
+        show = None if progress is None else _shown(progress, config, len(runs), len(odometries))
+        run = run_odometry(sequence, odometry, show)
+        if isinstance(run.stopped, KeyboardInterrupt):
+            raise run.stopped
+        runs.append((config, run))
+    lengths = [length for _, run in runs if (length := forward_speed_length_m(run)) is not None]
+    return Comparison(
+        sequence=sequence.name,
+        scans=len(sequence),
+        reference_length_m=None if sequence.reference is None else sequence.reference.length_m,
+        forward_speed_length_m=max(lengths, default=None),
+        rows=tuple(_compared(config, run) for config, run in runs),
+    )
+
+
+def _shown(progress: Progress, config: Config, number: int, runs: int) -> Callable[[int, int, float], None]:
+    name = f"{config.initial_pose} + {config.residual}"
+    return lambda done, total, _metres: progress(name, number * total + done, runs * total)
+
+
+def _compared(config: Config, run: Run) -> Compared:
+    spent = [sum(e.seconds.values()) * 1e3 for e in run.estimates[1:]]
+    reference, evaluation, initial, final = run.sequence.reference, None, None, None
+    if reference is not None and len(run.estimates) > 1:
+        try:
+            evaluation = evaluate(reference, run.trajectory, steps=run.steps)
+            initial, final = (_step_errors(run, poses) for poses in (run.initial_poses, run.steps.poses))
+        except DataError as error:
+            run.stopped = run.stopped or error
+    return Compared(
+        initial_pose=config.initial_pose,
+        residual=config.residual,
+        backend=config.backend,
+        scans=len(run.estimates),
+        bridged=len(run.bridged),
+        path_length_m=run.trajectory.length_m if run.estimates else 0.0,
+        ms_median=float(np.median(spent)) if spent else None,
+        ms_p90=float(np.percentile(spent, 90)) if spent else None,
+        initial=initial,
+        final=final,
+        evaluation=evaluation,
+        error=None if run.stopped is None else str(run.stopped),
+    )
+
+
+def _step_errors(run: Run, poses: Array) -> StepErrors | None:
+    reference = run.sequence.reference
+    if reference is None:
+        return None
+    _, errors = associated_step_errors(associate(reference, run.trajectory), run.trajectory, poses)
+    if not len(errors):
+        return None
+    metres, degrees = np.linalg.norm(errors[:, 3:], axis=1), np.rad2deg(np.linalg.norm(errors[:, :3], axis=1))
+    rms_m, rms_deg = (float(np.sqrt(np.mean(values**2))) for values in (metres, degrees))
+    return StepErrors(float(np.median(metres)), float(np.median(degrees)), rms_m, rms_deg)
+
+
+def table(comparison: Comparison) -> Table:
+    """The comparison for the terminal."""
+    from rich.table import Table
+    from rich.text import Text
+
+    out = Table(title=Text(heading(comparison)))
+    rows = columns(comparison)
+    for name in rows[0]:
+        out.add_column(Text(name), justify="left" if name in ("initial pose", "residual", "backend") else "right")
+    for row in rows:
+        out.add_row(*map(Text, row.values()))
+    return out
+
+
+def heading(comparison: Comparison) -> str:
+    """What was compared on."""
+    words = [f"{comparison.sequence}: {comparison.scans} scans"]
+    if comparison.reference_length_m is not None:
+        words.append(f"{comparison.reference_length_m:.1f} m by the reference")
+    if comparison.forward_speed_length_m is not None:
+        words.append(f"{comparison.forward_speed_length_m:.1f} m by forward speed")
+    return ", ".join(words)
+
+
+def columns(comparison: Comparison) -> list[dict[str, str]]:
+    """The rows under their headings, all under the same; columns that say nothing are left out."""
+    rows = [_cells(row) for row in comparison.rows]
+    names = dict.fromkeys(name for row in rows for name in row)
+    if len({row.backend for row in comparison.rows}) == 1:
+        names.pop("backend")
+    return [{name: row.get(name, "–") for name in names if any(r.get(name, "–") != "–" for r in rows)} for row in rows]
+
+
+def _cells(row: Compared) -> dict[str, str]:
+    e = row.evaluation
+    out = {"initial pose": row.initial_pose, "residual": row.residual, "backend": row.backend}
+    if e is not None:
+        short = e.t_rel_percent is None
+        over = f" over {e.chosen_lengths_m[0]:g}–{e.chosen_lengths_m[-1]:g} m" if short and e.chosen_lengths_m else ""
+        out[f"t_rel{over} [%]"] = _text(e.chosen_t_rel_percent if short else e.t_rel_percent, 3)
+        out[f"r_rel{over} [°/100 m]"] = _text(e.chosen_r_rel_deg_per_100m if short else e.r_rel_deg_per_100m, 3)
+        out["ATE [m]"] = _text(e.ate_m, 3)
+    for name, errors in (("initial", row.initial), ("final", row.final)):
+        if errors is not None:
+            out[f"{name} step error [mm]"] = _text(1e3 * errors.median_m, 1)
+            out[f"{name} [°]"] = _text(errors.median_deg, 3)
+    out |= {"path [m]": _text(row.path_length_m, 2), "ms a scan": _text(row.ms_median, 1)}
+    out |= {"p90": _text(row.ms_p90, 1), "bridged": str(row.bridged)}
+    return out | {"ended early": f"after {row.scans} scans: {row.error}" if row.error else "–"}
+
+
+def _text(value: float | None, decimals: int) -> str:
+    return "–" if value is None else f"{value:.{decimals}f}"
+
+
+def to_markdown(comparison: Comparison) -> str:
+    """The comparison as a Markdown table; step errors are medians."""
+    rows = columns(comparison)
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *(list(row.values()) for row in rows)]
+    body = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return f"{heading(comparison)}\n\n{body}\n\nStep errors are medians over the scans.\n"
+
+
+def write_comparison(folder: Path, comparison: Comparison) -> None:
+    """Write ``compare.json`` and ``compare.md``."""
+    values = vars(comparison) | {"rows": [row.to_json_dict() for row in comparison.rows]}
+    write_whole(folder / "compare.json", json.dumps(values, indent=2, ensure_ascii=False) + "\n")
+    write_whole(folder / "compare.md", to_markdown(comparison))
