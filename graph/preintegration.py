@@ -48,7 +48,7 @@ def bias_of(state: State) -> gtsam.imuBias.ConstantBias:
 def preintegrate(imu: ImuSamples, state: State, noise: ImuNoise) -> gtsam.PreintegratedCombinedMeasurements:
     """Sum up the samples from the state's stamp to the last, with the state's biases and gravity.
 
-    Each step between two samples takes their mean (midpoint rule). The noise grows with the longest step
+    Each step between two samples takes their mean (trapezoidal rule). The noise grows with the longest step
     (:func:`sampling_noise`).
 
     Raises:
@@ -59,8 +59,10 @@ def preintegrate(imu: ImuSamples, state: State, noise: ImuNoise) -> gtsam.Preint
     steps_s = np.diff(imu.stamps_ns) / NS_PER_S
     params = _params(noise, float(steps_s.max()), state.gravity_m_s2)
     pim = gtsam.PreintegratedCombinedMeasurements(params, bias_of(state))
-    accel = (imu.accel_m_s2[1:] + imu.accel_m_s2[:-1]) / 2
     gyro = (imu.gyro_rad_s[1:] + imu.gyro_rad_s[:-1]) / 2
+    # GTSAM takes the force in the frame at the step's start, from where the second sample's frame has turned
+    turned = se3.so3_exp((gyro - state.gyro_bias_rad_s) * steps_s[:, None])
+    accel = (imu.accel_m_s2[:-1] + (turned @ imu.accel_m_s2[1:, :, None])[..., 0]) / 2
     for step_s, a, w in zip(steps_s, accel, gyro, strict=True):
         pim.integrateMeasurement(a, w, step_s)
     return pim

@@ -1,0 +1,162 @@
+"""A vehicle's drive without a lidar: a smooth path, an IMU on it, and relative poses of known noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hybridlio import se3
+from hybridlio.estimates import RelativePose, State
+from hybridlio.record import Record
+from hybridlio.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples, Scan
+from hybridlio.simulation.imu import ideal_imu
+from hybridlio.simulation.path import SmoothPath
+from hybridlio.simulation.rig import GRAVITY_M_S2
+from hybridlio.startup import GRAVITY_MAGNITUDE_SIGMA_M_S2, start_state
+from hybridlio.trajectory import Trajectory
+
+START_NS = 1_700_000_000_000_000_000
+NOISE = ImuNoise()
+SILENT = ImuNoise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+STEP_SIGMAS = np.r_[np.full(3, 1e-3), np.full(3, 0.02)]  # rad, m: of a relative pose
+T_IMU_LIDAR = se3.make(Rotation.from_euler("xyz", (1.0, -0.5, 3.0), degrees=True).as_matrix(), (0.8, -0.3, 0.9))
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """A drive; world is the IMU's first pose. ``frames`` carry scans of no points."""
+
+    frames: list[Frame]
+    relative: list[RelativePose]
+    start: State
+    poses: np.ndarray  # (N, 4, 4) of the IMU
+    lidar_poses: np.ndarray  # (N, 4, 4) in the first lidar pose
+    velocities: np.ndarray
+    accel_biases: np.ndarray
+    gyro_biases: np.ndarray
+    gravity: np.ndarray
+    noise: ImuNoise
+    calibration: Calibration
+
+    def record(self, online: np.ndarray) -> Record:
+        """A run's record whose online lidar poses are ``online``."""
+        stamps = np.array([frame.scan.stamp_ns for frame in self.frames])
+        parts = [frame.imu for frame in self.frames[1:]]
+        stamps_imu, first = np.unique(np.concatenate([part.stamps_ns for part in parts]), return_index=True)
+        imu = ImuSamples(
+            stamps_imu,
+            np.concatenate([part.gyro_rad_s for part in parts])[first],
+            np.concatenate([part.accel_m_s2 for part in parts])[first],
+        )
+        covariances = np.tile(np.eye(6), (len(stamps), 1, 1))
+        trajectory = Trajectory(stamps, online, covariances)
+        steps = tuple(self.relative)
+        return Record(trajectory, steps, steps, imu, (), self.start, self.calibration, self.noise)
+
+
+def vehicle_path(rng: np.random.Generator, seconds: float, speed: float) -> SmoothPath:
+    """A car's path that starts at ``speed``: it turns, speeds up and down, pitches and rolls."""
+    times = np.arange(-0.5, seconds + 0.5, 0.05)
+
+    def waves(amplitude: float, periods: tuple[float, float]) -> np.ndarray:
+        period, phase = rng.uniform(*periods, 4), rng.uniform(0, 2 * np.pi, 4)
+        return amplitude * np.sin(2 * np.pi * times[:, None] / period + phase).sum(axis=1) / 2
+
+    speeds = speed + waves(2.0, (6.0, 20.0)) if speed else np.zeros(len(times))
+    yaw = rng.uniform(-np.pi, np.pi) + waves(0.6, (8.0, 20.0))
+    angles = np.column_stack([yaw, waves(0.02, (2.0, 8.0)), waves(0.02, (2.0, 8.0))])
+    R = Rotation.from_euler("ZYX", angles).as_matrix()
+    position = np.cumsum(R[:, :, 0] * speeds[:, None] * 0.05, axis=0)
+    return SmoothPath.through(times, se3.make(R, position))
+
+
+def _walk(rng: np.random.Generator, count: int, sigma: float, density: float, rate: float) -> np.ndarray:
+    start = sigma * rng.standard_normal(3)
+    return start + np.cumsum(density / np.sqrt(rate) * rng.standard_normal((count, 3)), axis=0)
+
+
+def make_chain(
+    seed: int,
+    steps: int = 60,
+    speed: float = 10.0,
+    imu_noise: ImuNoise = NOISE,
+    true_noise: ImuNoise | None = None,
+    step_sigmas: np.ndarray = STEP_SIGMAS,
+    step_error: float = 1.0,
+    imu_hz: float = 100.0,
+    path: SmoothPath | None = None,
+    T_imu_lidar: np.ndarray = T_IMU_LIDAR,
+) -> Chain:
+    """A drive of ``steps`` steps of 0.1 s whose IMU and relative poses have exactly the noise that they claim.
+
+    Args:
+        seed: of path, biases and noise.
+        steps: relative poses.
+        speed: metres per second at the start; 0 stands still.
+        imu_noise: what the IMU is said to be.
+        true_noise: what it is, where that is not the same.
+        step_sigmas: of a relative pose, as claimed.
+        step_error: the true error in units of the claimed one.
+        imu_hz: samples per second.
+        path: of the IMU, in place of a random one.
+        T_imu_lidar: the mount.
+    """
+    rng = np.random.default_rng(seed)
+    path = path or vehicle_path(rng, steps * 0.1 + 0.2, speed)
+    true = true_noise or imu_noise
+    scan_s = np.arange(steps + 1) * 0.1
+    imu_s = np.arange(round(scan_s[-1] * imu_hz) + 1) / imu_hz
+    gyro, accel = ideal_imu(path, imu_s)
+    gyro_bias = _walk(rng, len(imu_s), true.gyro_bias_sigma_rad_s, true.gyro_walk_rad_s2_sqrt_hz, imu_hz)
+    accel_bias = _walk(rng, len(imu_s), true.accel_bias_sigma_m_s2, true.accel_walk_m_s3_sqrt_hz, imu_hz)
+    gyro = gyro + gyro_bias + true.gyro_rad_s_sqrt_hz * np.sqrt(imu_hz) * rng.standard_normal(gyro.shape)
+    accel = accel + accel_bias + true.accel_m_s2_sqrt_hz * np.sqrt(imu_hz) * rng.standard_normal(accel.shape)
+    # gravity's magnitude differs from place to place, as the start-up's prior says
+    gravity = np.array([0.0, 0.0, -9.81 + GRAVITY_MAGNITUDE_SIGMA_M_S2 * rng.standard_normal()])
+    R_imu = path.motion(imu_s).poses[:, :3, :3]
+    accel = accel + np.einsum("nji,j->ni", R_imu, GRAVITY_M_S2 - gravity)
+    imu = ImuSamples(START_NS + np.round(imu_s * NS_PER_S).astype(np.int64), gyro, accel)
+    motion = path.motion(scan_s)
+    R0 = motion.poses[0, :3, :3]
+    poses = se3.between(motion.poses[0], motion.poses)
+    lidar = motion.poses @ T_imu_lidar
+    stamps = START_NS + np.round(scan_s * NS_PER_S).astype(np.int64)
+    calibration = Calibration(T_imu_lidar)
+    frames = [
+        Frame(
+            k,
+            Scan(int(stamp), np.empty((0, 3), np.float32)),
+            imu.between(int(stamps[k - 1]), int(stamp)) if k else ImuSamples.empty(),
+            calibration=calibration,
+            imu_noise=imu_noise,
+        )
+        for k, stamp in enumerate(stamps)
+    ]
+    covariance = np.diag(step_sigmas**2)
+    true_steps = se3.between(lidar[:-1], lidar[1:])
+    errors = step_error * step_sigmas * rng.standard_normal((steps, 6))
+    relative = [RelativePose(step, covariance, "test") for step in true_steps @ se3.exp(errors)]
+    at = np.searchsorted(imu.stamps_ns, stamps)
+    return Chain(
+        frames,
+        relative,
+        start_state(int(stamps[0]), frames[1].imu, imu_noise),
+        poses,
+        se3.between(lidar[0], lidar),
+        motion.velocity_m_s @ R0,
+        accel_bias[at],
+        gyro_bias[at],
+        gravity @ R0,
+        imu_noise,
+        calibration,
+    )
+
+
+@pytest.fixture(scope="session")
+def chain() -> Callable[..., Chain]:
+    """Makes drives: see :func:`make_chain`."""
+    return make_chain
