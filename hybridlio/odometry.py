@@ -11,13 +11,14 @@ import numpy as np
 
 from hybridlio import se3
 from hybridlio.config import Config
-from hybridlio.deskew import constant_twist, deskew
+from hybridlio.deskew import deskew
 from hybridlio.errors import ConfigError, DataError, EstimationError
 from hybridlio.estimates import Array, Backend, InitialPoseSource, RelativePose, ResidualSource, State
 from hybridlio.record import Record
 from hybridlio.sensors import Calibration, Frame, GpsFix, ImuNoise, ImuSamples
 from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES, Setup, check_names
 from hybridlio.startup import start_state
+from hybridlio.sweep import sweep_motion
 from hybridlio.trajectory import Trajectory
 
 
@@ -99,8 +100,9 @@ class Odometry:
         with _timed(seconds, "initial pose"):
             initial = self._initial_pose.predict(frame, state)
         with _timed(seconds, "motion compensation"):
-            motion = constant_twist(initial.pose, state.stamp_ns, frame.scan.stamp_ns)
-            frame = replace(frame, scan=deskew(frame.scan, motion))
+            if frame.scan.time_offsets_ns is not None:
+                motion = sweep_motion(frame, initial, state, self._setup.calibration)
+                frame = replace(frame, scan=deskew(frame.scan, motion))
         with _timed(seconds, "residual"):
             relative = self._residual.refine(frame, initial)
         with _timed(seconds, "graph"):

@@ -48,7 +48,7 @@ class ScanMatchingSettings:
     source_voxel_m: float = 1.0
     min_points: int = 200
     min_matched: float = 0.3
-    covariance_scale: float = 4.0
+    covariance_scale: float = 6.0
     start_speeds_m_s: tuple[float, ...] = (0.0, -5.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0)
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
     local_map: LocalMapSettings = field(default_factory=LocalMapSettings)

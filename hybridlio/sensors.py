@@ -223,6 +223,8 @@ class Frame:
         imu: samples from the previous scan's stamp to this one's, interpolated at both; for the first frame those
             before it, possibly none.
         gps: fixes in that time.
+        sweep_imu: samples during the sweep, for motion compensation; it may end after the scan's stamp. Empty where
+            the scan's points carry no times.
         calibration: the extrinsics; needed where there are IMU samples.
         imu_noise: the IMU's noise, where the recording says it.
     """
@@ -231,5 +233,6 @@ class Frame:
     scan: Scan
     imu: ImuSamples = field(default_factory=ImuSamples.empty)
     gps: tuple[GpsFix, ...] = ()
+    sweep_imu: ImuSamples = field(default_factory=ImuSamples.empty)
     calibration: Calibration | None = None
     imu_noise: ImuNoise | None = None

@@ -123,8 +123,23 @@ class Sequence:
         first, last = (
             bisect_right(self.gps, t, key=lambda fix: fix.stamp_ns) for t in (start if k else start - 1, end)
         )
-        imu = self.imu.between(start, end)
-        return Frame(k, scan, imu, self.gps[first:last], self.calibration, self.imu_noise)
+        scan = self.load_scan(k)
+        return Frame(
+            k,
+            scan,
+            imu=self.imu.between(start, end),
+            gps=self.gps[first:last],
+            sweep_imu=self._during(scan),
+            calibration=self.calibration,
+            imu_noise=self.imu_noise,
+        )
+
+    def _during(self, scan: Scan) -> ImuSamples:
+        """The samples from the scan's first point to its last, where points carry times."""
+        if scan.time_offsets_ns is None or not len(scan):
+            return ImuSamples.empty()
+        first, last = scan.time_offsets_ns.min(), scan.time_offsets_ns.max()
+        return self.imu.between(scan.stamp_ns + int(first), scan.stamp_ns + int(last))
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))
