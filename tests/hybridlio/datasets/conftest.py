@@ -178,3 +178,9 @@ class Recordings:
 @pytest.fixture(scope="session")
 def recordings() -> type[Recordings]:
     return Recordings
+
+
+@pytest.fixture
+def drive(recordings: type[Recordings], tmp_path: Path) -> Path:
+    """A KITTI raw drive with its 100 Hz recording beside it."""
+    return recordings.write_raw(tmp_path, recordings.ride)
