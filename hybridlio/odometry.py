@@ -11,7 +11,7 @@ import numpy as np
 
 from hybridlio import se3
 from hybridlio.config import Config
-from hybridlio.deskew import deskew
+from hybridlio.deskew import constant_twist, deskew
 from hybridlio.errors import ConfigError, DataError, EstimationError
 from hybridlio.estimates import Array, Backend, InitialPoseSource, RelativePose, ResidualSource, State
 from hybridlio.record import Record
@@ -99,12 +99,9 @@ class Odometry:
         seconds: dict[str, float] = {}
         with _timed(seconds, "initial pose"):
             initial = self._initial_pose.predict(frame, state)
-        with _timed(seconds, "motion compensation"):
-            if frame.scan.time_offsets_ns is not None:
-                motion = sweep_motion(frame, initial, state, self._setup.calibration)
-                frame = replace(frame, scan=deskew(frame.scan, motion))
-        with _timed(seconds, "residual"):
-            relative = self._residual.refine(frame, initial)
+        relative = self._refine(frame, initial, state, seconds)
+        if self._state is None and relative.ok and self._first.scan.time_offsets_ns is not None:
+            relative = self._restart(self._first, frame, relative, state)
         with _timed(seconds, "graph"):
             self._state = self._backend.update(frame, relative)
             step = self._backend.last_step()
@@ -163,6 +160,23 @@ class Odometry:
         self._start_state = start_state(first.scan.stamp_ns, _joined([near, frame.imu]), self._setup.imu_noise)
         self._backend.start(self._start_state)
         return self._start_state
+
+    def _refine(self, frame: Frame, initial: RelativePose, state: State, seconds: dict[str, float]) -> RelativePose:
+        """Compensate the scan's motion, where its points carry times, and refine the initial pose."""
+        with _timed(seconds, "motion compensation"):
+            if frame.scan.time_offsets_ns is not None:
+                step = constant_twist(initial.pose, state.stamp_ns, frame.scan.stamp_ns)
+                motion = sweep_motion(frame, step, state, self._setup.calibration)
+                frame = replace(frame, scan=deskew(frame.scan, motion))
+        with _timed(seconds, "residual"):
+            return self._residual.refine(frame, initial)
+
+    def _restart(self, first: Frame, frame: Frame, found: RelativePose, state: State) -> RelativePose:
+        """Do the first step again: only now is it known how fast the first two scans moved."""
+        step = constant_twist(found.pose, first.scan.stamp_ns, frame.scan.stamp_ns)
+        motion = sweep_motion(first, step, state, self._setup.calibration)
+        self._residual.start(replace(first, scan=deskew(first.scan, motion)))
+        return self._refine(frame, found, state, {})
 
     def _lidar_pose(self, state: State) -> tuple[Array, Array]:
         T_imu_lidar = self._setup.calibration.T_imu_lidar
