@@ -79,6 +79,16 @@ def _walk(rng: np.random.Generator, count: int, sigma: float, density: float, ra
     return start + np.cumsum(density / np.sqrt(rate) * rng.standard_normal((count, 3)), axis=0)
 
 
+def _frames(stamps: np.ndarray, imu: ImuSamples, calibration: Calibration, noise: ImuNoise) -> list[Frame]:
+    """Frames with scans of no points, each with the samples since the one before."""
+    nothing = np.empty((0, 3), np.float32)
+    parts = [ImuSamples.empty(), *(imu.between(int(a), int(b)) for a, b in zip(stamps, stamps[1:], strict=False))]
+    return [
+        Frame(k, Scan(int(stamp), nothing), part, calibration=calibration, imu_noise=noise)
+        for k, (stamp, part) in enumerate(zip(stamps, parts, strict=True))
+    ]
+
+
 def make_chain(
     seed: int,
     steps: int = 60,
@@ -126,16 +136,7 @@ def make_chain(
     lidar = motion.poses @ T_imu_lidar
     stamps = START_NS + np.round(scan_s * NS_PER_S).astype(np.int64)
     calibration = Calibration(T_imu_lidar)
-    frames = [
-        Frame(
-            k,
-            Scan(int(stamp), np.empty((0, 3), np.float32)),
-            imu.between(int(stamps[k - 1]), int(stamp)) if k else ImuSamples.empty(),
-            calibration=calibration,
-            imu_noise=imu_noise,
-        )
-        for k, stamp in enumerate(stamps)
-    ]
+    frames = _frames(stamps, imu, calibration, imu_noise)
     covariance = np.diag(step_sigmas**2)
     true_steps = se3.between(lidar[:-1], lidar[1:])
     errors = step_error * step_sigmas * rng.standard_normal((steps, 6))
