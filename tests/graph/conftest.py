@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -82,7 +83,7 @@ def _walk(rng: np.random.Generator, count: int, sigma: float, density: float, ra
 def _frames(stamps: np.ndarray, imu: ImuSamples, calibration: Calibration, noise: ImuNoise) -> list[Frame]:
     """Frames with scans of no points, each with the samples since the one before."""
     nothing = np.empty((0, 3), np.float32)
-    parts = [ImuSamples.empty(), *(imu.between(int(a), int(b)) for a, b in zip(stamps, stamps[1:], strict=False))]
+    parts = [ImuSamples.empty(), *(imu.between(int(a), int(b)) for a, b in pairwise(stamps))]
     return [
         Frame(k, Scan(int(stamp), nothing), part, calibration=calibration, imu_noise=noise)
         for k, (stamp, part) in enumerate(zip(stamps, parts, strict=True))
