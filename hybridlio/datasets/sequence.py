@@ -123,7 +123,6 @@ class Sequence:
         first, last = (
             bisect_right(self.gps, t, key=lambda fix: fix.stamp_ns) for t in (start if k else start - 1, end)
         )
-        scan = self.load_scan(k)
         return Frame(
             k,
             scan,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 
 from hybridlio.datasets import READERS, Sequence, open_sequence, sequence_names
 from hybridlio.errors import DataError
+from hybridlio.sensors import Scan
 
 # a new reader is tested by adding how its layout is written: (fixture, folder) -> arguments of open_sequence
 WRITERS: dict[str, Callable[[Any, Path], dict[str, Any]]] = {
@@ -121,6 +123,18 @@ def test_going_through_it_again_gives_the_same(sequence: Sequence) -> None:
         np.testing.assert_array_equal(a.imu.stamps_ns, b.imu.stamps_ns)
 
 
+def test_a_scan_is_read_once_each_time_its_frame_is_asked_for(sequence: Sequence) -> None:
+    asked = []
+
+    def load(k: int) -> Scan:
+        asked.append(k)
+        return sequence.load_scan(k)
+
+    counted = replace(sequence, load_scan=load)
+    assert counted[4].scan.stamp_ns == sequence.stamps_ns[4]
+    assert asked == [4]
+
+
 def test_it_can_be_sent_to_another_process(sequence: Sequence) -> None:
     copy = pickle.loads(pickle.dumps(sequence))
     np.testing.assert_array_equal(copy[3].scan.points, sequence[3].scan.points)
@@ -137,6 +151,9 @@ def test_a_scan_cut_short_is_named_when_it_is_asked_for_and_others_still_load(
         scan.write_bytes(data)
         with pytest.raises(DataError, match=rf"frame {frame}: .*{scan.name}"):
             sequence[frame]
+    bridged = sequence.without_scan(frame)
+    assert (bridged.index, bridged.scan.stamp_ns, len(bridged.scan)) == (frame, sequence.stamps_ns[frame], 0)
+    assert len(bridged.imu) >= 10
     scan.unlink()
     with pytest.raises(DataError, match=rf"frame {frame}: .*{scan.name}"):
         sequence[frame]
