@@ -70,3 +70,11 @@ def kitti_raw_root(unpacked_recordings: Path) -> Path:
 def kitti_odometry_root(unpacked_recordings: Path) -> Path:
     """The folder that holds ``sequences/00`` (10 scans) and ``poses`` (ground truth in the camera frame)."""
     return unpacked_recordings / "kitti_odometry"
+
+
+@pytest.fixture(scope="session")
+def tiny_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated drive of 25 scans with a 16-beam sensor, started at 10 m/s; read it, do not change it."""
+    from hybridlio.simulation import SimulationConfig, simulate
+
+    return simulate(tmp_path_factory.mktemp("drive"), SimulationConfig(seconds=2.5, seed=3, lidar="16-beam"))
