@@ -1,6 +1,7 @@
 """The factors of one odometry step, the same for the online and the offline graph.
 
-Keys: ``x`` pose of the IMU, ``v`` velocity, ``b`` biases, ``g`` gravity, each with the scan's number. World is the
+Keys: ``x`` pose of the IMU, ``v`` velocity, ``b`` biases, ``g`` gravity, ``m`` the pose on the path that scan matching
+has made for itself, each with the scan's number. World is the
 IMU's first pose, so that a marginal covariance is relative to the start without more ado, and gravity is what is
 estimated. It is one vector for all scans, written as a chain of nearly equal ones: a key shared by every factor would
 make each update cost as much as the run is long.
@@ -10,13 +11,15 @@ from __future__ import annotations
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, G, V, X
+from gtsam.symbol_shorthand import B, G, M, V, X
 
 from hybridlio import se3
 from hybridlio.estimates import Array, RelativePose, State
 from hybridlio.graph import noise
 from hybridlio.sensors import NS_PER_S
 from hybridlio.startup import GRAVITY_M_S2, GRAVITY_MAGNITUDE_SIGMA_M_S2
+
+Factors = list[gtsam.NonlinearFactor]
 
 _GAUGE_SIGMA = 1e-6  # the first pose defines world
 _GRAVITY_CHAIN_SIGMA_M_S2 = 1e-6  # per scan; 0.1 mm/s² after 10,000 scans
@@ -51,14 +54,47 @@ def insert_state(values: gtsam.Values, k: int, state: State) -> None:
         values.insert(G(k), state.gravity_m_s2)
 
 
-def between_factor(i: int, j: int, relative: RelativePose, T_imu_lidar: Array) -> gtsam.BetweenFactorPose3:
-    """The relative pose of scan j in scan i as a factor between IMU poses."""
+def between_factor(
+    i: int, j: int, relative: RelativePose, covariance: Array, T_imu_lidar: Array
+) -> gtsam.BetweenFactorPose3:
+    """The relative pose between two keys' IMU poses, given with its covariance between lidar poses."""
     pose = T_imu_lidar @ relative.pose @ se3.inverse(T_imu_lidar)
-    model = noise.gaussian(se3.rotate_covariance(relative.covariance, T_imu_lidar), f"{relative.source} {i}-{j}")
-    return gtsam.BetweenFactorPose3(X(i), X(j), gtsam.Pose3(pose), model)
+    model = noise.gaussian(se3.rotate_covariance(covariance, T_imu_lidar), f"{relative.source} to scan {j & 0xFFFFFF}")
+    return gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(pose), model)
 
 
-def imu_factors(i: int, j: int, pim: gtsam.PreintegratedCombinedMeasurements) -> list[gtsam.NonlinearFactor]:
+def map_factors(i: int, relative: RelativePose, drift: Array, T_imu_lidar: Array, fresh: bool) -> Factors:
+    """The step from scan ``i`` of a source that matches to a map of its own.
+
+    A scan's scatter about the map is not carried on: the next step takes it back, so that consecutive steps' errors
+    are opposed and a chain of independent factors would claim far too much. Instead the source's path has poses of its
+    own: along it only the map's drift adds up, and each scan's pose lies beside it by the scatter.
+
+    Args:
+        i: the scan before.
+        relative: the step; of a failed one, the path goes on where the source put it, but says nothing of the scan.
+        drift: ``(6, 6)``, what of its covariance adds up.
+        T_imu_lidar: the extrinsics.
+        fresh: whether the path begins at scan ``i``.
+    """
+    graph: Factors = [between_factor(M(i), M(i + 1), relative, drift, T_imu_lidar)]
+    if fresh:
+        graph.append(gtsam.BetweenFactorPose3(M(i), X(i), gtsam.Pose3(), noise.sigmas(np.full(6, _GAUGE_SIGMA))))
+    if relative.ok:
+        scatter = se3.rotate_covariance((relative.covariance - drift) / 2, T_imu_lidar)
+        model = noise.gaussian(scatter, f"{relative.source}, scatter of scan {i + 1}")
+        graph.append(gtsam.BetweenFactorPose3(M(i + 1), X(i + 1), gtsam.Pose3(), model))
+    return graph
+
+
+def insert_map_pose(values: gtsam.Values, i: int, before: Array, after: Array, fresh: bool) -> None:
+    """Put the poses of :func:`map_factors` beside those of the IMU, ``before`` and ``after`` the step."""
+    if fresh:
+        values.insert(M(i), gtsam.Pose3(before))
+    values.insert(M(i + 1), gtsam.Pose3(after))
+
+
+def imu_factors(i: int, j: int, pim: gtsam.PreintegratedCombinedMeasurements) -> Factors:
     """The samples between scans i and j as one factor, and gravity carried on."""
     return [
         gtsam.CombinedImuFactorWithGravityVector(X(i), V(i), X(j), V(j), B(i), B(j), G(i), pim),
@@ -66,7 +102,7 @@ def imu_factors(i: int, j: int, pim: gtsam.PreintegratedCombinedMeasurements) ->
     ]
 
 
-def bridge_factors(i: int, j: int, dt_s: float) -> list[gtsam.NonlinearFactor]:
+def bridge_factors(i: int, j: int, dt_s: float) -> Factors:
     """In place of IMU samples that are missing: velocity and biases may have changed as much as they can.
 
     Velocity here is tied to the poses again by the next samples; biases may have walked freely for ``dt_s``.
@@ -87,18 +123,28 @@ def _same_gravity(i: int, j: int) -> gtsam.NonlinearFactor:
 
 
 def step_factors(
-    i: int, state: State, relative: RelativePose, pim: gtsam.PreintegratedCombinedMeasurements | None, stamp_ns: int,
+    i: int,
+    state: State,
+    relative: RelativePose,
+    pim: gtsam.PreintegratedCombinedMeasurements | None,
+    stamp_ns: int,
     T_imu_lidar: Array,
-) -> gtsam.NonlinearFactorGraph:  # fmt: skip
+    fresh: bool,
+) -> gtsam.NonlinearFactorGraph:
     """All factors of the step from scan ``i`` (at ``state``) to the next, at ``stamp_ns``.
 
     A relative pose that failed, or that comes from the same IMU samples, is left out where the IMU factor bridges.
+    ``fresh`` is said of :func:`map_factors`.
     """
     graph = gtsam.NonlinearFactorGraph()
     if state.has_imu:
         dt_s = (stamp_ns - state.stamp_ns) / NS_PER_S
         for factor in imu_factors(i, i + 1, pim) if pim else bridge_factors(i, i + 1, dt_s):
             graph.add(factor)
-    if pim is None or (relative.ok and not relative.from_imu):
-        graph.add(between_factor(i, i + 1, relative, T_imu_lidar))
+    if relative.drift is not None:
+        for factor in map_factors(i, relative, relative.drift, T_imu_lidar, fresh):
+            graph.add(factor)
+    usable = relative.ok and not relative.from_imu and relative.drift is None
+    if usable or (pim is None and not (relative.ok and relative.drift is not None)):
+        graph.add(between_factor(X(i), X(i + 1), relative, relative.covariance, T_imu_lidar))
     return graph

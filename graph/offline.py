@@ -94,13 +94,18 @@ def _build(record: Record, states: list[State]) -> tuple[gtsam.NonlinearFactorGr
     graph, _ = factors.start_factors(record.start)
     values = gtsam.Values()
     factors.insert_state(values, 0, states[0])
+    on_map = False
     for i, relative in enumerate(record.relative):
         state, stamp_ns = states[i], states[i + 1].stamp_ns
         imu = record.imu.between(state.stamp_ns, stamp_ns)
         usable = state.has_imu and covers(imu, state.stamp_ns, stamp_ns)
         pim = preintegrate(imu, state, record.imu_noise) if usable else None
-        graph.push_back(factors.step_factors(i, state, relative, pim, stamp_ns, record.calibration.T_imu_lidar))
+        T_imu_lidar, fresh = record.calibration.T_imu_lidar, not on_map
+        graph.push_back(factors.step_factors(i, state, relative, pim, stamp_ns, T_imu_lidar, fresh))
         factors.insert_state(values, i + 1, states[i + 1])
+        on_map = relative.drift is not None
+        if on_map:
+            factors.insert_map_pose(values, i, state.T_world_imu, states[i + 1].T_world_imu, fresh)
     return graph, values
 
 

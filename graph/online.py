@@ -10,9 +10,9 @@ from hybridlio import se3
 from hybridlio.errors import GraphError
 from hybridlio.estimates import RelativePose, State
 from hybridlio.graph import factors
-from hybridlio.graph.preintegration import covers, preintegrate
+from hybridlio.graph.preintegration import bias_of, covers, preintegrate
 from hybridlio.graph.solver import incremental_solver
-from hybridlio.sensors import Calibration, Frame, ImuNoise
+from hybridlio.sensors import NS_PER_S, Calibration, Frame, ImuNoise
 
 # While tilt, speed and biases are still found, every step solves the few poses there are anew.
 _WARM_UP_STEPS = 20
@@ -28,10 +28,12 @@ class IncrementalBackend:
         self._T_lidar_imu = se3.inverse(calibration.T_imu_lidar)
         self._noise = noise
         self._k = 0
+        self._on_map = False  # whether the residual source's own path has a pose at the last scan
 
     def start(self, state: State) -> None:
         """Put the first scan's pose at the origin, the rest at ``state`` with its covariance."""
         self._k = 0
+        self._on_map = False
         self._state = state
         self._graph, self._values = factors.start_factors(state)
         self._isam = incremental_solver()
@@ -46,14 +48,18 @@ class IncrementalBackend:
         state, stamp_ns = self._state, frame.scan.stamp_ns
         usable = state.has_imu and covers(frame.imu, state.stamp_ns, stamp_ns)
         pim = preintegrate(frame.imu, state, self._noise) if usable else None
-        graph = factors.step_factors(self._k, state, relative, pim, stamp_ns, self._T_imu_lidar)
-        values = gtsam.Values()
-        factors.insert_state(values, self._k + 1, self._guess(frame, relative))
+        fresh = not self._on_map
+        graph = factors.step_factors(self._k, state, relative, pim, stamp_ns, self._T_imu_lidar, fresh)
+        values, guess = gtsam.Values(), self._guess(frame, relative, pim)
+        factors.insert_state(values, self._k + 1, guess)
+        if relative.drift is not None:
+            factors.insert_map_pose(values, self._k, state.T_world_imu, guess.T_world_imu, fresh)
         try:
             self._solve(graph, values)
         except RuntimeError as error:
             raise GraphError(f"frame {frame.index}: the graph cannot be solved: {str(error).strip()}") from error
         self._k += 1
+        self._on_map = relative.drift is not None
         self._state = self._read(stamp_ns)
         return self._state
 
@@ -68,12 +74,18 @@ class IncrementalBackend:
         pose = self._T_lidar_imu @ step @ self._T_imu_lidar
         return RelativePose(pose, (covariance + covariance.T) / 2, source=self.name, from_imu=self._state.has_imu)
 
-    def _guess(self, frame: Frame, relative: RelativePose) -> State:
-        """Where the new variables start: the relative pose, and the velocity that it means."""
+    def _guess(
+        self, frame: Frame, relative: RelativePose, pim: gtsam.PreintegratedCombinedMeasurements | None
+    ) -> State:
+        """Where the new variables start: the relative pose and the velocity it means; the IMU's where that failed."""
         state, stamp_ns = self._state, frame.scan.stamp_ns
-        T_world_imu = state.T_world_imu @ self._T_imu_lidar @ relative.pose @ self._T_lidar_imu
-        dt_s = (stamp_ns - state.stamp_ns) / 1e9
-        velocity = (T_world_imu[:3, 3] - state.T_world_imu[:3, 3]) / dt_s
+        if pim is not None and not relative.ok:
+            then = pim.predict(gtsam.NavState(gtsam.Pose3(state.T_world_imu), state.velocity_m_s), bias_of(state))
+            T_world_imu, velocity = then.pose().matrix(), then.velocity()
+        else:
+            T_world_imu = state.T_world_imu @ self._T_imu_lidar @ relative.pose @ self._T_lidar_imu
+            dt_s = (stamp_ns - state.stamp_ns) / NS_PER_S
+            velocity = (T_world_imu[:3, 3] - state.T_world_imu[:3, 3]) / dt_s
         return State(
             stamp_ns, T_world_imu, velocity, state.accel_bias_m_s2, state.gyro_bias_rad_s, state.gravity_m_s2,
             state.covariance, state.gravity_covariance, state.has_imu,

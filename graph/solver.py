@@ -10,6 +10,7 @@ import numpy as np
 _WILDFIRE_THRESHOLD = 1.0
 _RELINEARISE = {
     "x": np.r_[np.full(3, 0.02), np.full(3, 1.0)],  # pose: rad, m
+    "m": np.r_[np.full(3, 0.02), np.full(3, 1.0)],  # pose on scan matching's own path
     "v": np.full(3, 1.0),  # velocity, m/s
     "b": np.r_[np.full(3, 0.1), np.full(3, 0.01)],  # biases: m/s², rad/s
     "g": np.full(3, 0.1),  # gravity, m/s²
@@ -17,7 +18,7 @@ _RELINEARISE = {
 
 
 def incremental_solver() -> gtsam.ISAM2:
-    """An empty iSAM2 for graphs of poses ``x``, velocities ``v``, biases ``b`` and gravity ``g``."""
+    """An empty iSAM2 for graphs of poses ``x`` and ``m``, velocities ``v``, biases ``b`` and gravity ``g``."""
     params = gtsam.ISAM2Params()
     params.setFactorization("QR")  # Cholesky finds long straight chains indeterminate
     params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(_WILDFIRE_THRESHOLD))

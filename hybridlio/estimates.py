@@ -49,6 +49,8 @@ class RelativePose:
         source: who says so, such as ``preintegration`` or ``scan-matching``.
         degenerate: ``(D, 6)`` unit tangent directions that the measurement does not constrain; often empty.
         ok: False where the source failed and only bridges (the covariance is then wide).
+        drift: ``(6, 6)``, what of the covariance adds up over consecutive steps; the rest is scatter about a map that
+            the next step takes back. None where the steps' errors are independent, so that all of it adds up.
         from_imu: whether inertial data went into the pose; a graph that has the IMU itself must not count it twice.
         details: the source's own diagnostics by name (inliers, iterations, error …).
     """
@@ -59,11 +61,15 @@ class RelativePose:
     degenerate: Array = field(default_factory=lambda: np.empty((0, 6)))
     ok: bool = True
     from_imu: bool = False
+    drift: Array | None = None
     details: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "pose", se3.check_pose(self.pose, f"{self.source}: relative pose"))
         object.__setattr__(self, "covariance", check_covariance(self.covariance, f"{self.source}: relative pose"))
+        if self.drift is not None:
+            object.__setattr__(self, "drift", check_covariance(self.drift, f"{self.source}: drift"))
+            check_covariance(self.covariance - self.drift, f"{self.source}: covariance less drift")
 
 
 @dataclass(frozen=True, eq=False)

@@ -71,6 +71,9 @@ def _relative_arrays(prefix: str, steps: tuple[RelativePose, ...]) -> dict[str, 
         f"{prefix}_sources": np.array([s.source for s in steps], dtype=np.str_),
         f"{prefix}_ok": np.array([s.ok for s in steps], dtype=bool),
         f"{prefix}_from_imu": np.array([s.from_imu for s in steps], dtype=bool),
+        f"{prefix}_drifts": np.array([np.full((6, 6), np.nan) if s.drift is None else s.drift for s in steps]).reshape(
+            -1, 6, 6
+        ),
         f"{prefix}_degenerate_step": np.array(
             [k for k, s in enumerate(steps) for _ in range(len(s.degenerate))], dtype=np.int64
         ),
@@ -80,10 +83,18 @@ def _relative_arrays(prefix: str, steps: tuple[RelativePose, ...]) -> dict[str, 
 
 def _relatives(prefix: str, arrays: Mapping[str, Any]) -> tuple[RelativePose, ...]:
     at, directions = arrays[f"{prefix}_degenerate_step"], arrays[f"{prefix}_degenerate"]
-    columns = (arrays[f"{prefix}_{name}"] for name in ("poses", "covariances", "sources", "ok", "from_imu"))
+    columns = (arrays[f"{prefix}_{name}"] for name in ("poses", "covariances", "sources", "ok", "from_imu", "drifts"))
     return tuple(
-        RelativePose(pose, covariance, str(source), directions[at == k], bool(ok), bool(from_imu))
-        for k, (pose, covariance, source, ok, from_imu) in enumerate(zip(*columns, strict=True))
+        RelativePose(
+            pose,
+            covariance,
+            str(source),
+            directions[at == k],
+            bool(ok),
+            bool(from_imu),
+            None if np.isnan(drift).any() else drift,
+        )
+        for k, (pose, covariance, source, ok, from_imu, drift) in enumerate(zip(*columns, strict=True))
     )
 
 

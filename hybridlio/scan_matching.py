@@ -36,6 +36,8 @@ class ScanMatchingSettings:
         min_matched: with a smaller share of points matched, too.
         covariance_scale: how much larger the covariance is than independent residuals would make it; points on one
             surface share its error.
+        drift_share: how much of a step's covariance adds up from scan to scan; the rest is scatter about the local map.
+            Not used with ``last-scan``, where all of it does.
         start_speeds_m_s: forward speeds tried where the initial pose is unsure of the translation.
     """
 
@@ -49,6 +51,7 @@ class ScanMatchingSettings:
     min_points: int = 200
     min_matched: float = 0.3
     covariance_scale: float = 6.0
+    drift_share: float = 0.02
     start_speeds_m_s: tuple[float, ...] = (0.0, -5.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0)
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
     local_map: LocalMapSettings = field(default_factory=LocalMapSettings)
@@ -56,6 +59,7 @@ class ScanMatchingSettings:
 
 _UNSURE_TRANSLATION_M = 0.5
 _FLOOR_SIGMAS = np.r_[np.full(3, 5e-5), np.full(3, 1e-3)]  # rad, m: no registration is better than this
+_FLOOR_COVARIANCE = np.diag(_FLOOR_SIGMAS**2)
 _UNKNOWN_SIGMA_M = 10.0  # along a degenerate direction
 
 
@@ -98,13 +102,18 @@ class ScanMatching:
         before, self._T_map_lidar = self._T_map_lidar, found.pose
         if self._settings.target == "last-scan" or self._map.wants(found.pose):
             self._keep(cloud)
+        covariance = covariance_of(found, self._settings.covariance_scale)
         return RelativePose(
             se3.between(before, found.pose),
-            covariance_of(found, self._settings.covariance_scale),
+            covariance,
             source=self.name,
+            drift=self._drift(covariance),
             degenerate=degenerate_directions(found.hessian),
             details=_details(found, cloud.size()),
         )
+
+    def _drift(self, covariance: Array) -> Array | None:
+        return None if self._settings.target == "last-scan" else self._settings.drift_share * covariance
 
     def _thin(self, scan: Scan) -> small_gicp.PointCloud:
         range2 = np.einsum("ij,ij->i", scan.points, scan.points)
@@ -139,6 +148,7 @@ class ScanMatching:
             initial.covariance,
             source=initial.source,
             ok=False,
+            drift=self._drift(_FLOOR_COVARIANCE),  # the map has not moved
             from_imu=initial.from_imu,
             details=_details(found, points) if found else {"points": float(points)},
         )
@@ -153,7 +163,7 @@ def covariance_of(found: Registration, scale: float) -> Array:
     information = values - NORMAL_NOISE * np.trace(found.hessian[3:, 3:])
     variance = np.minimum(scale * found.sigma_m**2 / np.maximum(information, 1e-9), _UNKNOWN_SIGMA_M**2)
     root = vectors * np.sqrt(variance) * to_tangent[:, None]
-    return np.asarray(root @ root.T + np.diag(_FLOOR_SIGMAS**2))
+    return np.asarray(root @ root.T + _FLOOR_COVARIANCE)
 
 
 def _ahead(pose: Array, distance_m: float) -> Array:
