@@ -18,7 +18,7 @@ from hybridlio.record import Record
 from hybridlio.sensors import Calibration, Frame, GpsFix, ImuNoise, ImuSamples
 from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES, Setup, check_names
 from hybridlio.startup import start_state
-from hybridlio.sweep import sweep_motion
+from hybridlio.sweep import compensation_noise, sweep_motion
 from hybridlio.trajectory import Trajectory
 
 
@@ -163,13 +163,16 @@ class Odometry:
 
     def _refine(self, frame: Frame, initial: RelativePose, state: State, seconds: dict[str, float]) -> RelativePose:
         """Compensate the scan's motion, where its points carry times, and refine the initial pose."""
+        turned: Array = np.zeros((6, 6))
         with _timed(seconds, "motion compensation"):
             if frame.scan.time_offsets_ns is not None:
+                turned = compensation_noise(frame.scan, self._setup.imu_noise)
                 step = constant_twist(initial.pose, state.stamp_ns, frame.scan.stamp_ns)
                 motion = sweep_motion(frame, step, state, self._setup.calibration)
                 frame = replace(frame, scan=deskew(frame.scan, motion))
         with _timed(seconds, "residual"):
-            return self._residual.refine(frame, initial)
+            relative = self._residual.refine(frame, initial)
+        return replace(relative, covariance=relative.covariance + turned) if relative.ok else relative
 
     def _restart(self, first: Frame, frame: Frame, found: RelativePose, state: State) -> RelativePose:
         """Do the first step again: only now is it known how fast the first two scans moved."""

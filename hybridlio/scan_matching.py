@@ -51,7 +51,7 @@ class ScanMatchingSettings:
     min_points: int = 200
     min_matched: float = 0.3
     covariance_scale: float = 6.0
-    drift_share: float = 0.02
+    drift_share: float = 0.05
     start_speeds_m_s: tuple[float, ...] = (0.0, -5.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0)
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
     local_map: LocalMapSettings = field(default_factory=LocalMapSettings)

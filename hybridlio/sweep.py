@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from hybridlio import se3
-from hybridlio.estimates import State
-from hybridlio.sensors import NS_PER_S, Calibration, Frame
+from hybridlio.estimates import Array, State
+from hybridlio.sensors import NS_PER_S, Calibration, Frame, ImuNoise, Scan
 from hybridlio.trajectory import Trajectory
 
 
@@ -37,3 +37,15 @@ def sweep_motion(sweep: Frame, step: Trajectory, state: State, calibration: Cali
         R = R @ turn
         poses.append(se3.make(R, position))
     return Trajectory(imu.stamps_ns, np.array(poses))
+
+
+def compensation_noise(scan: Scan, noise: ImuNoise) -> Array:
+    """``(6, 6)`` by which a step between two scans compensated by a gyroscope is less sure than their points say.
+
+    The orientation of a point ``τ`` from the stamp is off by the gyroscope's noise summed over ``τ``, variance
+    ``σ_g²·|τ|``; over a sweep of length ``T`` around the stamp a scan as a whole turns by about ``σ_g²·T/12`` of it.
+    """
+    assert scan.time_offsets_ns is not None
+    sweep_s = float(np.ptp(scan.time_offsets_ns)) / NS_PER_S if len(scan) else 0.0
+    both_scans = 2 * noise.gyro_rad_s_sqrt_hz**2 * sweep_s / 12
+    return np.diag(np.r_[np.full(3, both_scans), np.zeros(3)])
