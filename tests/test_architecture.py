@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 HEAVY = {"torch", "gtsam", "open3d", "matplotlib", "small_gicp", "scipy", "pydantic", "typer"}
 # the only modules of hybridlio that may know that graph and learned exist
 JOINING = ("__main__", "cli", "compare", "odometry", "run", "run_folder", "run_outputs", "sources")
-MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_IMPORT_S = 300, 60, 0.3
+MAX_MODULE_LINES, MAX_TEST_LINES, MAX_FUNCTION_LINES, MAX_IMPORT_S = 300, 400, 60, 0.3
 
 
 def package_files() -> Iterator[tuple[str, Path]]:
@@ -128,7 +128,8 @@ def test_every_module_says_what_it_is():
 
 def test_files_stay_short():
     lines = {file: len(path.read_text().splitlines()) for file, path in FILES.items()}
-    assert {file: count for file, count in lines.items() if count > MAX_FILE_LINES} == {}
+    limits = {file: MAX_TEST_LINES if file.startswith("tests/") else MAX_MODULE_LINES for file in FILES}
+    assert {file: count for file, count in lines.items() if count > limits[file]} == {}
 
 
 def lines_of(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
