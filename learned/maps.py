@@ -1,0 +1,118 @@
+"""Vertex and normal maps in PyTorch: batched, on any device, with gradients through what the cells hold.
+
+The same cells as :mod:`hybridlio.projection` (UnDeepLIO, "Vertex map", "Normal map", "Mapping the point clouds of
+current frame to the last frame"). Which point a cell shows is a choice and has no gradient; the point's coordinates
+have, so the loss reaches the pose by which a map was moved. Geometry stays in single precision also where networks
+compute in half.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from hybridlio.learned import se3
+from hybridlio.projection import MapGeometry
+
+_FAR = (1 << 63) - 1
+_INDEX_BITS = 32
+
+
+@torch.no_grad()
+def winners(points: Tensor, geometry: MapGeometry) -> Tensor:
+    """Which point each cell shows: the index of the nearest ``(B, H·W)`` int64, −1 where a cell is empty.
+
+    Args:
+        points: ``(B, N, 3)`` float32 metres. Points that are not finite, lie in the origin or outside the rows are left
+            out. Of points equally near, the first wins.
+        geometry: the cells.
+    """
+    batch, count, _ = points.shape
+    cells = geometry.rows * geometry.columns
+    x, y, z = points.float().unbind(-1)
+    depth = torch.sqrt(x * x + y * y + z * z)
+    row = (geometry.fov_up_deg - torch.rad2deg(torch.asin(z / depth))) / geometry.row_deg
+    column = (180.0 - torch.rad2deg(torch.atan2(y, x))) / geometry.column_deg
+    inside = (row >= 0) & (row < geometry.rows) & (depth < torch.inf)  # NaN compares false
+    cell = row.nan_to_num(0.0).long() * geometry.columns + column.nan_to_num(0.0).long() % geometry.columns
+    index = torch.arange(count, device=points.device)
+    # positive floats order like their bits: the least of (depth, index) in one integer is the nearest point
+    key = (depth.view(torch.int32).long() << _INDEX_BITS) | index
+    cell = torch.where(inside, cell, cells)  # one cell more, thrown away, takes what is outside
+    nearest = torch.full((batch, cells + 1), _FAR, dtype=torch.int64, device=points.device)
+    nearest.scatter_reduce_(1, cell, key, reduce="amin")
+    nearest = nearest[:, :cells]
+    return torch.where(nearest == _FAR, -1, nearest & ((1 << _INDEX_BITS) - 1))
+
+
+def gather(values: Tensor, chosen: Tensor, geometry: MapGeometry) -> Tensor:
+    """Values ``(B, N, C)`` of the points, as maps ``(B, C, H, W)`` by :func:`winners`; 0 in empty cells."""
+    index = chosen.clamp(min=0)[..., None].expand(-1, -1, values.shape[-1])
+    there = (chosen >= 0)[..., None]
+    filled = torch.where(there, values.gather(1, index), torch.zeros((), dtype=values.dtype, device=values.device))
+    return filled.transpose(1, 2).reshape(len(values), values.shape[-1], geometry.rows, geometry.columns)
+
+
+def vertex_map(points: Tensor, geometry: MapGeometry) -> Tensor:
+    """Vertex maps ``(B, 3, H, W)`` of points ``(B, N, 3)``, metres: each cell's nearest point, 0 where there is none.
+
+    Pad clouds of different sizes with zeros: a point in the origin falls into no cell.
+    """
+    return gather(points, winners(points, geometry), geometry)
+
+
+def valid_cells(maps: Tensor) -> Tensor:
+    """Cells ``(B, H, W)`` of maps ``(B, C, H, W)`` that hold something."""
+    return (maps != 0).any(dim=-3)
+
+
+def as_points(maps: Tensor) -> Tensor:
+    """The cells of maps ``(B, 3, H, W)`` as a list ``(B, H·W, 3)``, row by row."""
+    return maps.flatten(2).transpose(1, 2)
+
+
+def normal_map(vertices: Tensor) -> Tensor:
+    """Normal maps ``(B, 3, H, W)`` of vertex maps: unit normals towards the sensor, 0 where a neighbour is missing.
+
+    The definition is that of :func:`hybridlio.projection.normal_map`.
+    """
+    depth = vertices.square().sum(-3).sqrt()
+    arms = []
+    valid = depth > 0
+    for down, right in ((1, 0), (0, -1), (-1, 0), (0, 1)):
+        neighbour, its_depth = _shifted(vertices, down, right), _shifted(depth, down, right)
+        valid = valid & (its_depth > 0)
+        arms.append(torch.exp(-0.5 * (its_depth - depth).abs())[..., None, :, :] * (neighbour - vertices))
+    up, right_, below, left = arms
+    total = torch.linalg.cross(up - below, right_ - left, dim=-3)  # the four cyclic products in one
+    length = total.square().sum(-3).sqrt()
+    valid = valid & (length > 0)
+    sign = torch.where((total * vertices).sum(-3) > 0, -1.0, 1.0)
+    unit = total * (sign / torch.where(valid, length, 1.0))[..., None, :, :]
+    return torch.where(valid[..., None, :, :], unit, 0.0)
+
+
+def _shifted(values: Tensor, down: int, right: int) -> Tensor:
+    """Values ``(..., H, W)`` moved by rows and columns; columns wrap around, rows that nothing moves into are 0."""
+    moved = torch.roll(values, (down, right), dims=(-2, -1))
+    if down:
+        edge = 0 if down > 0 else -1
+        moved[..., edge, :] = 0.0
+    return moved
+
+
+def remap(vertices: Tensor, normals: Tensor, T_a_b: Tensor, geometry: MapGeometry) -> tuple[Tensor, Tensor]:
+    """Both maps of frame b as seen from frame a: vertices moved and projected again, normals rotated with them.
+
+    Gradients reach ``T_a_b`` through the moved vertices and rotated normals.
+
+    Args:
+        vertices, normals: ``(B, 3, H, W)`` in frame b.
+        T_a_b: ``(B, 4, 4)``, such as the initial poses ``T_k_k1``.
+        geometry: the cells of the result.
+    """
+    there = valid_cells(vertices).flatten(1)[..., None]
+    moved = torch.where(there, se3.transform(T_a_b, as_points(vertices)), 0.0)  # an empty cell stays in the origin
+    chosen = winners(moved, geometry)
+    rotated = se3.rotate(T_a_b, as_points(normals))
+    return gather(moved, chosen, geometry), gather(rotated, chosen, geometry)

@@ -1,0 +1,116 @@
+"""The whole network: initial pose, remapping, residual, ``T = δT·T̂``. Source: UnDeepLIO, "Network Structure"."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from hybridlio.errors import ConfigError
+from hybridlio.learned import maps, se3
+from hybridlio.learned.imu_network import ImuNetwork
+from hybridlio.learned.residual_network import ResidualNetwork
+from hybridlio.learned.settings import NetworkSettings
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkInput:
+    """What the network sees of a batch of pairs.
+
+    Attributes:
+        last, current: vertex maps ``(B, 3, H, W)`` of scan k and k+1, each in its own frame.
+        imu: ``(B, S, 6)`` rows of :func:`hybridlio.learned.imu_rows.imu_rows`; zeros where there are none.
+        dt_s: ``(B,)`` time between the scans.
+        velocity_m_s: ``(B, 3)`` at scan k, in its axes; zeros where not known.
+        initial: ``(B, 4, 4)`` initial poses from elsewhere, for ``imu="given"``; else None or not looked at.
+    """
+
+    last: Tensor
+    current: Tensor
+    imu: Tensor
+    dt_s: Tensor
+    velocity_m_s: Tensor
+    initial: Tensor | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkOutput:
+    """What the network says.
+
+    Attributes:
+        initial: ``T̂`` ``(B, 4, 4)``.
+        poses: ``T = δT·T̂`` ``(B, 4, 4)`` after each iteration; the paper's network has one.
+    """
+
+    initial: Tensor
+    poses: tuple[Tensor, ...]
+
+    @property
+    def pose(self) -> Tensor:
+        """``T_k_k1`` ``(B, 4, 4)``, the last iteration's."""
+        return self.poses[-1]
+
+    @property
+    def residual(self) -> Tensor:
+        """``δT`` ``(B, 4, 4)``, of all iterations together."""
+        return self.pose @ se3.inverse(self.initial)
+
+
+class OdometryNetwork(nn.Module):
+    """UnDeepLIO: from two vertex maps and the inertial data between them to the relative pose ``T_k_k1``.
+
+    Args:
+        settings: its structure.
+
+    Attributes:
+        mixed_precision: encoders compute in bfloat16; geometry and poses never do.
+    """
+
+    def __init__(self, settings: NetworkSettings) -> None:
+        super().__init__()
+        self.settings = settings
+        self.mixed_precision = False
+        self.imu_network = ImuNetwork(settings) if settings.imu in ("initial-pose", "feature") else None
+        self.residual_network = ResidualNetwork(settings)
+
+    def forward(self, given: NetworkInput) -> NetworkOutput:
+        """Estimate the relative poses of a batch.
+
+        Raises:
+            ConfigError: the maps have other cells than the network, or an initial pose is to be given and is not.
+        """
+        geometry = self.settings.geometry
+        if given.last.shape[-2:] != (geometry.rows, geometry.columns):
+            rows, columns = given.last.shape[-2:]
+            raise ConfigError(
+                f"the network takes maps of {geometry.rows} x {geometry.columns} cells, got {rows} x {columns}"
+            )
+        initial, features = self._from_imu(given)
+        last = (given.last, maps.normal_map(given.last))
+        normals = maps.normal_map(given.current)
+        pose, poses = initial, []
+        for _ in range(self.settings.iterations):
+            moved = maps.remap(given.current, normals, pose, geometry)
+            with torch.autocast(given.last.device.type, torch.bfloat16, enabled=self.mixed_precision):
+                residual = self.residual_network(last, moved, features)
+            pose = residual.float() @ pose
+            poses.append(pose)
+        return NetworkOutput(initial, tuple(poses))
+
+    def _from_imu(self, given: NetworkInput) -> tuple[Tensor, tuple[Tensor, Tensor] | None]:
+        if self.settings.imu == "given":
+            if given.initial is None:
+                raise ConfigError("this network takes its initial pose from elsewhere, and none was given")
+            return given.initial, None
+        nothing = se3.identity(len(given.last), given.last)
+        if self.imu_network is None:
+            return nothing, None
+        if self.settings.imu == "feature":
+            return nothing, self.imu_network.features(given.imu, given.velocity_m_s)
+        return self.imu_network(given.imu, given.velocity_m_s, given.dt_s), None
+
+
+def parameter_count(network: nn.Module) -> int:
+    """How many numbers training adjusts; shared ones count once."""
+    return sum(parameter.numel() for parameter in network.parameters())

@@ -1,0 +1,229 @@
+"""What a network is made of, how it is judged and how it is trained: frozen settings that go into every checkpoint.
+
+Plain dataclasses, so that training needs nothing but PyTorch and NumPy. Values are checked on construction; unknown
+keys are errors. What the paper leaves open is named in the attribute's description.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeVar
+
+from hybridlio.errors import ConfigError
+from hybridlio.projection import MAP_GEOMETRIES, MapGeometry
+
+_S = TypeVar("_S")
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """The network.
+
+    Attributes:
+        imu: what the IMU is used for: ``initial-pose`` (the method), ``feature`` (its features join those of the scans,
+            the initial pose is the identity), ``none``, or ``given`` (the initial pose comes from elsewhere).
+        normals: ``separate`` (translation from vertex features alone), ``joined`` (both from all features), ``none``.
+        head: ``attention`` (the paper's gate) or ``mlp`` (``tanh(W₂ tanh(W₁x + b₁) + b₂)``).
+        siamese: whether the two encoders, and the two LSTMs, share their weights, as the word means, or are ``twins``
+            of one structure.
+        rotation: ``euler`` angles (roll, pitch, yaw) or ``log``, a rotation vector.
+        geometry: cells of the maps.
+        imu_samples: S, rows of inertial data between two scans.
+        imu_hidden, imu_layers: size of the LSTMs; not in the paper.
+        velocity: the translation LSTM also sees the last velocity and starts from what it gives at constant speed;
+            not in the paper.
+        stem, stages: channels of the encoder's first convolution and of its stages, as ResNet-18; not in the paper.
+        blocks: residual blocks a stage; not in the paper.
+        normalisation: ``batch`` (ResNet's) or ``group``, which does not depend on the batch.
+        features: outputs of the fully connected layer after pooling; not in the paper.
+        pooled_columns: sectors of azimuth that are pooled by themselves; 1 pools everything.
+        iterations: how often the residual is estimated, each from the maps moved by all before; the paper's is 1.
+        distance_channel: the signed distance of each moved point to the plane in its cell as an input; not in the
+            paper, and needs ``twins``.
+        vertex_scale_m: vertices are divided by it.
+        residual_scale: the last layers' weights start smaller by it, so that training starts near δT = 1.
+    """
+
+    imu: Literal["initial-pose", "feature", "none", "given"] = "initial-pose"
+    normals: Literal["separate", "joined", "none"] = "separate"
+    head: Literal["attention", "mlp"] = "attention"
+    siamese: Literal["shared", "twins"] = "shared"
+    rotation: Literal["euler", "log"] = "euler"
+    geometry: MapGeometry = MAP_GEOMETRIES["hdl-64e"]
+    imu_samples: int = 15
+    imu_hidden: int = 128
+    imu_layers: int = 2
+    velocity: bool = False
+    stem: int = 32
+    stages: tuple[int, ...] = (32, 64, 128, 256)
+    blocks: int = 2
+    normalisation: Literal["batch", "group"] = "batch"
+    features: int = 256
+    pooled_columns: int = 1
+    iterations: int = 1
+    distance_channel: bool = False
+    vertex_scale_m: float = 1.0
+    residual_scale: float = 0.1
+
+    def __post_init__(self) -> None:
+        _check_choices(self)
+        positive = ("imu_samples", "imu_hidden", "imu_layers", "stem", "blocks", "features", "pooled_columns")
+        _check_positive(self, *positive, "iterations", "vertex_scale_m", "residual_scale")
+        if not self.stages or min(self.stages) < 1:
+            raise ConfigError(f"network: stages needs channels of 1 or more each, got {self.stages}")
+        if self.distance_channel and self.siamese == "shared" and self.normals != "none":
+            raise ConfigError("network: distance_channel gives the encoders different inputs; set siamese to 'twins'")
+        if self.velocity and self.siamese == "shared":
+            raise ConfigError("network: velocity gives the LSTMs different inputs; set siamese to 'twins'")
+
+
+@dataclass(frozen=True)
+class LossSettings:
+    """The unsupervised loss.
+
+    Attributes:
+        alpha, lambda_: weights of the point-to-plane and the plane-to-plane term.
+        product: ``dot`` for ``|n·d|``, or ``element-wise`` for ``Σᵢ|nᵢdᵢ|``, as the paper's text has it.
+        matching: ``nearest`` in the whole last cloud, ``nearest-projected`` among the points that the maps show, or
+            ``same-pixel``.
+        kernel: ``l1`` (the paper's), ``huber`` or ``geman-mcclure`` on the point-to-plane distance.
+        kernel_m: where the kernel bends.
+        max_distance_m: points farther from their match count for nothing; the paper has no limit.
+        reduction: ``sum`` over the points (the paper's) or their ``mean``.
+    """
+
+    alpha: float = 1.0
+    lambda_: float = 0.1
+    product: Literal["dot", "element-wise"] = "dot"
+    matching: Literal["nearest", "nearest-projected", "same-pixel"] = "nearest"
+    kernel: Literal["l1", "huber", "geman-mcclure"] = "l1"
+    kernel_m: float = 0.1
+    max_distance_m: float = float("inf")
+    reduction: Literal["sum", "mean"] = "sum"
+
+    def __post_init__(self) -> None:
+        _check_choices(self)
+        _check_positive(self, "kernel_m", "max_distance_m")
+        if self.alpha < 0 or self.lambda_ < 0 or self.alpha + self.lambda_ == 0:
+            raise ConfigError(
+                f"loss: alpha and lambda_ must not be negative or both 0, got {self.alpha}, {self.lambda_}"
+            )
+
+
+@dataclass(frozen=True)
+class OptimiserSettings:
+    """How weights are found.
+
+    Attributes:
+        epochs: passes over the data; the paper does not say how many.
+        batch: pairs a step, over all processes together.
+        learning_rate: at the start.
+        schedule: ``step`` halves it every ``step_epochs``; ``cosine`` lets it fall to 0 over all epochs.
+        step_epochs, step_factor: of the step schedule.
+        betas, weight_decay: Adam's.
+        clip_norm: gradients longer than this are shortened; 0 leaves them.
+        seed: of the weights, the order of the pairs and the noise.
+        mixed_precision: encoders compute in bfloat16 on a GPU.
+        initial_noise_rad, initial_noise_m: standard deviation by axis of what a given initial pose is shaken by.
+    """
+
+    epochs: int = 100
+    batch: int = 20
+    learning_rate: float = 1e-4
+    schedule: Literal["step", "cosine"] = "step"
+    step_epochs: int = 20
+    step_factor: float = 0.5
+    betas: tuple[float, float] = (0.9, 0.99)
+    weight_decay: float = 1e-5
+    clip_norm: float = 0.0
+    seed: int = 0
+    mixed_precision: bool = False
+    initial_noise_rad: float = 0.0
+    initial_noise_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_choices(self)
+        _check_positive(self, "epochs", "batch", "learning_rate", "step_epochs", "step_factor")
+        if len(self.betas) != 2 or not all(0 <= beta < 1 for beta in self.betas):
+            raise ConfigError(f"optimiser: betas are two numbers from 0 to below 1, got {self.betas}")
+        if min(self.weight_decay, self.clip_norm, self.initial_noise_rad, self.initial_noise_m) < 0:
+            raise ConfigError("optimiser: weight decay, clip_norm and initial noise must not be negative")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Everything that decides what a training run gives, but the data.
+
+    Attributes:
+        name: of the preset it came from.
+        network, loss, optimiser: the settings.
+    """
+
+    name: str = "custom"
+    network: NetworkSettings = field(default_factory=NetworkSettings)
+    loss: LossSettings = field(default_factory=LossSettings)
+    optimiser: OptimiserSettings = field(default_factory=OptimiserSettings)
+
+
+def to_dict(settings: Any) -> dict[str, Any]:
+    """Settings as plain values, for JSON: an infinite limit becomes ``"inf"``."""
+    values = dataclasses.asdict(settings)
+    return {key: _plain(value) for key, value in values.items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, tuple):
+        return list(value)
+    return "inf" if value == float("inf") else value
+
+
+def from_dict(kind: type[_S], values: Mapping[str, Any], where: str = "settings") -> _S:
+    """Settings of a kind from plain values.
+
+    Raises:
+        ConfigError: a key is unknown, or a value of the wrong type or out of range; says where.
+    """
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{where}: expected named values, got {type(values).__name__}")
+    hints = typing.get_type_hints(kind)
+    known = [f.name for f in dataclasses.fields(kind)]  # type: ignore[arg-type]
+    unknown = [key for key in values if key not in known]
+    if unknown:
+        raise ConfigError(f"{where}: unknown {', '.join(map(repr, unknown))}; there are {', '.join(known)}")
+    return kind(**{key: _typed(hints[key], value, f"{where}.{key}") for key, value in values.items()})
+
+
+def _typed(hint: Any, value: Any, where: str) -> Any:
+    if dataclasses.is_dataclass(hint):
+        return from_dict(typing.cast("type[Any]", hint), value, where)
+    if typing.get_origin(hint) is tuple:
+        if not isinstance(value, list | tuple):
+            raise ConfigError(f"{where}: expected a list, got {value!r}")
+        return tuple(_typed(typing.get_args(hint)[0], item, where) for item in value)
+    if typing.get_origin(hint) is Literal or isinstance(hint, types.UnionType):
+        return value
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if hint is float and (number or value == "inf"):
+        return float(value)
+    if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
+        raise ConfigError(f"{where}: expected {hint.__name__}, got {value!r}")
+    return value
+
+
+def _check_choices(settings: Any) -> None:
+    for name, hint in typing.get_type_hints(type(settings)).items():
+        if typing.get_origin(hint) is Literal and getattr(settings, name) not in typing.get_args(hint):
+            choices = ", ".join(typing.get_args(hint))
+            raise ConfigError(f"{name} is one of {choices}, not {getattr(settings, name)!r}")
+
+
+def _check_positive(settings: Any, *names: str) -> None:
+    for name in names:
+        if not getattr(settings, name) > 0:
+            raise ConfigError(f"{name} must be positive, got {getattr(settings, name)}")
