@@ -37,7 +37,9 @@ def main(
     ] = False,
     _verbose: Annotated[
         int,
-        typer.Option("-v", "--verbose", count=True, callback=start_quietly, show_default=False, help="Log more."),
+        typer.Option(
+            "-v", "--verbose", count=True, metavar=" ", callback=start_quietly, show_default=False, help="Log more."
+        ),
     ] = 0,
 ) -> None:
     """Lidar-inertial odometry: from a drive to a trajectory with covariances, a pose graph and a report."""

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
 Progress = Callable[[str, int, int], None]
 
+_NAMES = ("initial pose", "residual", "backend")
+_LEGEND = "initial, final: median error of a step before and after looking at the scans; time: median for a scan"
+
 
 @dataclass(frozen=True, eq=False)
 class StepErrors:
@@ -178,13 +181,16 @@ def _step_errors(run: Run, poses: Array) -> StepErrors | None:
 
 def table(comparison: Comparison) -> Table:
     """The comparison for the terminal."""
+    from rich import box
     from rich.table import Table
     from rich.text import Text
 
-    out = Table(title=Text(heading(comparison)))
+    out = Table(title=Text(heading(comparison)), caption=Text(_LEGEND), box=box.SIMPLE_HEAD, padding=0)
     rows = columns(comparison)
     for name in rows[0]:
-        out.add_column(Text(name), justify="left" if name in ("initial pose", "residual", "backend") else "right")
+        is_name = name in _NAMES
+        lines = name if is_name else "\n".join(name.rsplit(" ", 1))
+        out.add_column(Text(lines), justify="left" if is_name else "right")
     for row in rows:
         out.add_row(*map(Text, row.values()))
     return out
@@ -197,6 +203,11 @@ def heading(comparison: Comparison) -> str:
         words.append(f"{comparison.reference_length_m:.1f} m by the reference")
     if comparison.forward_speed_length_m is not None:
         words.append(f"{comparison.forward_speed_length_m:.1f} m by forward speed")
+    judged = [row.evaluation for row in comparison.rows if row.evaluation is not None]
+    short = [e.chosen_lengths_m for e in judged if e.t_rel_percent is None and e.chosen_lengths_m is not None]
+    words += [f"drift over {short[0][0]:g}–{short[0][-1]:g} m"] if short else []
+    used = {name: {getattr(row, name.replace(" ", "_")) for row in comparison.rows} for name in _NAMES}
+    words += [f"{name} {values.pop()}" for name, values in used.items() if len(values) == 1]
     return ", ".join(words)
 
 
@@ -204,9 +215,9 @@ def columns(comparison: Comparison) -> list[dict[str, str]]:
     """The rows under their headings, all under the same; columns that say nothing are left out."""
     rows = [_cells(row) for row in comparison.rows]
     names = dict.fromkeys(name for row in rows for name in row)
-    if len({row.backend for row in comparison.rows}) == 1:
-        names.pop("backend")
-    return [{name: row.get(name, "–") for name in names if any(r.get(name, "–") != "–" for r in rows)} for row in rows]
+    same = [name for name in _NAMES[1:] if len({row[name] for row in rows}) == 1]
+    told = [name for name in names if name not in same and any(row.get(name, "–") != "–" for row in rows)]
+    return [{name: row.get(name, "–") for name in told} for row in rows]
 
 
 def _cells(row: Compared) -> dict[str, str]:
@@ -214,16 +225,19 @@ def _cells(row: Compared) -> dict[str, str]:
     out = {"initial pose": row.initial_pose, "residual": row.residual, "backend": row.backend}
     if e is not None:
         short = e.t_rel_percent is None
-        over = f" over {e.chosen_lengths_m[0]:g}–{e.chosen_lengths_m[-1]:g} m" if short and e.chosen_lengths_m else ""
-        out[f"t_rel{over} [%]"] = _text(e.chosen_t_rel_percent if short else e.t_rel_percent, 3)
-        out[f"r_rel{over} [°/100 m]"] = _text(e.chosen_r_rel_deg_per_100m if short else e.r_rel_deg_per_100m, 3)
+        out["t_rel [%]"] = _text(e.chosen_t_rel_percent if short else e.t_rel_percent, 3)
+        out["r_rel [°/100m]"] = _text(e.chosen_r_rel_deg_per_100m if short else e.r_rel_deg_per_100m, 3)
         out["ATE [m]"] = _text(e.ate_m, 3)
     for name, errors in (("initial", row.initial), ("final", row.final)):
         if errors is not None:
-            out[f"{name} step error [mm]"] = _text(1e3 * errors.median_m, 1)
+            out[f"{name} [mm]"] = _text(1e3 * errors.median_m, 1)
             out[f"{name} [°]"] = _text(errors.median_deg, 3)
-    out |= {"path [m]": _text(row.path_length_m, 2), "ms a scan": _text(row.ms_median, 1)}
-    out |= {"p90": _text(row.ms_p90, 1), "bridged": str(row.bridged)}
+    out |= {
+        "path [m]": _text(row.path_length_m, 2),
+        "time [ms]": _text(row.ms_median, 1),
+        "p90 [ms]": _text(row.ms_p90, 1),
+    }
+    out["bridged"] = str(row.bridged)
     return out | {"ended early": f"after {row.scans} scans: {row.error}" if row.error else "–"}
 
 
@@ -232,11 +246,11 @@ def _text(value: float | None, decimals: int) -> str:
 
 
 def to_markdown(comparison: Comparison) -> str:
-    """The comparison as a Markdown table; step errors are medians."""
+    """The comparison as a Markdown table."""
     rows = columns(comparison)
     lines = [list(rows[0]), ["---"] * len(rows[0]), *(list(row.values()) for row in rows)]
     body = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-    return f"{heading(comparison)}\n\n{body}\n\nStep errors are medians over the scans.\n"
+    return f"{heading(comparison)}\n\n{body}\n\n{_LEGEND}\n"
 
 
 def write_comparison(folder: Path, comparison: Comparison) -> None:

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from typing import Protocol
 
 from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
@@ -23,7 +24,7 @@ class Tick(Protocol):
 
 
 _LINES_APART_S = 1.0
-_TABLE_WIDTH = 240  # where the output is no terminal: nobody's columns to fit into
+_WIDE = 240
 
 
 def say(text: str) -> None:
@@ -32,9 +33,10 @@ def say(text: str) -> None:
 
 
 def say_table(table: Table) -> None:
-    """Print a table; a file or pipe gets it at full width."""
-    console = Console()
-    (console if console.is_terminal else Console(width=_TABLE_WIDTH)).print(table)
+    """Print a table at the width that it needs, also where that is more than the terminal has."""
+    console, wide = Console(), Console(width=_WIDE)
+    needed = Measurement.get(wide, wide.options, table).maximum
+    (console if needed <= console.width else Console(width=needed)).print(table)
 
 
 def complain(text: str, style: str = "red") -> None:

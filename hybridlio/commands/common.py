@@ -48,12 +48,15 @@ Verbose = Annotated[
         "-v",
         "--verbose",
         count=True,
+        metavar=" ",
         show_default=False,
         callback=be_verbose,
         help="Log more; twice: everything, and tracebacks.",
     ),
 ]
-Data = Annotated[Path, typer.Argument(help="A recording: its folder, or one above it.", show_default=False)]
+Data = Annotated[
+    Path, typer.Argument(metavar="DATA", help="A recording: its folder, or one above it.", show_default=False)
+]
 SequenceName = Annotated[
     str | None, typer.Option("--sequence", metavar="NAME", help="Which recording, where DATA holds several.")
 ]

@@ -55,7 +55,6 @@ def compare(
     with progress("comparing") as tick:
         comparison = run_all(recording, configs, lambda name, done, total: tick(done, total, name))
     say_table(table(comparison))
-    say("step errors are medians over the scans")
     if out is not None:
         write_comparison(out, comparison)
         say(f"written to {out / 'compare.md'} and {out / 'compare.json'}")

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from hybridlio.report_data import Findings
     from hybridlio.run import Run
 
+_WITHOUT_IMU = "constant-velocity"
+
 
 @guarded
 def odometry(
@@ -47,8 +49,12 @@ def odometry(
     from hybridlio.run import run_odometry
 
     chosen = common.settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
-    estimator = Odometry(config=chosen)
+    estimator = Odometry(config=chosen)  # wrong names fail before the recording is opened
     recording = common.open_data(data, sequence, reader, raw_root, frames)
+    if not len(recording.imu) and initial_pose is None and config is None:
+        complain(f"warning: no inertial data, so initial poses by {_WITHOUT_IMU}", "yellow")
+        chosen = chosen.model_copy(update={"initial_pose": _WITHOUT_IMU})
+        estimator = Odometry(config=chosen)
     folder = run_folder.new_run_folder(recording.name, out, overwrite)
     with progress("odometry") as tick:
         run = run_odometry(recording, estimator, lambda done, total, metres: tick(done, total, f"{metres:.1f} m"))
@@ -61,7 +67,7 @@ def _finish(folder: Path, run: Run, config: Config) -> None:
     """Write the run and say what came of it; an interrupted or failed one ends with its exit code."""
     from hybridlio.run_outputs import write_run
 
-    if run.stopped is not None and not run.estimates:
+    if run.stopped is not None and len(run.estimates) < 2:  # the first pose is the origin: nothing is known yet
         _remove_if_empty(folder)
         common.fail(run.stopped)
     if isinstance(run.stopped, KeyboardInterrupt):
@@ -73,7 +79,6 @@ def _finish(folder: Path, run: Run, config: Config) -> None:
     complain(f"kept {run.done} of {len(run.sequence)} scans in {folder}", "yellow")
     if isinstance(run.stopped, KeyboardInterrupt):
         raise typer.Exit(common.INTERRUPTED)
-    complain(f"frame {run.done}:", "red")
     common.fail(run.stopped, FAILED)
 
 

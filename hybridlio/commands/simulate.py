@@ -14,7 +14,7 @@ from hybridlio.terminal import complain, progress, say
 
 @guarded
 def simulate(
-    out: Annotated[Path, typer.Argument(help="The folder to write to.", show_default=False)],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The folder to write to.", show_default=False)],
     seconds: Annotated[float | None, typer.Option(help="How long to drive; 60 if nothing else says.")] = None,
     length_m: Annotated[float | None, typer.Option("--length-m", help="How far to drive instead, in metres.")] = None,
     seed: Annotated[int, typer.Option(help="Decides road, town, traffic and noise.")] = 1,

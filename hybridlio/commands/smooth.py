@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 
 @guarded
 def smooth(
-    run: Annotated[Path, typer.Argument(help="A run folder that `hybridlio odometry` made.", show_default=False)],
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN", help="A run folder that `hybridlio odometry` made.", show_default=False)
+    ],
     out: Annotated[
         Path | None, typer.Option("-o", "--out", metavar="DIR", help="Where to write; by default RUN/smoothed.")
     ] = None,

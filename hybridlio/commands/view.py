@@ -15,7 +15,9 @@ from hybridlio.terminal import say
 
 
 @guarded
-def view(run: Annotated[Path, typer.Argument(help="A run folder.", show_default=False)], _verbose: Verbose = 0) -> None:
+def view(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.", show_default=False)], _verbose: Verbose = 0
+) -> None:
     """Open a run's report in the browser; without a display, print where it is."""
     import webbrowser
 

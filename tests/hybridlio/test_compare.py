@@ -69,7 +69,7 @@ def test_without_reference_paths_and_times_are_still_compared(sequence):
     bare = replace(sequence, reference=None)
     result = compare(bare, combinations(["identity"], ["none"], ["incremental"], Config()))
     (row,) = columns(result)
-    assert {"path [m]", "ms a scan", "bridged"} <= set(row)
+    assert {"path [m]", "time [ms]", "bridged"} <= set(row)
     assert "ATE [m]" not in row
 
 
