@@ -15,7 +15,7 @@ from hybridlio.errors import GraphError
 from hybridlio.estimates import Array, State
 from hybridlio.graph import factors
 from hybridlio.graph.preintegration import covers, preintegrate
-from hybridlio.graph.solver import incremental_solver
+from hybridlio.graph.solver import incremental_solver, reason
 from hybridlio.record import Record
 from hybridlio.trajectory import Trajectory
 
@@ -121,7 +121,7 @@ def _solve(optimiser: gtsam.LevenbergMarquardtOptimizer) -> gtsam.Values:
     try:
         return optimiser.optimize()
     except RuntimeError as error:
-        raise GraphError(f"smoothing: the graph cannot be solved: {str(error).strip()}") from error
+        raise GraphError(f"smoothing: the graph cannot be solved: {reason(error)}") from error
 
 
 def _read(values: gtsam.Values, states: list[State]) -> list[State]:
@@ -146,7 +146,10 @@ def _read_one(values: gtsam.Values, k: int, state: State) -> State:
 def _covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, count: int, progress: Progress) -> Array:
     """``(N, 6, 6)`` marginals of the IMU poses, relative to the first, which is the origin."""
     isam = incremental_solver()
-    isam.update(graph, values)
+    try:
+        isam.update(graph, values)
+    except RuntimeError as error:
+        raise GraphError(f"smoothing: the graph does not fix every variable: {reason(error)}") from error
     out = np.empty((count, 6, 6))
     for k in range(count):
         progress("covariances", k, count)

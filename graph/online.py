@@ -11,7 +11,7 @@ from hybridlio.errors import GraphError
 from hybridlio.estimates import RelativePose, State
 from hybridlio.graph import factors
 from hybridlio.graph.preintegration import bias_of, covers, preintegrate
-from hybridlio.graph.solver import incremental_solver
+from hybridlio.graph.solver import incremental_solver, reason
 from hybridlio.sensors import NS_PER_S, Calibration, Frame, ImuNoise
 
 # While tilt, speed and biases are still found, every step solves the few poses there are anew.
@@ -57,7 +57,7 @@ class IncrementalBackend:
         try:
             self._solve(graph, values)
         except RuntimeError as error:
-            raise GraphError(f"frame {frame.index}: the graph cannot be solved: {str(error).strip()}") from error
+            raise GraphError(f"frame {frame.index}: the graph cannot be solved: {reason(error)}") from error
         self._k += 1
         self._on_map = relative.drift is not None
         self._state = self._read(stamp_ns)

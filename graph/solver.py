@@ -28,3 +28,8 @@ def incremental_solver() -> gtsam.ISAM2:
         thresholds.insert((kind, change))
     params.setRelinearizeThreshold(thresholds)
     return gtsam.ISAM2(params)
+
+
+def reason(error: RuntimeError) -> str:
+    """What GTSAM says went wrong, and at which variable, on one line; the essay that follows it left out."""
+    return " ".join(str(error).strip().split("\n\n")[0].split())
