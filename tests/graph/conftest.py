@@ -90,6 +90,23 @@ def _frames(stamps: np.ndarray, imu: ImuSamples, calibration: Calibration, noise
     ]
 
 
+def _relative(
+    lidar: np.ndarray, sigmas: np.ndarray, error: float, drift_share: float | None, rng: np.random.Generator
+) -> list[RelativePose]:
+    """Steps between lidar poses, each with an error of its own, or those of a path beside them that only drifts."""
+    covariance = np.diag(sigmas**2)
+    true = se3.between(lidar[:-1], lidar[1:])
+    if drift_share is None:
+        steps = true @ se3.exp(error * sigmas * rng.standard_normal((len(true), 6)))
+        return [RelativePose(step, covariance, "test") for step in steps]
+    scatter = sigmas * np.sqrt((1 - drift_share) / 2) * rng.standard_normal((len(lidar), 6))
+    scatter[0] = 0.0  # the map is made of the first scan
+    beside = lidar @ se3.inverse(se3.exp(error * scatter))
+    drift = error * sigmas * np.sqrt(drift_share) * rng.standard_normal((len(true), 6))
+    steps = se3.between(beside[:-1], beside[1:]) @ se3.exp(drift)
+    return [RelativePose(step, covariance, "test", drift=drift_share * covariance) for step in steps]
+
+
 def make_chain(
     seed: int,
     steps: int = 60,
@@ -98,6 +115,7 @@ def make_chain(
     true_noise: ImuNoise | None = None,
     step_sigmas: np.ndarray = STEP_SIGMAS,
     step_error: float = 1.0,
+    drift_share: float | None = None,
     imu_hz: float = 100.0,
     path: SmoothPath | None = None,
     T_imu_lidar: np.ndarray = T_IMU_LIDAR,
@@ -112,6 +130,7 @@ def make_chain(
         true_noise: what it is, where that is not the same.
         step_sigmas: of a relative pose, as claimed.
         step_error: the true error in units of the claimed one.
+        drift_share: of a relative pose's covariance that adds up, where the poses are of matching to a map.
         imu_hz: samples per second.
         path: of the IMU, in place of a random one.
         T_imu_lidar: the mount.
@@ -138,10 +157,7 @@ def make_chain(
     stamps = START_NS + np.round(scan_s * NS_PER_S).astype(np.int64)
     calibration = Calibration(T_imu_lidar)
     frames = _frames(stamps, imu, calibration, imu_noise)
-    covariance = np.diag(step_sigmas**2)
-    true_steps = se3.between(lidar[:-1], lidar[1:])
-    errors = step_error * step_sigmas * rng.standard_normal((steps, 6))
-    relative = [RelativePose(step, covariance, "test") for step in true_steps @ se3.exp(errors)]
+    relative = _relative(lidar, step_sigmas, step_error, drift_share, rng)
     at = np.searchsorted(imu.stamps_ns, stamps)
     return Chain(
         frames,

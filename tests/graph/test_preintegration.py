@@ -23,6 +23,7 @@ from hybridlio.simulation.plan import plan
 GRAVITY = np.array([0.0, 0.0, -9.81])
 CERTAIN = 1e-18 * np.eye(15)
 NOISE = ImuNoise()
+IDENTITY = np.eye(4)
 
 
 def state_at(T: np.ndarray, velocity: np.ndarray, **changes: object) -> State:
@@ -195,7 +196,7 @@ def test_a_vehicles_motion_between_ten_samples_a_second_stays_within_the_noise_t
 # ---------------------------------------------------------------------------------------- what may be missing
 
 
-def straight(steps: int, mount: np.ndarray = np.eye(4)) -> tuple[State, Callable[[ImuSamples], Frame]]:
+def straight(steps: int, mount: np.ndarray = IDENTITY) -> tuple[State, Callable[[ImuSamples], Frame]]:
     state = state_at(np.eye(4), np.array([10.0, 0.0, 0.0]), covariance=np.diag(np.full(15, 1e-4)))
     return state, lambda imu: Frame(3, empty_scan(steps * NS_PER_S // 10), imu, calibration=Calibration(mount))
 
