@@ -46,7 +46,7 @@ class ImuNetwork(nn.Module):
         return self.accel_lstm(accel)[0][:, -1], self.gyro_lstm(gyro)[0][:, -1]
 
     def forward(self, imu: Tensor, velocity_m_s: Tensor | None = None, dt_s: Tensor | None = None) -> Tensor:
-        """Initial poses ``T_k_k1`` ``(B, 4, 4)``; arguments as :meth:`features`, ``dt_s`` ``(B,)`` between the scans."""
+        """Initial poses ``T_k_k1`` ``(B, 4, 4)``; arguments as :meth:`features`, ``dt_s`` ``(B,)`` between scans."""
         of_accel, of_gyro = self.features(imu, velocity_m_s)
         t = self.translation(of_accel)
         if self.settings.velocity and velocity_m_s is not None and dt_s is not None:

@@ -138,7 +138,7 @@ class ResidualNetwork(nn.Module):
 
 
 def _distance(last: tuple[Tensor, Tensor], current: Tensor) -> Tensor:
-    """Distance ``(B, 1, H, W)`` in metres, signed, within ±1, of points to their cells' planes; 0 where either lacks."""
+    """Signed distance ``(B, 1, H, W)``, within ±1 m, of points to the planes in their cells; 0 where either lacks."""
     seen = (current != 0).any(dim=1, keepdim=True)
     distance = (last[1] * (current - last[0])).sum(dim=1, keepdim=True)
     return torch.where(seen, distance, 0.0).clamp(-1.0, 1.0)
