@@ -25,7 +25,8 @@ from hybridlio.datasets.imu_csv import read_imu_csv
 from hybridlio.datasets.point_files import SUFFIXES, read_scan
 from hybridlio.datasets.reference import poses_at
 from hybridlio.datasets.sequence import Notes, Sequence
-from hybridlio.datasets.stamps import MISSING_STAMP, increasing, note_coverage, note_gaps, read_stamps
+from hybridlio.datasets.stamps import MISSING_STAMP, note_coverage, note_gaps, read_stamps, usable_scans
+from hybridlio.datasets.vertical_angle import raised
 from hybridlio.errors import DataError
 from hybridlio.sensors import LIDAR_MODELS, Calibration, ImuSamples, LidarModel, Scan
 from hybridlio.trajectory_files import read_tum
@@ -61,12 +62,13 @@ def find(path: Path) -> dict[str, Path]:
     return {p.resolve().name: p for p in here}
 
 
-def open_folder(folder: Path, raw_root: Path | None = None) -> Sequence:
-    """One recording, laid out as the module says. ``raw_root`` is not used.
+def open_folder(folder: Path, raw_root: Path | None = None, vertical_angle_deg: float | None = None) -> Sequence:
+    """One recording, laid out as the module says. ``raw_root`` is not used; points are raised by the angle, if any.
 
     Raises:
         DataError: stamps missing or not one a scan, an IMU without ``T_imu_lidar``, or a malformed file; says what
             to write.
+        ConfigError: ``vertical_angle_deg`` is over 5°.
     """
     del raw_root
     folder = folder.resolve()
@@ -83,7 +85,7 @@ def open_folder(folder: Path, raw_root: Path | None = None) -> Sequence:
     return Sequence(
         name=folder.name,
         stamps_ns=stamps,
-        load_scan=PointFiles(paths, stamps),
+        load_scan=raised(PointFiles(paths, stamps), vertical_angle_deg),
         imu=imu,
         calibration=calibration or Calibration(),
         reference=poses_at(stamps, poses.stamps_ns, poses.poses, "rows of poses_tum.txt", notes) if poses else None,
@@ -123,7 +125,7 @@ def _stamped(folder: Path, paths: tuple[Path, ...], notes: Notes) -> tuple[NDArr
     stamps = read_stamps(files[0])
     if len(stamps) != len(paths) or (stamps == MISSING_STAMP).any():
         raise DataError(f"{files[0]}: {len(stamps)} lines for {len(paths)} scans; each scan needs one stamp")
-    keep = increasing(stamps)
+    keep = usable_scans(stamps, files[0])
     if len(keep) < len(paths):
         first = paths[int(np.setdiff1d(np.arange(len(paths)), keep)[0])].name
         notes.add(f"dropped {len(paths) - len(keep)} scans whose stamps repeat or go backwards, first {first}")

@@ -31,9 +31,9 @@ def gyro_lag_ns(stamps_ns: NDArray[np.int64], attitude_rad: Array, gyro_rad_s: A
         attitude_rad: ``(R, 3)`` roll, pitch and yaw.
         gyro_rad_s: ``(R, 3)`` angular velocity along the body's axes.
     """
-    seconds = (stamps_ns - stamps_ns[0]) / 1e9
-    if len(seconds) < _LEAST_STEPS or not np.ptp(attitude_rad, axis=0).any():
+    if len(stamps_ns) < _LEAST_STEPS or not np.ptp(attitude_rad, axis=0).any():
         return 0
+    seconds = (stamps_ns - stamps_ns[0]) / 1e9
     period = float(np.median(np.diff(seconds)))
     rows = np.arange(0, len(seconds), max(1, round(_STEP_S / period)))
     start, stop = seconds[rows[:-1]], seconds[rows[1:]]

@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio import se3
+from hybridlio.datasets.drive_imu import drive_imu
 from hybridlio.datasets.kitti_files import BinScans, numbered, read_calibration, rows_of
-from hybridlio.datasets.kitti_raw import drive_imu, read_drive_calibration
+from hybridlio.datasets.kitti_raw import read_drive_calibration
 from hybridlio.datasets.oxts import read_oxts
 from hybridlio.datasets.sequence import Notes, Sequence
-from hybridlio.datasets.stamps import increasing, note_coverage, note_gaps, read_stamps
+from hybridlio.datasets.stamps import note_coverage, note_gaps, read_stamps, usable_scans
+from hybridlio.datasets.vertical_angle import kitti_raised
 from hybridlio.errors import DataError
 from hybridlio.sensors import LIDAR_MODELS, Calibration, ImuSamples
 from hybridlio.trajectory import Trajectory
@@ -58,27 +60,32 @@ def find(path: Path) -> dict[str, Path]:
     return {p.resolve().name: p for p in here or sorted(filter(_is_sequence, below))}
 
 
-def open_sequence_folder(folder: Path, raw_root: Path | None = None) -> Sequence:
+def open_sequence_folder(
+    folder: Path, raw_root: Path | None = None, vertical_angle_deg: float | None = None
+) -> Sequence:
     """One sequence: the scans on disk with their stamps (seconds from the recording's first frame) and references.
 
     With ``raw_root`` (the folder of the date folders) the inertial samples and ``T_imu_lidar`` come from the raw drive
     that the sequence was cut from, moved to the sequence's clock; without it there are none and ``T_imu_lidar`` is the
-    identity.
+    identity. Points are raised by ``vertical_angle_deg``, without it by KITTI's known error where the sequence is
+    KITTI's own (:mod:`hybridlio.datasets.vertical_angle`).
 
     Raises:
         DataError: no scans, stamps or poses that do not match them, a missing calibration, or no such raw drive.
+        ConfigError: ``vertical_angle_deg`` is over 5°.
     """
     folder = folder.resolve()
     notes = Notes(f"kitti_{folder.name}")
     numbers, times, paths = _scans(folder, notes)
     stamps = times[numbers]
-    T_camera_lidar = _camera(folder / "calib.txt")
+    (Tr,) = rows_of(read_calibration(folder / "calib.txt"), folder / "calib.txt", "Tr")
+    T_camera_lidar = _camera(folder / "calib.txt", Tr)
     imu, T_imu_lidar = _imu(folder.name, times, raw_root, notes)
     note_coverage(imu.stamps_ns, stamps, "inertial data", notes)
     return Sequence(
         name=notes.name,
         stamps_ns=stamps,
-        load_scan=BinScans(paths, stamps),
+        load_scan=kitti_raised(BinScans(paths, stamps), len(paths), Tr, vertical_angle_deg, notes),
         imu=imu,
         calibration=Calibration(T_imu_lidar, T_camera_lidar),
         reference=_reference(folder, numbers, stamps, T_camera_lidar, notes),
@@ -96,7 +103,7 @@ def _scans(folder: Path, notes: Notes) -> tuple[NDArray[np.int64], NDArray[np.in
     times = read_stamps(folder / "times.txt")
     if numbers[-1] >= len(times):
         raise DataError(f"{folder / 'times.txt'}: {len(times)} stamps do not reach scan {paths[-1].name}")
-    if len(increasing(times[numbers])) < len(numbers):
+    if len(usable_scans(times[numbers], folder / "times.txt")) < len(numbers):
         raise DataError(f"{folder / 'times.txt'}: stamps of the scans do not increase; download the file again")
     if len(numbers) < len(times):
         notes.add(f"{len(numbers)} of {len(times)} scans are on disk; using those, with their stamps and references")
@@ -104,8 +111,7 @@ def _scans(folder: Path, notes: Notes) -> tuple[NDArray[np.int64], NDArray[np.in
     return numbers, times, paths
 
 
-def _camera(path: Path) -> NDArray[np.float64]:
-    (Tr,) = rows_of(read_calibration(path), path, "Tr")
+def _camera(path: Path, Tr: NDArray[np.float64]) -> NDArray[np.float64]:
     if Tr.shape != (3, 4):
         raise DataError(f"{path}: expected 12 numbers in 'Tr:', found {Tr.size}")
     return se3.check_pose(np.vstack([Tr, [0, 0, 0, 1]]), f"{path}: Tr")
@@ -146,7 +152,7 @@ def _imu(
     imu = drive_imu(drive, read_oxts(drive / "oxts", notes), notes)
     shift_ns = _clock_start_ns(drive, raw, notes) - int(times[0])
     moved = ImuSamples(imu.stamps_ns - shift_ns, imu.gyro_rad_s, imu.accel_m_s2)
-    return moved, read_drive_calibration(drive.parent, needs_imu=True).T_imu_lidar
+    return moved, read_drive_calibration(drive, needs_imu=True).T_imu_lidar
 
 
 def _clock_start_ns(drive: Path, raw: RawDrive, notes: Notes) -> int:

@@ -38,7 +38,8 @@ class OxtsRows:
 
     Attributes:
         stamps_ns: ``(R,)`` int64.
-        values: ``(R, 30)`` in KITTI's units: degrees, metres, radians, m/s, m/s², rad/s.
+        values: ``(R, 30)`` in KITTI's units: degrees, metres, radians, m/s, m/s², rad/s. The inertial columns are
+            finite; positions, attitudes and speeds need not be, as a recording may do without them.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -65,7 +66,9 @@ class OxtsRows:
     @property
     def gyro_lag_ns(self) -> int:
         """By how much the angular velocities are late, see :func:`hybridlio.datasets.gyro_lag.gyro_lag_ns`."""
-        return gyro_lag_ns(self.stamps_ns, self.values[:, _ATTITUDE], self.values[:, _GYRO])
+        known = np.isfinite(self.values[:, _ATTITUDE]).all(axis=1)
+        values = self.values[known]
+        return gyro_lag_ns(self.stamps_ns[known], values[:, _ATTITUDE], values[:, _GYRO])
 
     @property
     def T_enu_imu(self) -> Array:
@@ -77,14 +80,34 @@ class OxtsRows:
         attitude = Rotation.from_euler("ZYX", self.values[:, _ATTITUDE][:, ::-1]).as_matrix()
         return se3.make(attitude, position - position[0])
 
-    def forward_speed_at(self, stamps_ns: NDArray[np.int64]) -> Array:
-        """Forward speed ``(N,)`` in m/s at ``stamps_ns``, interpolated; constant beyond the ends."""
-        at, known = (stamps_ns - self.stamps_ns[0]) / 1e9, (self.stamps_ns - self.stamps_ns[0]) / 1e9
-        return np.asarray(np.interp(at, known, self.values[:, _FORWARD]))
+    @property
+    def placed(self) -> OxtsRows | None:
+        """The rows with position and attitude; None where positions are not given: absent, 0, or still in a drive."""
+        rows = np.isfinite(self.values[:, : _ATTITUDE.stop]).all(axis=1)
+        values = self.values[rows]
+        moves = np.ptp(values[:, :_ALT], axis=0).any() if len(values) else False
+        stands = len(values) and values[:, :_ALT].any() and not (np.abs(values[:, _FORWARD]) > 0.5).any()
+        return OxtsRows(self.stamps_ns[rows], values) if moves or stands else None
+
+    def forward_speed_at(self, stamps_ns: NDArray[np.int64]) -> Array | None:
+        """Forward speed ``(N,)`` in m/s at ``stamps_ns``, interpolated, constant beyond the ends; None if not given."""
+        speed = self.values[:, _FORWARD]
+        known = np.isfinite(speed)
+        if not known.any() or (self.placed is None and not speed[known].any()):
+            return None
+        at, seconds = ((t - self.stamps_ns[0]) / 1e9 for t in (stamps_ns, self.stamps_ns[known]))
+        return np.asarray(np.interp(at, seconds, speed[known]))
 
     def lidar_poses_at(self, stamps_ns: NDArray[np.int64], T_imu_lidar: Array, notes: Notes) -> Trajectory | None:
-        """Lidar poses at ``stamps_ns`` in the frame of the first; None, with a note, where the rows do not reach."""
-        return poses_at(stamps_ns, self.stamps_ns, self.T_enu_imu @ T_imu_lidar, "navigation rows", notes)
+        """Lidar poses at ``stamps_ns`` in the frame of the first.
+
+        None, with a note, where the rows do not reach or positions are not given.
+        """
+        placed = self.placed
+        if placed is None:
+            notes.add("no reference poses: the navigation rows give no positions")
+            return None
+        return poses_at(stamps_ns, placed.stamps_ns, placed.T_enu_imu @ T_imu_lidar, "navigation rows", notes)
 
 
 def _read_row(path: Path) -> Array:
@@ -100,8 +123,8 @@ def _read_row(path: Path) -> Array:
 def read_oxts(folder: Path, notes: Notes) -> OxtsRows:
     """The rows of an ``oxts`` folder (``timestamps.txt`` and ``data/NNNNNNNNNN.txt``), in order of time.
 
-    Stamps that repeat or go backwards (as in KITTI's unsynchronised recordings) are sorted and made unique, rows that
-    are not finite are dropped; both are noted.
+    Stamps that repeat or go backwards (as in KITTI's unsynchronised recordings) are sorted and made unique, rows whose
+    inertial columns are not finite are dropped; both are noted.
 
     Raises:
         DataError: no rows, a row with another number of columns, or a row without a stamp; names the file.
@@ -115,7 +138,7 @@ def read_oxts(folder: Path, notes: Notes) -> OxtsRows:
             f"{folder / 'timestamps.txt'}: {len(lines)} lines do not stamp every row up to {paths[-1].name}"
         )
     values, stamps = np.array([_read_row(path) for path in paths]), lines[numbers]
-    finite = np.isfinite(values[:, :20]).all(axis=1)
+    finite = np.isfinite(values[:, _ACCEL]).all(axis=1) & np.isfinite(values[:, _GYRO]).all(axis=1)
     if not finite.any():
         raise DataError(f"{folder}: no navigation row is finite")
     if not finite.all():

@@ -20,12 +20,13 @@ class Reader:
     Attributes:
         layout: what the reader expects, for messages.
         find: the recordings at or just below a path, by name; empty where the layout does not fit.
-        open: opens one of them; the second argument is the root of raw drives to join, or None.
+        open: opens one of them; the second argument is the root of raw drives to join, or None, the third the angle by
+            which to raise points in degrees, or None for what the recording needs.
     """
 
     layout: str
     find: Callable[[Path], dict[str, Path]]
-    open: Callable[[Path, Path | None], Sequence]
+    open: Callable[[Path, Path | None, float | None], Sequence]
 
 
 READERS: dict[str, Reader] = {  # in the order in which they are tried
@@ -41,6 +42,7 @@ def open_sequence(
     sequence: str | None = None,
     reader: str | None = None,
     raw_root: str | os.PathLike[str] | None = None,
+    vertical_angle_deg: float | None = None,
 ) -> Sequence:
     """Open the recording at ``path``.
 
@@ -49,16 +51,19 @@ def open_sequence(
         sequence: which one, where there are several: its name, or its number alone (``0005``, ``09``).
         reader: a name of :data:`READERS`; guessed from what lies at ``path`` without it.
         raw_root: for KITTI odometry, the folder of the raw data's date folders, to join inertial data from.
+        vertical_angle_deg: raise each point, as seen from the lidar, by this angle against an error of the lidar's
+            vertical angles. By default 0.205 for KITTI's own scans, which have it, and 0 for all others.
 
     Raises:
         DataError: nothing there, no reader fits (lists what was tried), several recordings and no ``sequence`` that
             picks one, or what the reader raises.
-        ConfigError: unknown ``reader``.
+        ConfigError: unknown ``reader``, or ``vertical_angle_deg`` is over 5°.
     """
     root = Path(path).expanduser().resolve()
     name, found = _find(root, reader)
     recording = found[_pick(root, found, sequence)]
-    return READERS[name].open(recording, Path(raw_root).expanduser() if raw_root is not None else None)
+    raw = Path(raw_root).expanduser() if raw_root is not None else None
+    return READERS[name].open(recording, raw, vertical_angle_deg)
 
 
 def sequence_names(path: str | os.PathLike[str], *, reader: str | None = None) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ from hybridlio.sensors import NS_PER_S
 
 Stamps = NDArray[np.int64]
 
+_LEAST_STEP_NS = 5_000_000
 MISSING_STAMP = int(np.iinfo(np.int64).min)  # what a blank line reads as; NumPy's "not a time" has the same bits
 
 
@@ -28,15 +29,17 @@ def _seconds_ns(text: str) -> int:
     return int((Decimal(text) * NS_PER_S).to_integral_value())  # a float64 would round seconds since 1970 to 0.2 µs
 
 
-def _parser(first: str) -> Callable[[str], int]:
-    if re.fullmatch(r"[+-]?\d+", first):
-        return int
-    return _iso_ns if re.match(r"\d{4}-\d\d-\d\d", first) else _seconds_ns
+def _parser(lines: list[str]) -> Callable[[str], int]:
+    first = next(filter(None, lines))
+    if re.match(r"\d{4}-\d\d-\d\d", first):
+        return _iso_ns
+    seconds = any(re.search(r"[.eE]", line) for line in lines)  # one whole second among others is no nanosecond
+    return _seconds_ns if seconds or not re.fullmatch(r"[+-]?\d+", first) else int
 
 
 def read_stamps(path: Path) -> Stamps:
-    """Stamps ``(N,)`` of a text file with one a line: whole numbers are nanoseconds, numbers with a point (or an
-    exponent) seconds, and dates such as ``2011-09-26 13:04:32.349659964`` ISO 8601 in UTC.
+    """Stamps ``(N,)`` of a text file with one a line: whole numbers are nanoseconds, or seconds where any line has a
+    point or an exponent, and dates such as ``2011-09-26 13:04:32.349659964`` ISO 8601 in UTC.
 
     A blank line, as for a frame that was not recorded, reads as ``MISSING_STAMP``.
 
@@ -48,7 +51,7 @@ def read_stamps(path: Path) -> Stamps:
     lines = [line.strip() for line in path.read_text(encoding="utf-8", errors="replace").rstrip().splitlines()]
     if not any(lines):
         raise DataError(f"{path}: empty; expected one time stamp a line")
-    parse = _parser(next(filter(None, lines)))
+    parse = _parser(lines)
     stamps = np.full(len(lines), MISSING_STAMP)
     for row, line in enumerate(lines):
         try:
@@ -80,6 +83,24 @@ def increasing(stamps: Stamps) -> NDArray[np.intp]:
     return np.array(chain[::-1], dtype=np.intp)
 
 
+def usable_scans(stamps: Stamps, path: Path) -> NDArray[np.intp]:
+    """Indices of the scans to keep: a longest part of ``stamps`` that increases.
+
+    Raises:
+        DataError: that is less than half of them, or scans would follow each other within 5 ms: stamps with too few
+            digits or in another unit; names ``path``, their file.
+    """
+    keep = increasing(stamps)
+    if 2 * len(keep) < len(stamps):
+        raise DataError(
+            f"{path}: only {len(keep)} of {len(stamps)} scans have stamps that increase; do they lack digits?"
+        )
+    step_ns = float(np.median(np.diff(stamps[keep]))) if len(keep) > 1 else _LEAST_STEP_NS
+    if step_ns < _LEAST_STEP_NS:
+        raise DataError(f"{path}: scans are {step_ns / 1e6:g} ms apart; whole numbers are nanoseconds, write s as 1.0")
+    return keep
+
+
 def sorted_unique(stamps: Stamps, what: str, notes: Notes) -> NDArray[np.intp]:
     """Indices that put ``stamps`` in order, each stamp once (the first row that has it); says how many were wrong."""
     backwards = int((np.diff(stamps) < 0).sum())
@@ -103,8 +124,10 @@ def note_gaps(stamps: Stamps, what: str, notes: Notes, factor: float) -> None:
         notes.add(f"{what}: {large} gaps, the longest {steps[worst]:.3f} s after row {worst}")
 
 
-def note_coverage(stamps: Stamps, scans: Stamps, what: str, notes: Notes) -> None:
+def note_coverage(stamps: Stamps, scans: Stamps, what: str, notes: Notes, of: str = "scan") -> None:
     """Say where ``stamps``, if there are any, begin after the first scan or end before the last by over 0.15 s.
+
+    ``of`` is what to call ``scans`` where they are something else.
 
     Raises:
         DataError: the two share no time at all, as with clocks of different origin.
@@ -114,10 +137,10 @@ def note_coverage(stamps: Stamps, scans: Stamps, what: str, notes: Notes) -> Non
     if stamps[0] > scans[-1] or stamps[-1] < scans[0]:
         away = float(stamps[0] - scans[0]) / NS_PER_S
         raise DataError(
-            f"{notes.name}: {what} begins {away:+.1f} s from the first scan and shares no time with the scans"
+            f"{notes.name}: {what} begins {away:+.1f} s from the first {of} and shares no time with the {of}s"
         )
     late, early = (stamps[0] - scans[0]) / NS_PER_S, (scans[-1] - stamps[-1]) / NS_PER_S
     if late > 0.15:
-        notes.add(f"{what} starts {late:.2f} s after the first scan")
+        notes.add(f"{what} starts {late:.2f} s after the first {of}")
     if early > 0.15:
-        notes.add(f"{what} ends {early:.2f} s before the last scan")
+        notes.add(f"{what} ends {early:.2f} s before the last {of}")

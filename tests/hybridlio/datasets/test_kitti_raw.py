@@ -150,9 +150,23 @@ class TestInertialData:
         oxts = drive.with_name("2011_09_30_drive_0016_extract") / "oxts"
         shutil.rmtree(oxts)
         recordings.put_oxts(oxts, recordings.ride, recordings.ride.imu_stamps_ns(10)[50:90])
+        shutil.rmtree(drive / "oxts")
         notes = " ".join(open_sequence(drive).notes)
         assert "starts 0.47 s after the first scan" in notes
         assert "ends 0.24 s before the last scan" in notes
+
+    def test_slow_rows_fill_the_holes_and_the_ends_of_the_fast_recording(self, recordings: Any, drive: Path) -> None:
+        oxts, fast = drive.with_name("2011_09_30_drive_0016_extract") / "oxts", recordings.ride.imu_stamps_ns(10)
+        shutil.rmtree(oxts)
+        recordings.put_oxts(oxts, recordings.ride, np.concatenate([fast[20:50], fast[80:110]]))
+        sequence = open_sequence(drive)
+        assert sequence.imu.stamps_ns[0] == recordings.ride.stamps_ns[0] + 4 * MS
+        assert sequence.imu.stamps_ns[-1] == recordings.ride.stamps_ns[-1] + 4 * MS
+        assert np.diff(sequence.imu.stamps_ns).max() < 170 * MS
+        np.testing.assert_allclose(sequence.imu.gyro_rad_s, np.tile([0, 0, 0.2], (len(sequence.imu), 1)), atol=1e-12)
+        notes = " ".join(sequence.notes)
+        assert "fill holes and ends" in notes
+        assert "starts 0.17 s after the first navigation row" in notes
 
     def test_a_drive_without_navigation_rows_still_opens(self, drive: Path) -> None:
         shutil.rmtree(drive / "oxts")
