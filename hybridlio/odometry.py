@@ -105,7 +105,8 @@ class Odometry:
         with _timed(seconds, "graph"):
             self._state = self._backend.update(frame, relative)
             step = self._backend.last_step()
-        self._initial_pose.correct(frame, step)
+        if relative.ok and relative.source != initial.source:  # its own guess is nothing to learn from
+            self._initial_pose.correct(frame, step)
         pose, covariance = self._lidar_pose(self._state)
         return self._keep(
             Estimate(frame.index, frame.scan.stamp_ns, pose, covariance, initial, relative, step, seconds)
