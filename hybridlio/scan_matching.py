@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-import small_gicp
 
 from hybridlio import se3
 from hybridlio.errors import DataError
@@ -21,6 +20,7 @@ from hybridlio.registration import (
     scaled_spectrum,
 )
 from hybridlio.sensors import NS_PER_S, Frame, Scan
+from hybridlio.voxel import voxel_average
 
 
 @dataclass(frozen=True)
@@ -80,28 +80,28 @@ class ScanMatching:
         Raises:
             DataError: it has too few points.
         """
-        cloud = self._thin(frame.scan)
-        if cloud.size() < self._settings.min_points:
+        points = self._thin(frame.scan)
+        if len(points) < self._settings.min_points:
             raise DataError(
-                f"frame {frame.index}: only {cloud.size()} points between {self._settings.min_range_m} and "
+                f"frame {frame.index}: only {len(points)} points between {self._settings.min_range_m} and "
                 f"{self._settings.max_range_m} m; start at a scan with at least {self._settings.min_points}"
             )
         self._map = LocalMap(self._settings.local_map)
         self._T_map_lidar = np.eye(4)
-        self._map.insert(cloud.points()[:, :3], self._T_map_lidar)
+        self._map.insert(points, self._T_map_lidar)
         self._stamp_ns = frame.scan.stamp_ns
 
     def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:
         """Register the scan; where that fails, return the initial pose marked as not ok."""
-        cloud = self._thin(frame.scan)
+        points = self._thin(frame.scan)
         dt_s = (frame.scan.stamp_ns - self._stamp_ns) / NS_PER_S
         self._stamp_ns = frame.scan.stamp_ns
-        found = self._register(cloud, initial, dt_s) if cloud.size() >= self._settings.min_points else None
+        found = self._register(points, initial, dt_s) if len(points) >= self._settings.min_points else None
         if found is None or found.matched < self._settings.min_matched:
-            return self._bridge(initial, cloud.size(), found)
+            return self._bridge(initial, len(points), found)
         before, self._T_map_lidar = self._T_map_lidar, found.pose
         if self._settings.target == "last-scan" or self._map.wants(found.pose):
-            self._keep(cloud)
+            self._keep(points)
         covariance = covariance_of(found, self._settings.covariance_scale)
         return RelativePose(
             se3.between(before, found.pose),
@@ -109,29 +109,29 @@ class ScanMatching:
             source=self.name,
             drift=self._drift(covariance),
             degenerate=degenerate_directions(found.hessian),
-            details=_details(found, cloud.size()),
+            details=_details(found, len(points)),
         )
 
     def _drift(self, covariance: Array) -> Array | None:
         return None if self._settings.target == "last-scan" else self._settings.drift_share * covariance
 
-    def _thin(self, scan: Scan) -> small_gicp.PointCloud:
-        range2 = np.einsum("ij,ij->i", scan.points, scan.points)
+    def _thin(self, scan: Scan) -> Array:
+        """``(M, 3)``: one point a voxel, of those within range."""
+        points = voxel_average(scan.points, None, self._settings.map_voxel_m)[0].astype(np.float64)
+        range2 = np.einsum("ij,ij->i", points, points)
         near, far = self._settings.min_range_m, self._settings.max_range_m
-        points = scan.points[(range2 > near**2) & (range2 < far**2)].astype(np.float64)
-        # one thread: with more, small_gicp's result depends on their timing
-        return small_gicp.voxelgrid_sampling(points, self._settings.map_voxel_m)
+        return points[(range2 > near**2) & (range2 < far**2)]
 
-    def _keep(self, cloud: small_gicp.PointCloud) -> None:
+    def _keep(self, points: Array) -> None:
         if self._settings.target == "last-scan":
             self._map = LocalMap(self._settings.local_map)
-        self._map.insert(cloud.points()[:, :3], self._T_map_lidar)
+        self._map.insert(points, self._T_map_lidar)
 
-    def _register(self, cloud: small_gicp.PointCloud, initial: RelativePose, dt_s: float) -> Registration | None:
+    def _register(self, points: Array, initial: RelativePose, dt_s: float) -> Registration | None:
         surface = self._map.surface
         if surface is None:
             return None
-        source = small_gicp.voxelgrid_sampling(cloud, self._settings.source_voxel_m).points()[:, :3]
+        source = voxel_average(points, None, self._settings.source_voxel_m)[0].astype(np.float64)
         settings = self._settings.registration
         sigma_m = float(np.sqrt(initial.covariance[3:, 3:].trace()))
         starts = [initial.pose]
