@@ -2,7 +2,7 @@
 
 Beside the scans a drive may hold what the simulator adds: ``poses.txt`` (exact lidar poses, preferred as reference),
 ``simulation.json`` (sensor names and noise), ``gps.csv`` and per-point times in ``velodyne_points/offsets``.
-KITTI's own scans carry no times, and are handed on as they are.
+KITTI's own scans carry no times.
 """
 
 from __future__ import annotations
