@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,8 @@ from hybridlio.trajectory import Trajectory
 Array = NDArray[np.float64]
 
 FORMAT_VERSION = 1
+# what NumPy, zip and the checks of the parts raise at a file that is cut off, damaged or something else
+_UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, BadZipFile, zlib.error, DataError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +64,7 @@ class Record:
         try:
             with np.load(path, allow_pickle=False) as file:
                 return _from_arrays({name: file[name] for name in file.files})
-        except (OSError, ValueError, KeyError, EOFError) as error:
+        except _UNREADABLE as error:
             raise DataError(f"{path}: not a record of a run ({error}); run `hybridlio odometry` again") from error
 
 

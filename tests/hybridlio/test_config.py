@@ -1,0 +1,124 @@
+from pathlib import Path
+
+import pytest
+import yaml
+
+from hybridlio.config import Config, config_to_yaml, load_config, parse_config, save_config
+from hybridlio.errors import ConfigError
+from hybridlio.sensors import ImuNoise
+
+
+def test_the_defaults_round_trip_through_yaml(tmp_path: Path):
+    save_config(Config(), tmp_path / "my.yaml")
+    assert load_config(tmp_path / "my.yaml") == Config()
+
+
+def test_changed_settings_round_trip_through_yaml(tmp_path: Path):
+    changed = parse_config(
+        {
+            "initial_pose": "kalman",
+            "imu_noise": {"gyro_rad_s_sqrt_hz": 1e-4},
+            "scan_matching": {
+                "target": "last-scan",
+                "start_speeds_m_s": [0.0, 12.5],
+                "registration": {"kernel_m": 0.2},
+                "local_map": {"voxel_m": 0.5},
+            },
+        },
+        "here",
+    )
+    save_config(changed, tmp_path / "my.yaml")
+    again = load_config(tmp_path / "my.yaml")
+    assert again == changed
+    assert again.imu_noise == ImuNoise(gyro_rad_s_sqrt_hz=1e-4)
+    assert again.scan_matching.start_speeds_m_s == (0.0, 12.5)
+    assert again != Config()
+
+
+def test_the_yaml_names_every_setting_in_plain_values():
+    tree = yaml.safe_load(config_to_yaml(Config()))
+    assert set(tree) == set(Config.model_fields)
+    assert tree["scan_matching"]["registration"]["max_iterations"] == 15
+    assert tree["scan_matching"]["local_map"]["voxel_m"] > 0
+
+
+def test_what_a_file_leaves_out_keeps_its_default(tmp_path: Path):
+    (tmp_path / "part.yaml").write_text("scan_matching:\n  registration:\n    kernel_m: 0.3\n")
+    config = load_config(tmp_path / "part.yaml")
+    assert config.scan_matching.registration.kernel_m == 0.3
+    assert config.scan_matching.registration.max_iterations == Config().scan_matching.registration.max_iterations
+    assert config.initial_pose == Config().initial_pose
+
+
+def test_an_empty_file_is_the_defaults(tmp_path: Path):
+    for text in ("", "# nothing\n", "{}\n"):
+        (tmp_path / "empty.yaml").write_text(text)
+        assert load_config(tmp_path / "empty.yaml") == Config()
+
+
+@pytest.mark.parametrize(
+    ("tree", "path"),
+    [
+        ({"inital_pose": "kalman"}, "inital_pose"),
+        ({"imu_noise": {"gyro": 1.0}}, "imu_noise.gyro"),
+        ({"scan_matching": {"voxel_m": 1.0}}, "scan_matching.voxel_m"),
+        ({"scan_matching": {"registration": {"kernel": 1.0}}}, "scan_matching.registration.kernel"),
+        ({"scan_matching": {"local_map": {"voxel": 1.0}}}, "scan_matching.local_map.voxel"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_an_unknown_key_at_any_level_is_an_error_that_gives_its_path(tmp_path: Path, tree: dict, path: str):
+    (tmp_path / "my.yaml").write_text(yaml.safe_dump(tree))
+    with pytest.raises(ConfigError) as error:
+        load_config(tmp_path / "my.yaml")
+    assert f"{path}: " in str(error.value)
+    assert "my.yaml" in str(error.value)
+    assert "hybridlio config" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("tree", "path"),
+    [
+        ({"scan_matching": {"target": "nearest"}}, "scan_matching.target"),
+        ({"scan_matching": {"min_points": "many"}}, "scan_matching.min_points"),
+        ({"scan_matching": 3}, "scan_matching"),
+        ({"backend": 7}, "backend"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_value_of_the_wrong_kind_is_an_error_that_gives_its_path(tree: dict, path: str):
+    with pytest.raises(ConfigError, match=rf"here: {path}"):
+        parse_config(tree, "here")
+
+
+def test_two_mistakes_are_both_named():
+    with pytest.raises(ConfigError, match=r"one: .*two: "):
+        parse_config({"one": 1, "two": 2}, "here")
+
+
+@pytest.mark.parametrize("tree", [["a", "list"], "a word", 7])
+def test_a_file_that_is_no_tree_of_settings_is_refused(tree: object):
+    with pytest.raises(ConfigError, match="here: "):
+        parse_config(tree, "here")
+
+
+def test_a_file_that_is_not_yaml_is_named(tmp_path: Path):
+    (tmp_path / "broken.yaml").write_text("scan_matching: [1, 2\n")
+    with pytest.raises(ConfigError, match=r"broken\.yaml: not YAML"):
+        load_config(tmp_path / "broken.yaml")
+
+
+def test_a_file_of_bytes_is_named(tmp_path: Path):
+    (tmp_path / "bytes.yaml").write_bytes(b"\xff\xfe\x00binary")
+    with pytest.raises(ConfigError, match=r"bytes\.yaml"):
+        load_config(tmp_path / "bytes.yaml")
+
+
+def test_a_missing_file_is_named(tmp_path: Path):
+    with pytest.raises(ConfigError, match=r"nowhere\.yaml: cannot be read"):
+        load_config(tmp_path / "nowhere.yaml")
+
+
+def test_settings_do_not_change_once_made():
+    with pytest.raises((ValueError, AttributeError)):
+        Config().backend = "none"  # type: ignore[misc]
