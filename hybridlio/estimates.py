@@ -69,7 +69,8 @@ class RelativePose:
         object.__setattr__(self, "covariance", check_covariance(self.covariance, f"{self.source}: relative pose"))
         if self.drift is not None:
             object.__setattr__(self, "drift", check_covariance(self.drift, f"{self.source}: drift"))
-            check_covariance(self.covariance - self.drift, f"{self.source}: covariance less drift")
+            if self.ok:  # else the pose bridges, and its covariance is no part of the path's
+                check_covariance(self.covariance - self.drift, f"{self.source}: covariance less drift")
 
 
 @dataclass(frozen=True, eq=False)
