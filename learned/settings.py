@@ -187,7 +187,7 @@ def from_dict(kind: type[_S], values: Mapping[str, Any], where: str = "settings"
     """Settings of a kind from plain values.
 
     Raises:
-        ConfigError: a key is unknown, or a value of the wrong type or out of range; says where.
+        ConfigError: a key is unknown or missing, or a value of the wrong type or out of range; says where.
     """
     if not isinstance(values, Mapping):
         raise ConfigError(f"{where}: expected named values, got {type(values).__name__}")
@@ -196,6 +196,10 @@ def from_dict(kind: type[_S], values: Mapping[str, Any], where: str = "settings"
     unknown = [key for key in values if key not in known]
     if unknown:
         raise ConfigError(f"{where}: unknown {', '.join(map(repr, unknown))}; there are {', '.join(known)}")
+    required = [f.name for f in dataclasses.fields(kind) if f.default is f.default_factory is dataclasses.MISSING]  # type: ignore[arg-type]
+    missing = [name for name in required if name not in values]
+    if missing:
+        raise ConfigError(f"{where}: {', '.join(map(repr, missing))} missing")
     return kind(**{key: _typed(hints[key], value, f"{where}.{key}") for key, value in values.items()})
 
 

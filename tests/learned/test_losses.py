@@ -195,14 +195,14 @@ def test_matches_farther_than_the_limit_do_not_count():
 
 
 def scan_of_a_room(T_world_lidar: torch.Tensor) -> Clouds:
-    """Vertex maps of a box of 12 x 8 x 5 m seen from a pose in it, as clouds."""
+    """Vertex maps of a box of 12 x 8 x 2 m seen from a pose in it, as clouds."""
     elevation = torch.deg2rad(GEOMETRY.fov_up_deg - (torch.arange(20) + 0.5) * GEOMETRY.row_deg).double()[:, None]
     azimuth = torch.deg2rad(180 - (torch.arange(90) + 0.5) * GEOMETRY.column_deg).double()[None]
     flat = torch.ones_like(azimuth)
     rays = torch.stack([elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin() * flat], -1)
     rays = rays.reshape(-1, 3)
     turned = rays @ T_world_lidar[0, :3, :3].T
-    half, origin = torch.tensor([6.0, 4.0, 2.5]), T_world_lidar[0, :3, 3]
+    half, origin = torch.tensor([6.0, 4.0, 1.0]), T_world_lidar[0, :3, 3]
     ranges = ((half * turned.sign() - origin) / turned).nan_to_num(torch.inf).min(dim=1, keepdim=True).values
     return Clouds.of_maps((rays * ranges).T.reshape(1, 3, 20, 90).float())
 

@@ -1,0 +1,79 @@
+import csv
+import json
+from dataclasses import FrozenInstanceError, replace
+
+import pytest
+import torch
+
+from hybridlio.errors import ConfigError
+from hybridlio.learned.odometry_network import OdometryNetwork, parameter_count
+from hybridlio.learned.presets import PAPER, PRESETS, TABLES, preset, table
+from hybridlio.learned.settings import LossSettings, NetworkSettings, OptimiserSettings, Recipe, from_dict, to_dict
+
+
+def test_the_papers_preset_has_the_published_numbers():
+    network, loss, optimiser = PAPER.network, PAPER.loss, PAPER.optimiser
+    assert (network.geometry.rows, network.geometry.columns, network.imu_samples) == (52, 720, 15)
+    assert (loss.alpha, loss.lambda_, loss.matching, loss.kernel) == (1.0, 0.1, "nearest", "l1")
+    assert (optimiser.betas, optimiser.weight_decay, optimiser.batch) == ((0.9, 0.99), 1e-5, 20)
+    assert (optimiser.learning_rate, optimiser.step_epochs, optimiser.step_factor) == (1e-4, 20, 0.5)
+
+
+def test_every_row_of_the_comparisons_is_a_preset_and_differs_from_its_neighbours():
+    for rows in TABLES.values():
+        recipes = [replace(preset(row.preset), name="") for row in rows]
+        assert all(a != b for i, a in enumerate(recipes) for b in recipes[:i])
+    assert {row.preset for rows in TABLES.values() for row in rows} <= set(PRESETS)
+
+
+def test_rows_carry_the_names_of_the_published_figures(project_root):
+    published = project_root.parent / "shared" / "paper" / "tables.csv"
+    if not published.is_file():
+        pytest.skip(f"no published figures at {published}")
+    with published.open(newline="") as file:
+        named = {(int(row["table"]), row["method"]) for row in csv.DictReader(file) if row["table"] != "1"}
+    assert named == {(number, row.published) for number, rows in TABLES.items() for row in rows}
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_recipes_survive_the_way_through_json(name):
+    recipe = preset(name)
+    assert from_dict(Recipe, json.loads(json.dumps(to_dict(recipe)))) == recipe
+    assert recipe.name == name
+
+
+def test_weights_of_the_papers_network_stay_below_the_size_that_ships():
+    with torch.device("meta"):
+        assert parameter_count(OdometryNetwork(PAPER.network)) * 4 < 25e6
+
+
+def test_unknown_names_list_what_there_is():
+    with pytest.raises(ConfigError, match="nubert"):
+        preset("newbert")
+    with pytest.raises(ConfigError, match="2, 3, 4, 5"):
+        table(1)
+
+
+@pytest.mark.parametrize(
+    ("values", "what"),
+    [
+        ({"networks": {}}, "networks"),
+        ({"network": {"imu_hiden": 3}}, "imu_hiden"),
+        ({"network": {"imu": "both"}}, "both"),
+        ({"network": {"features": "many"}}, "features"),
+        ({"network": {"stages": 3}}, "stages"),
+        ({"optimiser": {"batch": 0}}, "batch"),
+        ({"optimiser": {"betas": [0.9, 1.0]}}, "betas"),
+        ({"loss": 3}, "loss"),
+        ({"network": {"geometry": {"rows": 1}}}, "geometry"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused_by_name(values, what):
+    with pytest.raises(ConfigError, match=what):
+        from_dict(Recipe, values)
+
+
+def test_settings_cannot_be_changed():
+    for settings in (NetworkSettings(), LossSettings(), OptimiserSettings(), PAPER):
+        with pytest.raises(FrozenInstanceError):
+            settings.name = "mine"  # type: ignore[misc]
