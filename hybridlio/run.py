@@ -123,6 +123,9 @@ def run_odometry(sequence: Sequence, odometry: Odometry, progress: Progress | No
         progress: called after each scan with scans done, scans in all and metres travelled.
     """
     run = Run(sequence, odometry)
+    _log.info(
+        "%s: %d scans in %.1f s, %d IMU samples", sequence.name, len(sequence), sequence.duration_s, len(sequence.imu)
+    )
     start = time.perf_counter()
     distance_m = 0.0
     try:
@@ -159,6 +162,17 @@ def _advance(run: Run, k: int) -> None:
         return
     run.reading_s.append(read)
     run.estimates.append(estimate)
+    _log.debug("frame %d: %s", k, _described(estimate))
+
+
+def _described(estimate: Estimate) -> str:
+    relative = estimate.relative
+    if relative is None:
+        return "the first"
+    words = [f"{relative.source}{'' if relative.ok else ' (bridged)'}"]
+    words += [f"{len(relative.degenerate)} directions unconstrained"] if len(relative.degenerate) else []
+    words += [f"{name} {value:.4g}" for name, value in relative.details.items()]
+    return ", ".join(words + [f"{stage} {1e3 * spent:.0f} ms" for stage, spent in estimate.seconds.items()])
 
 
 def _frame(run: Run, k: int) -> Frame:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from hybridlio.graph.offline import Smoothed
 
 _ONLINE, _SMOOTHED = "odometry", "smoothed"
+_TOLD = 20
 
 
 def write_run(folder: Path, run: Run, config: Config) -> Findings:
@@ -77,7 +78,8 @@ def notes(run: Run) -> list[str]:
         out.append(f"the first {run.skipped} scans could not be used: the run starts at scan {run.skipped}")
     if run.bridged:
         out.append(f"{len(run.bridged)} scans could not be used and are bridged by the initial pose")
-    return out + [f"frame {k}: {why}" for k, why in run.unreadable.items()]
+    told = [f"frame {k}: {why}" for k, why in run.unreadable.items()]
+    return out + told[:_TOLD] + ([f"and {len(told) - _TOLD} more"] if len(told) > _TOLD else [])
 
 
 def report_data(run: Run, config: Config, config_text: str) -> ReportData:

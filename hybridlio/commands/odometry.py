@@ -44,9 +44,9 @@ def odometry(
 
     Without -o, runs/latest is a link to the newest. Ctrl-C keeps what was estimated so far.
     """
-    from hybridlio import run_folder
     from hybridlio.odometry import Odometry
     from hybridlio.run import run_odometry
+    from hybridlio.run_folder import new_run_folder
 
     chosen = common.settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
     estimator = Odometry(config=chosen)  # wrong names fail before the recording is opened
@@ -55,16 +55,15 @@ def odometry(
         complain(f"warning: no inertial data, so initial poses by {_WITHOUT_IMU}", "yellow")
         chosen = chosen.model_copy(update={"initial_pose": _WITHOUT_IMU})
         estimator = Odometry(config=chosen)
-    folder = run_folder.new_run_folder(recording.name, out, overwrite)
+    folder = new_run_folder(recording.name, out, overwrite)
     with progress("odometry") as tick:
         run = run_odometry(recording, estimator, lambda done, total, metres: tick(done, total, f"{metres:.1f} m"))
-    _finish(folder, run, chosen)
-    if out is None:
-        run_folder.point_latest_at(folder)
+    _finish(folder, run, chosen, is_latest=out is None)
 
 
-def _finish(folder: Path, run: Run, config: Config) -> None:
+def _finish(folder: Path, run: Run, config: Config, is_latest: bool) -> None:
     """Write the run and say what came of it; an interrupted or failed one ends with its exit code."""
+    from hybridlio.run_folder import point_latest_at
     from hybridlio.run_outputs import write_run
 
     if run.stopped is not None and len(run.estimates) < 2:  # the first pose is the origin: nothing is known yet
@@ -73,6 +72,8 @@ def _finish(folder: Path, run: Run, config: Config) -> None:
     if isinstance(run.stopped, KeyboardInterrupt):
         complain("interrupted: writing what was estimated so far (again to give it up)", "yellow")
     findings = write_run(folder, run, config)
+    if is_latest:
+        point_latest_at(folder)
     _say_result(folder, run, findings)
     if run.stopped is None:
         return

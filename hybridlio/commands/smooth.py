@@ -24,18 +24,21 @@ def smooth(
     out: Annotated[
         Path | None, typer.Option("-o", "--out", metavar="DIR", help="Where to write; by default RUN/smoothed.")
     ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run that is in -o.")] = False,
     _verbose: Verbose = 0,
 ) -> None:
     """Optimise all poses of a finished run at once, and leave the better trajectory with a report of its own."""
     from hybridlio.metrics import evaluation_table
     from hybridlio.record import Record
-    from hybridlio.run_folder import POSES, RECORD, REPORT, SMOOTHED, read_run
+    from hybridlio.run_folder import POSES, RECORD, REPORT, SMOOTHED, is_run_folder, read_run
     from hybridlio.run_outputs import write_smoothed
 
     stored = read_run(run)
     folder = run / SMOOTHED if out is None else out
     if folder.resolve() == run.resolve():
         raise ConfigError(f"{folder} is the run itself; choose another folder with -o")
+    if out is not None and is_run_folder(out) and not overwrite:
+        raise ConfigError(f"{out} holds a run already; choose another folder, or --overwrite it")
     record = Record.load(run / RECORD)
     smoothed = _smooth(record)
     findings = write_smoothed(folder, stored, record, smoothed)

@@ -189,6 +189,38 @@ def test_input_that_cannot_be_used_is_one_line_and_leaves_nothing(words, named, 
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_smoothed_run_never_takes_another_runs_place_unasked(run_folder, tmp_path, without_pages):
+    other = shutil.copytree(run_folder, tmp_path / "other")
+    assert "--overwrite" in refused(2, "smooth", run_folder, "-o", other)
+    assert "the run itself" in refused(2, "smooth", run_folder, "-o", run_folder)
+    assert (other / "odometry.npz").exists()
+    ok("smooth", run_folder, "-o", other, "--overwrite")
+    assert not (other / "odometry.npz").exists()
+
+
+@pytest.mark.parametrize(("flag", "level"), [("-v", "info"), ("-vv", "debug")])
+def test_verbose_says_more_on_stderr(flag, level, tiny_drive, tmp_path, without_pages):
+    quiet = run("odometry", tiny_drive, "--residual", "none", "--frames", ":4", "-o", tmp_path / "a")
+    loud = run("odometry", tiny_drive, "--residual", "none", "--frames", ":4", "-o", tmp_path / "b", flag)
+    assert f"{level}: " in loud.stderr
+    assert f"{level}: " not in quiet.stderr
+    assert ("frame 3" in loud.stderr) == (flag == "-vv")
+
+
+def test_a_recording_without_inertial_data_goes_on_by_constant_velocity_unless_told_otherwise(
+    tiny_drive, tmp_path, without_pages
+):
+    drive = shutil.copytree(tiny_drive, tmp_path / "date" / tiny_drive.name)
+    shutil.rmtree(drive / "oxts")
+    result = run("odometry", drive, "-o", tmp_path / "run")
+    assert result.exit_code == 0, result.output
+    assert "constant-velocity" in result.stderr
+    assert json.loads((tmp_path / "run/metrics.json").read_text())["initial_pose"] == "constant-velocity"
+    line = refused(2, "odometry", drive, "--initial-pose", "preintegration", "-o", tmp_path / "other")
+    assert "IMU" in line
+    assert not (tmp_path / "other").exists()
+
+
 @pytest.fixture
 def damaged(tiny_drive, tmp_path) -> Path:
     """The drive with a truncated scan, 7, and a missing one, 12."""
