@@ -120,7 +120,7 @@ class ScanMatching:
         points = voxel_average(scan.points, None, self._settings.map_voxel_m)[0].astype(np.float64)
         range2 = np.einsum("ij,ij->i", points, points)
         near, far = self._settings.min_range_m, self._settings.max_range_m
-        return points[(range2 > near**2) & (range2 < far**2)]
+        return np.asarray(points[(range2 > near**2) & (range2 < far**2)])
 
     def _keep(self, points: Array) -> None:
         if self._settings.target == "last-scan":
