@@ -86,7 +86,13 @@ class OdometryNetwork(nn.Module):
             raise ConfigError(
                 f"the network takes maps of {geometry.rows} x {geometry.columns} cells, got {rows} x {columns}"
             )
-        initial, features = self._from_imu(given)
+        return self.refine(given, *self._from_imu(given))
+
+    def refine(
+        self, given: NetworkInput, initial: Tensor, features: tuple[Tensor, Tensor] | None = None
+    ) -> NetworkOutput:
+        """Estimate the residual of any initial poses ``(B, 4, 4)``; ``features`` are those of :meth:`imu_features`."""
+        geometry = self.settings.geometry
         last = (given.last, maps.normal_map(given.last))
         normals = maps.normal_map(given.current)
         pose, poses = initial, []
@@ -98,6 +104,12 @@ class OdometryNetwork(nn.Module):
             poses.append(pose)
         return NetworkOutput(initial, tuple(poses))
 
+    def imu_features(self, given: NetworkInput) -> tuple[Tensor, Tensor] | None:
+        """What the residual network is told of the IMU; None but with ``imu="feature"``."""
+        if self.imu_network is None or self.settings.imu != "feature":
+            return None
+        return self.imu_network.features(given.imu, given.velocity_m_s)
+
     def _from_imu(self, given: NetworkInput) -> tuple[Tensor, tuple[Tensor, Tensor] | None]:
         if self.settings.imu == "given":
             if given.initial is None:
@@ -107,7 +119,7 @@ class OdometryNetwork(nn.Module):
         if self.imu_network is None:
             return nothing, None
         if self.settings.imu == "feature":
-            return nothing, self.imu_network.features(given.imu, given.velocity_m_s)
+            return nothing, self.imu_features(given)
         return self.imu_network(given.imu, given.velocity_m_s, given.dt_s), None
 
 

@@ -1,0 +1,77 @@
+"""One process or many: what training under ``torchrun`` needs to know of its place among the others."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+import torch.distributed
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
+
+
+@dataclass(frozen=True)
+class Processes:
+    """This process's place.
+
+    Attributes:
+        rank: its number, from 0.
+        count: of all processes.
+        device: where it computes.
+    """
+
+    rank: int
+    count: int
+    device: torch.device
+
+    @property
+    def leads(self) -> bool:
+        """Whether this is the process that writes files and shows progress."""
+        return self.rank == 0
+
+    def total(self, value: Tensor) -> Tensor:
+        """The sum of a value over all processes."""
+        if self.count > 1:
+            value = value.detach().clone()
+            torch.distributed.all_reduce(value)
+        return value.detach()
+
+    def wait(self) -> None:
+        """Return when every process has come here."""
+        if self.count > 1:
+            torch.distributed.barrier()
+
+    def joined(self, network: nn.Module) -> nn.Module:
+        """The network with gradients averaged over the processes; statistics of batches too, where the device can."""
+        if self.count == 1:
+            return network
+        if self.device.type == "cuda":
+            network = nn.SyncBatchNorm.convert_sync_batchnorm(network)  # type: ignore[no-untyped-call]
+        return DistributedDataParallel(network)
+
+
+@contextlib.contextmanager
+def processes(device: str | None = None) -> Iterator[Processes]:
+    """Join the processes that ``torchrun`` started, or be the only one.
+
+    Args:
+        device: where to compute; by default this process's GPU, where there is any.
+    """
+    count, rank = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("RANK", "0"))
+    local = int(os.environ.get("LOCAL_RANK", "0"))
+    if device is None:
+        device = f"cuda:{local}" if torch.cuda.is_available() else "cpu"
+    place = Processes(rank, count, torch.device(device))
+    if place.device.type == "cuda":
+        torch.cuda.set_device(place.device)
+    started = count > 1 and not torch.distributed.is_initialized()
+    if started:
+        torch.distributed.init_process_group("nccl" if place.device.type == "cuda" else "gloo")
+    try:
+        yield place
+    finally:
+        if started:
+            torch.distributed.destroy_process_group()

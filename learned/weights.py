@@ -1,0 +1,128 @@
+"""Weights in safetensors files, with what they are in the metadata: recipe, data, version, commit."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from hybridlio import __version__
+from hybridlio.errors import ConfigError, DataError
+from hybridlio.files import write_whole
+from hybridlio.learned.odometry_network import OdometryNetwork
+from hybridlio.learned.settings import Recipe, from_dict, to_dict
+
+_LISTED = 6  # mismatches that a message names
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """A file of weights.
+
+    Attributes:
+        recipe: how they were trained; its network settings are the structure that they fit.
+        about: data, steps, version and commit, as text.
+        tensors: by name.
+    """
+
+    recipe: Recipe
+    about: Mapping[str, str]
+    tensors: Mapping[str, Tensor]
+
+    def network(self, device: torch.device | str = "cpu") -> OdometryNetwork:
+        """The trained network, ready for inference."""
+        network = OdometryNetwork(self.recipe.network)
+        put_weights(network, self.tensors, "weights")
+        return network.to(device).eval()
+
+
+def own_tensors(network: nn.Module) -> dict[str, Tensor]:
+    """A network's weights and buffers by name; what two of its parts share stands once."""
+    found: dict[str, Tensor] = {}
+    seen: set[int] = set()
+    for name, tensor in network.state_dict(keep_vars=True).items():
+        if id(tensor) not in seen:
+            seen.add(id(tensor))
+            found[name] = tensor.detach()
+    return found
+
+
+def put_weights(network: nn.Module, tensors: Mapping[str, Tensor], where: str) -> None:
+    """Copy weights into a network.
+
+    Raises:
+        ConfigError: they do not fit; names what is missing, unknown or of another shape.
+    """
+    own = own_tensors(network)
+    wrong = [f"{name} is missing" for name in own if name not in tensors]
+    wrong += [f"{name} is unknown" for name in tensors if name not in own]
+    wrong += [
+        f"{name} is {tuple(tensors[name].shape)}, the network's is {tuple(tensor.shape)}"
+        for name, tensor in own.items()
+        if name in tensors and tensors[name].shape != tensor.shape
+    ]
+    if wrong:
+        more = f" and {len(wrong) - _LISTED} more" if len(wrong) > _LISTED else ""
+        raise ConfigError(f"{where} do not fit the network: {'; '.join(wrong[:_LISTED])}{more}; use their own recipe")
+    with torch.no_grad():
+        for name, tensor in own.items():
+            tensor.copy_(tensors[name])
+
+
+def save_weights(
+    path: str | os.PathLike[str], network: OdometryNetwork, recipe: Recipe, about: Mapping[str, str]
+) -> None:
+    """Write a network's weights with the recipe and whatever text says where they come from, whole or not at all."""
+    metadata = {
+        "recipe": json.dumps(to_dict(recipe)),
+        "hybridlio": __version__,
+        "commit": _commit(),
+        **about,
+    }
+    tensors = {name: tensor.cpu().contiguous() for name, tensor in own_tensors(network).items()}
+    write_whole(path, save(tensors, metadata))
+
+
+def load_weights(path: str | os.PathLike[str]) -> Weights:
+    """Read weights.
+
+    Raises:
+        DataError: the file is missing, damaged, or carries no recipe.
+    """
+    path = Path(path)
+    try:
+        with safe_open(str(path), "pt") as file:
+            metadata = dict(file.metadata() or {})
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (not a mapping)
+    except (OSError, SafetensorError) as error:
+        raise DataError(f"{path}: weights cannot be read ({error})") from error
+    try:
+        recipe = from_dict(Recipe, json.loads(metadata.pop("recipe")), "recipe")
+    except (KeyError, ValueError, ConfigError) as error:
+        raise DataError(f"{path}: carries no recipe of this version ({error}); train again") from error
+    return Weights(recipe, metadata, tensors)
+
+
+def _commit() -> str:
+    """The checkout's commit, or nothing where the package is installed."""
+    root = Path(__file__).resolve().parents[1]
+    if not (root / ".git").exists():
+        return ""
+    try:
+        found = subprocess.run(
+            ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=40"],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return found.stdout.strip()

@@ -1,0 +1,105 @@
+"""A small room to train in: boxes seen from a moving sensor, as shards, so that tests need no simulator."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hybridlio import se3
+from hybridlio.learned.settings import LossSettings, NetworkSettings, OptimiserSettings, Recipe
+from hybridlio.learned.shards import ScanRecord, Shard, write_shard
+from hybridlio.projection import MapGeometry, vertex_map
+
+GEOMETRY = MapGeometry(20.0, -20.0, 12, 60)
+NETWORK = NetworkSettings(
+    geometry=GEOMETRY,
+    siamese="twins",
+    normalisation="group",
+    imu_hidden=8,
+    imu_layers=1,
+    stem=8,
+    stages=(8, 16),
+    blocks=1,
+    features=16,
+    vertex_scale_m=10.0,
+)
+RECIPE = Recipe(
+    "tiny",
+    NETWORK,
+    LossSettings(reduction="mean"),
+    OptimiserSettings(epochs=3, batch=4, learning_rate=2e-3, step_epochs=2),
+)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Networks as small as these are slower on two threads, and other tests run beside."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def seen_room(T_world_lidar: np.ndarray, half: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals (N, 3) in the lidar frame, on the walls of a box around the world's origin."""
+    rays = rng.normal(size=(1500, 3)) * [1.0, 1.0, 0.25]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    turned = rays @ T_world_lidar[:3, :3].T
+    ranges = (half * np.sign(turned) - T_world_lidar[:3, 3]) / turned
+    wall = ranges.argmin(axis=1)
+    normals = -np.eye(3)[wall] * np.sign(turned[np.arange(len(wall)), wall])[:, None]
+    points = rays * ranges.min(axis=1, keepdims=True)
+    return points.astype(np.float32), (normals @ T_world_lidar[:3, :3]).astype(np.float32)
+
+
+def room_records(count: int, seed: int) -> list[ScanRecord]:
+    """Scans of a room on a winding way, with inertial rows that tell of each step."""
+    rng = np.random.default_rng(seed)
+    half, T = rng.uniform([6, 5, 2], [9, 8, 3]), np.eye(4)
+    records = []
+    for k in range(count):
+        xi = rng.normal(size=6) * [0.0, 0.0, 0.05, 0.25, 0.1, 0.0]
+        step = se3.exp(xi)
+        T = T @ step if k else T
+        if np.abs(T[:3, 3]).max() > 3.0:
+            T[:3, 3] *= 0.0
+            step = None
+        points, normals = seen_room(T, half, rng)
+        imu = np.tile(np.r_[xi[:3] / 0.1, xi[3:] * 4 + [0, 0, 9.81]], (15, 1)).astype(np.float32)
+        known = k > 0 and step is not None
+        records.append(
+            ScanRecord(
+                vertex_map(points, GEOMETRY),
+                points[:400],
+                normals[:400],
+                imu=imu if known else None,
+                dt_s=0.1,
+                initial=step if known else None,
+                reference=step if known else None,
+            )
+        )
+    return records
+
+
+@pytest.fixture(scope="session")
+def room_shards(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two shards of a made-up room: 17 scans to train on, and 9 of another room."""
+    folder = tmp_path_factory.mktemp("rooms")
+    write_shard(folder / "one", room_records(17, 1), "room one", GEOMETRY, 15)
+    write_shard(folder / "two", room_records(9, 2), "room two", GEOMETRY, 15)
+    return folder / "one", folder / "two"
+
+
+@pytest.fixture
+def rooms(room_shards: tuple[Path, Path]) -> tuple[Shard, Shard]:
+    """The two shards, opened."""
+    return Shard(room_shards[0]), Shard(room_shards[1])
+
+
+@pytest.fixture
+def tiny_recipe() -> Recipe:
+    """A recipe that trains in a second."""
+    return RECIPE
