@@ -87,9 +87,14 @@ class Odometry:
         """Estimate the frame's pose.
 
         Raises:
-            DataError: frames out of order, a first scan without points, or IMU samples without extrinsics.
+            DataError: frames out of order, or a first scan without points.
+            ConfigError: IMU samples without extrinsics.
         """
         self._gps.extend(frame.gps)
+        if frame.calibration is None and len(frame.imu):
+            raise ConfigError(
+                f"frame {frame.index} carries IMU samples but no calibration: set Frame.calibration (T_imu_lidar)"
+            )
         if self._first is None:
             return self._keep(self._begin(frame))
         if frame.scan.stamp_ns <= self._estimates[-1].stamp_ns:
@@ -129,7 +134,8 @@ class Odometry:
             online=online,
             initial=tuple(e.initial for e in steps if e.initial is not None),
             relative=tuple(e.relative for e in steps if e.relative is not None),
-            imu=_joined(self._imu[: len(steps)]),  # a step that was interrupted may have added more
+            # a step that failed or was interrupted may have added more
+            imu=_joined(self._imu).between(self._start_state.stamp_ns, int(stamps[-1])),
             gps=tuple(fix for fix in self._gps if fix.stamp_ns <= stamps[-1]),
             start=self._start_state,
             calibration=self._setup.calibration,
@@ -194,8 +200,6 @@ class Odometry:
 
 
 def _setup(config: Config, frame: Frame) -> Setup:
-    if frame.calibration is None and len(frame.imu):
-        raise ConfigError("the frames carry IMU samples but no calibration: set Frame.calibration (T_imu_lidar)")
     noise = config.imu_noise or frame.imu_noise or ImuNoise()
     return Setup(config, frame.calibration or Calibration(), noise)
 
