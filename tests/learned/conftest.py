@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -97,6 +99,36 @@ def room_shards(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def rooms(room_shards: tuple[Path, Path]) -> tuple[Shard, Shard]:
     """The two shards, opened."""
     return Shard(room_shards[0]), Shard(room_shards[1])
+
+
+@dataclass(frozen=True, eq=False)
+class SeenScan:
+    """A scan that is prepared already."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    vertex_map: np.ndarray = field(init=False)
+    usable: bool = True
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "vertex_map", vertex_map(self.points, GEOMETRY))
+
+    @property
+    def loss_cloud(self) -> SeenScan:
+        return self
+
+
+@pytest.fixture
+def seen() -> Callable[..., SeenScan]:
+    """What a sensor at a pose sees of a room of half sizes, with a centimetre of noise."""
+
+    def see(T_world_lidar: np.ndarray, half: tuple[float, float, float] = (8.0, 6.0, 2.5), seed: int = 0) -> SeenScan:
+        rng = np.random.default_rng(seed)
+        points, normals = seen_room(T_world_lidar, np.array(half), rng)
+        noisy = points + normals * rng.normal(size=(len(points), 1)) * 0.01
+        return SeenScan(noisy.astype(np.float32), normals)
+
+    return see
 
 
 @pytest.fixture

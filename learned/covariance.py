@@ -1,0 +1,61 @@
+"""Covariance and degenerate directions of a pose, from the loss's Gauss-Newton Hessian at it. NumPy only."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Normals are off by a few hundredths of a radian, so points on one plane alone seem to say something of motion along
+# it: this much of a point's information, per point, is that noise.
+NORMAL_NOISE = 2e-3
+_FLOOR_SIGMAS = np.r_[np.full(3, 5e-5), np.full(3, 1e-3)]  # rad, m: no single step is known better
+_UNKNOWN_SIGMA_M = 10.0
+
+
+def scaled_spectrum(information: Array) -> tuple[Array, Array, Array]:
+    """Eigenvalues ``(6,)``, eigenvectors as columns ``(6, 6)``, and the scaling ``(6,)`` that gives them one unit.
+
+    Rotations are measured in metres at the points' mean lever arm.
+    """
+    lever = np.sqrt(max(np.trace(information[:3, :3]), 1e-12) / max(np.trace(information[3:, 3:]), 1e-12))
+    scale = np.r_[np.full(3, 1 / lever), np.ones(3)]
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    return values, vectors, scale
+
+
+def strong_directions(information: Array, values: Array) -> NDArray[np.bool_]:
+    """Which eigenvalues ``(6,)`` of :func:`scaled_spectrum` stand out of the noise of the normals."""
+    strong: NDArray[np.bool_] = values >= 3 * NORMAL_NOISE * np.trace(information[3:, 3:])
+    return strong
+
+
+def degenerate_directions(information: Array) -> Array:
+    """``(D, 6)`` unit tangent directions along which the matches say no more than the noise of their normals."""
+    values, vectors, scale = scaled_spectrum(information)
+    directions = (vectors[:, ~strong_directions(information, values)] * scale[:, None]).T
+    return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+
+
+def covariance(information: Array, sigma_m: float, scale: float) -> Array:
+    """``scale·σ²·H⁻¹`` ``(6, 6)``, rad² and m², rotation first; 10 m where the matches say nothing.
+
+    Args:
+        information: of :class:`hybridlio.learned.losses.GaussNewton`, one ``(6, 6)``.
+        sigma_m: standard deviation of the distances to the planes.
+        scale: how much larger it is than independent residuals would make it: points on one surface share its error.
+    """
+    values, vectors, to_tangent = scaled_spectrum(information)
+    known = values - NORMAL_NOISE * np.trace(information[3:, 3:])
+    variance = np.minimum(scale * sigma_m**2 / np.maximum(known, 1e-9), _UNKNOWN_SIGMA_M**2)
+    root = vectors * np.sqrt(variance) * to_tangent[:, None]
+    return np.asarray(root @ root.T + np.diag(_FLOOR_SIGMAS**2))
+
+
+def newton_step(information: Array, gradient: Array, limit: float = 0.5) -> Array:
+    """The step ``(6,)`` to the minimum of the quadratic, 0 along degenerate directions, at most ``limit`` metres."""
+    values, vectors, scale = scaled_spectrum(information)
+    inverse = np.where(strong_directions(information, values), 1 / np.maximum(values, 1e-12), 0.0)
+    reduced = -(vectors @ (inverse * (vectors.T @ (scale * gradient))))
+    return np.asarray(scale * reduced * min(1.0, limit / max(float(np.linalg.norm(reduced)), 1e-12)))

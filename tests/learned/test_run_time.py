@@ -1,0 +1,217 @@
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+import hybridlio as hl
+from hybridlio import se3
+from hybridlio.errors import ConfigError, DataError
+from hybridlio.estimates import RelativePose, State
+from hybridlio.learned.covariance import covariance, degenerate_directions, newton_step
+from hybridlio.learned.lstm_initial_pose import LstmInitialPose
+from hybridlio.learned.network_residual import NetworkResidual, NetworkResidualSettings
+from hybridlio.learned.odometry_network import OdometryNetwork
+from hybridlio.learned.weights import save_weights
+from hybridlio.preparation import PreparationOptions, prepare
+from hybridlio.projection import MapGeometry
+from hybridlio.sensors import Frame, ImuSamples, Scan
+
+STEP = se3.exp([0.0, 0.0, 0.03, 0.3, 0.05, 0.0])
+WIDE = np.diag(np.r_[np.full(3, 1e-4), np.full(3, 1e-2)])
+GEOMETRY = MapGeometry(16.0, -16.0, 16, 180)
+FEW = NetworkResidualSettings(min_cells=200)
+
+
+@pytest.fixture
+def weights(tiny_recipe, tmp_path):
+    """Weights that know nothing yet: δT is nearly the identity."""
+
+    def write(**changes):
+        recipe = replace(tiny_recipe, network=replace(tiny_recipe.network, residual_scale=1e-6, **changes))
+        torch.manual_seed(0)
+        save_weights(tmp_path / "w.safetensors", OdometryNetwork(recipe.network), recipe, {})
+        return tmp_path / "w.safetensors"
+
+    return write
+
+
+def frame(k: int, imu: bool = True) -> Frame:
+    """Frame ``k`` of 10 Hz; its scan stands for what is looked up by its stamp."""
+    stamps = np.arange(11) * 10**7 + (k - 1) * 10**8
+    rows = np.full((11, 3), 0.1)
+    samples = ImuSamples(stamps, rows, rows + np.array([0, 0, 9.8])) if imu else ImuSamples.empty()
+    return Frame(k, Scan(k * 10**8, np.ones((1, 3), np.float32)), imu=samples)
+
+
+def source(weights_path, scans, settings=FEW) -> NetworkResidual:
+    residual = NetworkResidual(weights_path, lambda scan: scans[scan.stamp_ns // 10**8], settings)
+    residual.start(frame(0))
+    return residual
+
+
+def initial(error: np.ndarray) -> RelativePose:
+    return RelativePose(STEP @ se3.exp(error), WIDE, source="guess", from_imu=True)
+
+
+OFF = np.array([0.003, -0.002, 0.004, 0.06, -0.05, 0.03])
+
+
+def test_steps_down_the_loss_find_the_pose_and_its_covariance_covers_what_is_left(weights, seen):
+    path, normalised = weights(), []
+    for seed in range(4):
+        scans = [seen(np.eye(4), seed=2 * seed), seen(STEP, seed=2 * seed + 1)]
+        found = source(path, scans, replace(FEW, refine_steps=8)).refine(frame(1), initial(OFF))
+        assert found.ok
+        assert found.source == "network"
+        assert found.degenerate.shape == (0, 6)
+        assert found.details["cost"] < found.details["initial_cost"]
+        error = se3.log(se3.between(STEP, found.pose))
+        assert np.abs(error[:3]).max() < 1e-3
+        assert np.abs(error[3:]).max() < 0.01
+        normalised.append(error @ np.linalg.solve(found.covariance, error) / 6)
+    assert np.mean(normalised) < 2.0
+
+
+def test_along_a_corridor_the_covariance_is_loose_and_the_direction_named(weights, seen):
+    half = (500.0, 3.0, 2.0)
+    scans = [seen(np.eye(4), half, seed=0), seen(STEP, half, seed=1)]
+    found = source(weights(), scans, replace(FEW, refine_steps=8)).refine(frame(1), initial(OFF))
+    assert found.ok
+    along = STEP[:3, :3].T @ [1.0, 0.0, 0.0]  # in the current scan's axes, as right perturbations are
+    assert np.abs(found.degenerate @ np.r_[0, 0, 0, along]).max() > 0.99
+    in_corridor = STEP[:3, :3] @ found.covariance[3:, 3:] @ STEP[:3, :3].T
+    sigmas = np.sqrt(np.diag(in_corridor))
+    assert sigmas[0] > 100 * sigmas[1]
+    # nor does the refinement go astray in it
+    assert abs(se3.log(se3.between(STEP, found.pose))[3]) < 0.1
+
+
+def test_an_answer_that_the_loss_finds_worse_is_not_passed_on(weights, seen, monkeypatch):
+    residual = source(weights(), [seen(np.eye(4), seed=0), seen(STEP, seed=1)])
+    worse = torch.tensor(STEP @ se3.exp(3 * OFF), dtype=torch.float32)[None]
+    answer = type("Answer", (), {"pose": worse})
+    monkeypatch.setattr(residual._network, "refine", lambda *_: answer)
+    found = residual.refine(frame(1), initial(OFF))
+    assert not found.ok
+    assert np.allclose(found.pose, initial(OFF).pose)
+    assert np.array_equal(found.covariance, WIDE)
+    assert found.details["cost"] > found.details["initial_cost"]
+
+
+def test_too_little_to_see_is_bridged_and_the_scan_after_it_too(weights, seen):
+    good, poor = seen(np.eye(4)), replace_points(seen(STEP, seed=1), 50)
+    residual = source(weights(), [good, poor, good, good], replace(FEW, refine_steps=3))
+    at_rest = RelativePose(se3.exp(OFF), WIDE, source="guess")
+    oks = [residual.refine(frame(k), at_rest).ok for k in (1, 2, 3)]
+    assert oks == [False, False, True]
+
+
+def replace_points(scan, count):
+    return type(scan)(scan.points[:count], scan.normals[:count])
+
+
+def test_a_first_scan_without_much_in_it_is_an_error(weights, seen):
+    with pytest.raises(DataError, match="frame 0"):
+        source(weights(), [replace_points(seen(np.eye(4)), 20)])
+
+
+def test_scans_prepared_for_other_cells_are_refused(weights, seen):
+    scan = seen(np.eye(4))
+    object.__setattr__(scan, "vertex_map", np.zeros((3, 5, 5), np.float32))
+    with pytest.raises(ConfigError, match="cells"):
+        source(weights(), [scan])
+
+
+@pytest.mark.parametrize(
+    "changes", [{"imu": "given"}, {"imu": "none"}, {"imu": "feature"}, {"normals": "none"}], ids=str
+)
+def test_any_networks_residual_serves_any_initial_pose(weights, seen, changes):
+    scans = [seen(np.eye(4), seed=0), seen(STEP, seed=1)]
+    found = source(weights(**changes), scans, replace(FEW, refine_steps=8)).refine(frame(1), initial(OFF))
+    assert found.ok
+    assert found.from_imu == (changes.get("imu") == "feature")
+
+
+def test_both_run_in_the_odometry_as_objects_of_ones_own(weights, tiny_drive):
+    options = PreparationOptions(geometry=GEOMETRY, loss_points=2000, threads=1)
+    residual = NetworkResidual(
+        weights(geometry=GEOMETRY), partial(prepare, options=options), replace(FEW, refine_steps=10)
+    )
+    sequence = hl.open_sequence(tiny_drive).part(0, 8)
+    true = se3.between(sequence.reference.poses[:-1], sequence.reference.poses[1:])
+    steps = {}
+    for initial_pose in (LstmInitialPose(weights(geometry=GEOMETRY)), "preintegration"):
+        odometry = hl.Odometry(initial_pose=initial_pose, residual=residual)
+        steps[initial_pose] = [odometry.step(frame).relative for frame in sequence][1:]
+    untrained, found = steps.values()
+    assert [step.source for step in untrained] == ["network" if step.ok else "lstm" for step in untrained]
+    assert [step.source for step in found] == ["network"] * 7
+    # what the network has not learned, steps down the loss make up for; the drive starts at 10 m/s
+    errors = [np.linalg.norm((step.pose - T)[:3, 3]) for step, T in zip(found, true, strict=True)]
+    assert max(errors) < 0.1
+
+
+def state() -> State:
+    three = np.zeros(3)
+    return State(0, np.eye(4), three, three, three, three, np.eye(15), np.eye(3))
+
+
+def test_the_lstms_predict_and_learn_how_sure_they_are(weights):
+    lstm = LstmInitialPose(weights())
+    first = lstm.predict(frame(1), state())
+    assert first.from_imu
+    assert np.array_equal(first.pose, LstmInitialPose(weights()).predict(frame(1), state()).pose)
+    for _ in range(200):
+        predicted = lstm.predict(frame(1), state())
+        lstm.correct(frame(1), RelativePose(predicted.pose @ se3.exp([0, 0, 0, 0.05, 0, 0]), WIDE, source="truth"))
+    sigmas = np.sqrt(np.diag(lstm.predict(frame(1), state()).covariance))
+    assert sigmas[3] == pytest.approx(0.05, rel=0.01)
+    assert sigmas[4] < 0.01
+
+
+def test_without_samples_the_lstms_say_that_they_do_not_know(weights):
+    found = LstmInitialPose(weights()).predict(frame(1, imu=False), state())
+    assert not found.ok
+    assert found.covariance[3, 3] > 1.0
+
+
+def test_a_velocity_conditioned_lstm_goes_on_at_the_last_steps_velocity(weights):
+    lstm = LstmInitialPose(weights(velocity=True))
+    still = lstm.predict(frame(1), state()).pose
+    lstm.correct(frame(1), RelativePose(se3.exp([0, 0, 0, 1.0, 0, 0]), WIDE, source="truth"))
+    assert lstm.predict(frame(1), state()).pose[0, 3] - still[0, 3] == pytest.approx(1.0, abs=0.3)
+
+
+def test_weights_that_predict_no_initial_pose_are_refused(weights):
+    with pytest.raises(ConfigError, match="none"):
+        LstmInitialPose(weights(imu="none"))
+
+
+@pytest.mark.parametrize(
+    "changes", [{"min_cells": 0}, {"min_matched": 1.5}, {"refine_steps": -1}, {"covariance_scale": 0}], ids=str
+)
+def test_settings_out_of_range_are_refused(changes):
+    with pytest.raises(ConfigError):
+        NetworkResidualSettings(**changes)
+
+
+def spread(*weak: int) -> np.ndarray:
+    return np.diag([0.0 if axis in weak else 1000.0 * (25.0 if axis < 3 else 1.0) for axis in range(6)])
+
+
+def test_the_covariance_is_the_inverse_information_where_that_is_full():
+    found = covariance(spread(), sigma_m=0.02, scale=1.0)
+    # 2e-3 of the trace of translation is the normals' noise: 6 of 1000
+    assert np.sqrt(found[4, 4] - 1e-6) == pytest.approx(0.02 / np.sqrt(994), rel=1e-3)
+    assert degenerate_directions(spread()).shape == (0, 6)
+
+
+def test_directions_without_information_are_loose_and_no_step_is_taken_along_them():
+    found = covariance(spread(3), sigma_m=0.02, scale=1.0)
+    assert found[3, 3] == pytest.approx(100.0)
+    assert np.abs(degenerate_directions(spread(3))).argmax(axis=1).tolist() == [3]
+    step = newton_step(spread(3), np.array([0, 0, 0, 50.0, 50.0, 0]))
+    assert step[3] == 0
+    assert step[4] == pytest.approx(-0.05)
