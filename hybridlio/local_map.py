@@ -44,6 +44,7 @@ class LocalMap:
         self._cells = small_gicp.IncrementalVoxelMapNormal(settings.voxel_m)
         self._cells.set_lru(settings.horizon_keyframes, max(1, settings.horizon_keyframes // 6))
         self._keyframe: Array | None = None
+        self.keyframes = 0
         self.surface: Surface | None = None
 
     def wants(self, T_map_lidar: Array) -> bool:
@@ -60,6 +61,7 @@ class LocalMap:
         small_gicp.estimate_normals(cloud, None, self._settings.neighbours, self._settings.threads)
         self._cells.insert(cloud, T_map_lidar)
         self._keyframe = T_map_lidar
+        self.keyframes += 1
         points, normals = self._cells.voxel_points()[:, :3], self._cells.voxel_normals()[:, :3]
         near = ((points - T_map_lidar[:3, 3]) ** 2).sum(axis=1) < self._settings.radius_m**2
         near &= np.abs(normals).sum(axis=1) > 0.5  # small_gicp leaves a normal zero where there are too few neighbours

@@ -18,6 +18,7 @@ _ROTATION_CONVERGED_RAD = 2e-5
 _TRANSLATION_CONVERGED_M = 3e-4
 _REMATCH_ROTATION_RAD = 2e-4  # a centimetre at 50 m
 _REMATCH_TRANSLATION_M = 5e-3
+_REMATCH_STEPS = 8  # points between two equally near neighbours would have the pose go to and fro for ever
 # Normals of a surface are off by a few hundredths of a radian, so that points on one plane alone seem to say something
 # of motion along it: this much of a point's information, per point, is that noise.
 NORMAL_NOISE = 2e-3
@@ -146,7 +147,7 @@ def register(
     matches = _match(surface, source, pose, max(settings.max_distance_m, 3 * kernel), settings.threads)
     while not converged and iterations < settings.max_iterations:
         iterations += 1
-        if _moved(matches, pose):
+        if iterations <= _REMATCH_STEPS and _moved(matches, pose):
             matches = _match(surface, source, pose, max(settings.max_distance_m, 3 * kernel), settings.threads)
         system = _linearise(matches, pose, kernel)
         step = _solve(system)

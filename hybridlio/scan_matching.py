@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -15,6 +16,7 @@ from hybridlio.registration import (
     NORMAL_NOISE,
     Registration,
     RegistrationSettings,
+    Surface,
     degenerate_directions,
     register,
     scaled_spectrum,
@@ -36,9 +38,10 @@ class ScanMatchingSettings:
         min_matched: with a smaller share of points matched, too.
         covariance_scale: how much larger the covariance is than independent residuals would make it; points on one
             surface share its error.
-        drift_share: how much of a step's covariance adds up from scan to scan; the rest is scatter about the local map.
-            Not used with ``last-scan``, where all of it does.
+        drift_share: how much of a step's covariance adds up from scan to scan, once the map has many keyframes; the
+            rest is scatter about the map. Not used with ``last-scan``, where all of it does.
         start_speeds_m_s: forward speeds tried where the initial pose is unsure of the translation.
+        start_rates_deg_s: rates of turn tried with each where it is unsure of the rotation too.
     """
 
     __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
@@ -53,11 +56,16 @@ class ScanMatchingSettings:
     covariance_scale: float = 6.0
     drift_share: float = 0.05
     start_speeds_m_s: tuple[float, ...] = (0.0, -5.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0)
+    start_rates_deg_s: tuple[float, ...] = (0.0, -50.0, 50.0, -100.0, 100.0)
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
     local_map: LocalMapSettings = field(default_factory=LocalMapSettings)
 
 
 _UNSURE_TRANSLATION_M = 0.5
+_UNSURE_ROTATION_RAD = 0.02
+_SPARSE = 8  # one in so many points is enough to tell a metre from another
+_COARSE_ITERATIONS = 6
+_COARSE_KERNEL_M = 0.5
 _FLOOR_SIGMAS = np.r_[np.full(3, 5e-5), np.full(3, 1e-3)]  # rad, m: no registration is better than this
 _FLOOR_COVARIANCE = np.diag(_FLOOR_SIGMAS**2)
 _UNKNOWN_SIGMA_M = 10.0  # along a degenerate direction
@@ -113,7 +121,10 @@ class ScanMatching:
         )
 
     def _drift(self, covariance: Array) -> Array | None:
-        return None if self._settings.target == "last-scan" else self._settings.drift_share * covariance
+        """What of a step's covariance adds up: at first much, for a map of few keyframes is as wrong as they are."""
+        if self._settings.target == "last-scan":
+            return None
+        return max(self._settings.drift_share, 0.5 / self._map.keyframes) * covariance
 
     def _thin(self, scan: Scan) -> Array:
         """``(M, 3)``: one point a voxel, of those within range."""
@@ -134,12 +145,22 @@ class ScanMatching:
         source = voxel_average(points, None, self._settings.source_voxel_m)[0].astype(np.float64)
         settings = self._settings.registration
         sigma_m = float(np.sqrt(initial.covariance[3:, 3:].trace()))
-        starts = [initial.pose]
-        if sigma_m > _UNSURE_TRANSLATION_M:
-            starts = [_ahead(initial.pose, speed * dt_s) for speed in self._settings.start_speeds_m_s]
         kernel_start_m = min(max(settings.kernel_m, sigma_m), 1.0)
-        tries = [register(surface, source, self._T_map_lidar @ T, settings, kernel_start_m) for T in starts]
-        return min(tries, key=lambda found: found.cost)
+        start = self._T_map_lidar @ initial.pose
+        if sigma_m > _UNSURE_TRANSLATION_M:
+            turns = initial.covariance[:3, :3].trace() > _UNSURE_ROTATION_RAD**2
+            start = self._search(surface, source, start, dt_s, self._settings.start_rates_deg_s if turns else (0.0,))
+        return register(surface, source, start, settings, kernel_start_m)
+
+    def _search(
+        self, surface: Surface, source: Array, start: Array, dt_s: float, rates_deg_s: tuple[float, ...]
+    ) -> Array:
+        """The best of several motions, by a few steps each with a few of the points."""
+        sparse, coarse = source[::_SPARSE], replace(self._settings.registration, max_iterations=_COARSE_ITERATIONS)
+        motions = product(self._settings.start_speeds_m_s, np.deg2rad(rates_deg_s))
+        starts = [start @ se3.exp(np.array([0, 0, rate, speed, 0, 0]) * dt_s) for speed, rate in motions]
+        tries = [register(surface, sparse, T, coarse, _COARSE_KERNEL_M) for T in starts]
+        return min(tries, key=lambda found: found.cost).pose
 
     def _bridge(self, initial: RelativePose, points: int, found: Registration | None) -> RelativePose:
         self._T_map_lidar = self._T_map_lidar @ initial.pose
@@ -164,12 +185,6 @@ def covariance_of(found: Registration, scale: float) -> Array:
     variance = np.minimum(scale * found.sigma_m**2 / np.maximum(information, 1e-9), _UNKNOWN_SIGMA_M**2)
     root = vectors * np.sqrt(variance) * to_tangent[:, None]
     return np.asarray(root @ root.T + _FLOOR_COVARIANCE)
-
-
-def _ahead(pose: Array, distance_m: float) -> Array:
-    moved = pose.copy()
-    moved[0, 3] += distance_m
-    return moved
 
 
 def _details(found: Registration, points: int) -> dict[str, float]:
