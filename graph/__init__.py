@@ -1,1 +1,21 @@
 """The factor graph: GTSAM lives here and nowhere else."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hybridlio.graph.pose_graph import PoseGraph as PoseGraph
+    from hybridlio.graph.solution import Solution as Solution
+
+__all__ = ["PoseGraph", "Solution"]
+
+_MODULES = {"PoseGraph": "hybridlio.graph.pose_graph", "Solution": "hybridlio.graph.solution"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(_MODULES[name]), name)

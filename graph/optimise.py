@@ -1,0 +1,90 @@
+"""Solving a pose graph: where to start, which solver, and what came out."""
+
+from __future__ import annotations
+
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from hybridlio import se3
+from hybridlio.errors import ConfigError, GraphError
+from hybridlio.estimates import Array
+from hybridlio.graph import coordinates as co
+from hybridlio.graph.checks import check_determined, groups
+from hybridlio.graph.edges import edges_of
+from hybridlio.graph.graph_data import GraphData
+from hybridlio.graph.initial import find
+from hybridlio.graph.keys import named
+from hybridlio.graph.levenberg import Progress, solve
+from hybridlio.graph.measurements import Factor
+from hybridlio.graph.solution import Solution
+
+Solver: TypeAlias = Literal["auto", "batch"]
+SOLVERS = ("auto", "batch")
+
+
+def optimise(graph: GraphData, solver: str, initial: str, max_iterations: int, progress: Progress | None) -> Solution:
+    """Solve a pose graph; see :meth:`hybridlio.graph.pose_graph.PoseGraph.optimize`."""
+    if solver not in SOLVERS or initial not in ("auto", "given") or max_iterations < 1:
+        raise ConfigError(
+            f"solver {solver!r}, initial {initial!r}, max_iterations {max_iterations}: solvers are "
+            f"{', '.join(SOLVERS)}, initial is auto or given, max_iterations at least 1"
+        )
+    check_determined(graph)
+    report = progress or _silent
+    data = graph.without()
+    return Solution(data, solve(data, choose_start(data, initial), max_iterations, report))
+
+
+def choose_start(data: GraphData, initial: str) -> Array:
+    """Where to start from: ``given`` initial values, or the best of several.
+
+    These are the given values, chordal ones, and chordal ones without the factors that have a robust kernel.
+
+    Raises:
+        GraphError: values are missing and cannot be found.
+    """
+    start = data.initial_coordinates()
+    if initial == "given":
+        if start is None:
+            missing = [key for key in data.keys if data.initial(key) is None]
+            raise GraphError(f"pose {named(missing)} has no initial value; give one, or choose initial='auto'")
+        return start
+    kernels = {number for number, f in data.factors.items() if f.kind == "between" and f.robust is not None}
+    sure = [data.without(kernels)] if kernels else []
+    starts = [] if start is None else [start]
+    for part in [data, *(part for part in sure if len(groups(part, ("between",))) == len(groups(data, ("between",))))]:
+        try:
+            starts.append(find(part, "chordal"))
+        except GraphError:  # parts that inertial factors or given values place
+            if start is None:
+                raise
+    return starts[0] if len(starts) == 1 else min(starts, key=lambda poses: misfit(data, poses))
+
+
+def misfit(data: GraphData, coordinates: Array) -> float:
+    """Twice the error of between-factors, priors and GPS: enough to tell a good start from a bad one."""
+    poses = co.to_matrices(coordinates)
+    chi2 = edges_of(data).chi2(poses).tolist()
+    between = [factor for factor in data.factors.values() if factor.kind == "between"]
+    total = sum(f.robust.loss(x) if f.robust else x for f, x in zip(between, chi2, strict=True))
+    index = {key: k for k, key in enumerate(data.keys)}
+    for factor in data.factors.values():
+        if factor.kind in ("prior", "gps") and factor.noise is not None:
+            residual = _absolute(factor, poses[index[factor.keys[0]]])
+            squared = float(residual @ factor.noise.information @ residual)
+            total += factor.robust.loss(squared) if factor.robust else squared
+    return float(total)
+
+
+def _absolute(factor: Factor, pose: Array) -> Array:
+    """Residual of a prior or of GPS at a pose ``(4, 4)``."""
+    if factor.kind == "gps":
+        return np.asarray(se3.transform(pose, factor.measured[None, 3:])[0] - factor.measured[:3])
+    step = se3.log(se3.between(co.to_matrices(factor.measured[None])[0], pose))
+    return step if len(factor.measured) == 7 else step[2:5]
+
+
+def _silent(stage: str, iteration: int, error: float) -> None:
+    """Report to nobody."""
+    del stage, iteration, error
