@@ -38,8 +38,8 @@ class ScanMatchingSettings:
         min_matched: with a smaller share of points matched, too.
         covariance_scale: how much larger the covariance is than independent residuals would make it; points on one
             surface share its error.
-        drift_share: how much of a step's covariance adds up from scan to scan, once the map has many keyframes; the
-            rest is scatter about the map. Not used with ``last-scan``, where all of it does.
+        drift_share: how much of a step's covariance adds up when the map has taken in a keyframe, once it has many;
+            the rest is scatter about the map. Not used with ``last-scan``, where all of it does.
         start_speeds_m_s: forward speeds tried where the initial pose is unsure of the translation.
         start_rates_deg_s: rates of turn tried with each where it is unsure of the rotation too.
     """
@@ -54,7 +54,7 @@ class ScanMatchingSettings:
     min_points: int = 200
     min_matched: float = 0.3
     covariance_scale: float = 6.0
-    drift_share: float = 0.05
+    drift_share: float = 0.1
     start_speeds_m_s: tuple[float, ...] = (0.0, -5.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0)
     start_rates_deg_s: tuple[float, ...] = (0.0, -50.0, 50.0, -100.0, 100.0)
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
@@ -67,6 +67,7 @@ _SPARSE = 8  # one in so many points is enough to tell a metre from another
 _COARSE_ITERATIONS = 6
 _COARSE_KERNEL_M = 0.5
 _FLOOR_SIGMAS = np.r_[np.full(3, 5e-5), np.full(3, 1e-3)]  # rad, m: no registration is better than this
+_SHARE_OF_SAME_MAP = 1e-3
 _FLOOR_COVARIANCE = np.diag(_FLOOR_SIGMAS**2)
 _UNKNOWN_SIGMA_M = 10.0  # along a degenerate direction
 
@@ -81,6 +82,7 @@ class ScanMatching:
         self._map = LocalMap(self._settings.local_map)
         self._T_map_lidar: Array = np.eye(4)
         self._stamp_ns = 0
+        self._map_changed = False  # since the last scan was matched
 
     def start(self, frame: Frame) -> None:
         """Make the first scan the map.
@@ -96,7 +98,7 @@ class ScanMatching:
             )
         self._map = LocalMap(self._settings.local_map)
         self._T_map_lidar = np.eye(4)
-        self._map.insert(points, self._T_map_lidar)
+        self._keep(points)
         self._stamp_ns = frame.scan.stamp_ns
 
     def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:
@@ -108,6 +110,7 @@ class ScanMatching:
         if found is None or found.matched < self._settings.min_matched:
             return self._bridge(initial, len(points), found)
         before, self._T_map_lidar = self._T_map_lidar, found.pose
+        map_changed, self._map_changed = self._map_changed, False
         if self._settings.target == "last-scan" or self._map.wants(found.pose):
             self._keep(points)
         covariance = covariance_of(found, self._settings.covariance_scale)
@@ -115,16 +118,17 @@ class ScanMatching:
             se3.between(before, found.pose),
             covariance,
             source=self.name,
-            drift=self._drift(covariance),
+            drift=self._drift(covariance, map_changed),
             degenerate=degenerate_directions(found.hessian),
             details=_details(found, len(points)),
         )
 
-    def _drift(self, covariance: Array) -> Array | None:
+    def _drift(self, covariance: Array, map_changed: bool) -> Array | None:
         """What of a step's covariance adds up: at first much, for a map of few keyframes is as wrong as they are."""
         if self._settings.target == "last-scan":
             return None
-        return max(self._settings.drift_share, 0.5 / self._map.keyframes) * covariance
+        share = max(self._settings.drift_share, 0.5 / self._map.keyframes) if map_changed else _SHARE_OF_SAME_MAP
+        return share * covariance
 
     def _thin(self, scan: Scan) -> Array:
         """``(M, 3)``: one point a voxel, of those within range."""
@@ -137,6 +141,7 @@ class ScanMatching:
         if self._settings.target == "last-scan":
             self._map = LocalMap(self._settings.local_map)
         self._map.insert(points, self._T_map_lidar)
+        self._map_changed = True
 
     def _register(self, points: Array, initial: RelativePose, dt_s: float) -> Registration | None:
         surface = self._map.surface
@@ -169,7 +174,7 @@ class ScanMatching:
             initial.covariance,
             source=initial.source,
             ok=False,
-            drift=self._drift(_FLOOR_COVARIANCE),  # the map has not moved
+            drift=self._drift(_FLOOR_COVARIANCE, map_changed=False),  # the map has not moved
             from_imu=initial.from_imu,
             details=_details(found, points) if found else {"points": float(points)},
         )
