@@ -29,7 +29,7 @@ class Attention(nn.Module):
 
 
 class Mlp(nn.Module):
-    """``tanh(W₂ tanh(W₁x + b₁) + b₂)``: UnDeepLIO, formula (11). Features ``(B, F)`` to ``(B, F)``."""
+    """``tanh(W₂ tanh(W₁x + b₁) + b₂)``: UnDeepLIO, formula (12). Features ``(B, F)`` to ``(B, F)``."""
 
     def __init__(self, features: int) -> None:
         super().__init__()

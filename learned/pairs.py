@@ -72,12 +72,14 @@ class Pairs:
             good = shard.usable[1:] & shard.usable[:-1]
             if settings.imu in ("initial-pose", "feature"):
                 good = good & shard.imu_there[1:]
+            if settings.velocity:
+                good = good & np.isfinite(shard.velocity_m_s[1:]).all(axis=1)
             if settings.imu == "given":
                 good = good & np.isfinite(shard.initial[1:]).all(axis=(1, 2))
             self._rows += [(number, int(k) + 1) for k in np.flatnonzero(good)]
         if not self._rows:
             names = ", ".join(shard.info.name for shard in self.shards) or "no shard"
-            raise DataError(f"{names}: no pair of usable scans with what imu={settings.imu!r} needs")
+            raise DataError(f"{names}: no pair of usable scans with what the network needs (imu={settings.imu!r})")
 
     def __len__(self) -> int:
         return len(self._rows)

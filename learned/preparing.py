@@ -70,8 +70,8 @@ def prepare_shard(
 ) -> ShardInfo:
     """Prepare every scan of a recording once and write the shard.
 
-    A scan that cannot be read is kept as one that is not usable. Where there is a reference, the velocity at each scan
-    comes from the step before, as it would at run time; a scan after an unusable one still has its own.
+    A scan that cannot be read is kept as one that is not usable. The velocity at each scan comes from the step before,
+    as it would at run time: by the reference where there is one, else by ``initial``.
 
     Args:
         sequence: the recording.
@@ -98,6 +98,7 @@ def _records(
     initial: Initial | None,
     progress: Progress | None,
 ) -> Iterator[ScanRecord]:
+    before: NDArray[np.float64] | None = None  # the step that led to scan k-1
     for k in range(len(sequence)):
         frame, readable = _frame(sequence, k)
         prepared = prepare(frame.scan) if readable else None
@@ -108,6 +109,7 @@ def _records(
         vertices = np.zeros((3, geometry.rows, geometry.columns), np.float32)
         calibration = frame.calibration
         T_imu_lidar = None if calibration is None else calibration.T_imu_lidar
+        guess, reference = initial(frame) if initial is not None and k else None, _step(sequence, k)
         yield ScanRecord(
             vertex_map=prepared.vertex_map if prepared is not None and usable else vertices,
             loss_points=empty if cloud is None else cloud.points,
@@ -115,10 +117,11 @@ def _records(
             usable=usable,
             imu=imu_rows(frame.imu, imu_samples, T_imu_lidar) if k and len(frame.imu) else None,
             dt_s=float(sequence.stamps_ns[k] - sequence.stamps_ns[k - 1]) / NS_PER_S if k else 0.0,
-            velocity_m_s=_velocity(sequence, k),
-            initial=initial(frame) if initial is not None and k else None,
-            reference=_step(sequence, k),
+            velocity_m_s=_velocity(before, sequence, k),
+            initial=guess,
+            reference=reference,
         )
+        before = guess if reference is None else reference
         if progress is not None:
             progress(k + 1, len(sequence))
 
@@ -137,9 +140,8 @@ def _step(sequence: Sequence, k: int) -> NDArray[np.float64] | None:
     return se3.between(sequence.reference.poses[k - 1], sequence.reference.poses[k])
 
 
-def _velocity(sequence: Sequence, k: int) -> NDArray[np.float64] | None:
-    """Mean velocity from scan k-2 to k-1, in the axes of scan k-1, by the reference."""
-    before = _step(sequence, k - 1)
+def _velocity(before: NDArray[np.float64] | None, sequence: Sequence, k: int) -> NDArray[np.float64] | None:
+    """Mean velocity from scan k-2 to k-1, in the axes of scan k-1, by the step between them."""
     if before is None:
         return None
     seconds = float(sequence.stamps_ns[k - 1] - sequence.stamps_ns[k - 2]) / NS_PER_S

@@ -55,6 +55,15 @@ not change with them.
 """
 
 
+SPLITS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = MappingProxyType(
+    {
+        "easy": (tuple(f"{n:02}" for n in range(9)), ("09", "10")),
+        "hard": (tuple(f"{n:02}" for n in range(7)), ("07", "08", "09", "10")),
+    }
+)
+"""KITTI odometry sequences to train on and to test on, by the split's name."""
+
+
 @dataclass(frozen=True)
 class TableRow:
     """A row of one of the paper's tables.
@@ -116,6 +125,19 @@ def preset(name: str) -> Recipe:
     if name not in PRESETS:
         raise ConfigError(f"no preset named {name!r}; there are {', '.join(PRESETS)}")
     return PRESETS[name]
+
+
+def split(name: str, network: NetworkSettings) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """KITTI odometry sequences to train on and to test on; 03, which has no IMU, is left out where one is needed.
+
+    Raises:
+        ConfigError: there is no such split.
+    """
+    if name not in SPLITS:
+        raise ConfigError(f"no split named {name!r}; there are {', '.join(SPLITS)}")
+    train, test = SPLITS[name]
+    needs_imu = network.imu in ("initial-pose", "feature")
+    return tuple(s for s in train if not (needs_imu and s == "03")), test
 
 
 def table(number: int) -> tuple[TableRow, ...]:

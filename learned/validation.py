@@ -106,12 +106,13 @@ def step_errors(poses: Array, reference: Array) -> tuple[float, float]:
 
 
 def _drift(pairs: Pairs, steps: Steps) -> tuple[float | None, float | None]:
-    """Drift by recording, averaged; None where no recording is whole or long enough."""
+    """Drift by recording, averaged; None where none is without gaps and long enough."""
     places = [pairs.where(i) for i in range(len(pairs))]
     found = []
     for shard in pairs.shards:
         rows = [i for i, (its_shard, _) in enumerate(places) if its_shard is shard]
-        if len(rows) != len(shard) - 1 or not np.isfinite(steps.reference[rows]).all():
+        gaps = np.diff([places[i][1] for i in rows]) != 1
+        if not rows or gaps.any() or not np.isfinite(steps.reference[rows]).all():
             continue
         reference, estimate = _chained(steps.reference[rows]), _chained(steps.poses[rows])
         path_m = float(np.linalg.norm(steps.reference[rows][:, :3, 3], axis=1).sum())

@@ -76,6 +76,24 @@ def test_pairs_that_lack_what_the_network_needs_are_left_out(tmp_path, imu, left
     assert [pairs.where(i)[1] for i in range(len(pairs))] == left
 
 
+def test_a_network_that_starts_from_the_velocity_leaves_out_pairs_without_one(tmp_path):
+    records = [record(k) for k in range(4)]
+    records[2] = replace(records[2], velocity_m_s=None)
+    pairs = Pairs([shard_of(tmp_path, records)], replace(SETTINGS, velocity=True, siamese="twins"))
+    assert [pairs.where(i)[1] for i in range(len(pairs))] == [1, 3]
+
+
+def test_without_a_reference_velocities_come_from_the_initial_poses(tiny_drive, tmp_path):
+    sequence = replace(hl.open_sequence(tiny_drive).part(0, 4), reference=None)
+    options = PreparationOptions(geometry=GEOMETRY, loss_points=1000, threads=1)
+    step = se3.exp([0, 0, 0.5, 1.0, 0, 0])
+    prepare_shard(sequence, tmp_path / "s", partial(prepare, options=options), GEOMETRY, initial=lambda _: step)
+    shard = Shard(tmp_path / "s")
+    assert np.isnan(shard.velocity_m_s[1]).all()
+    assert np.allclose(shard.velocity_m_s[2:], step[:3, :3].T @ step[:3, 3] / 0.1, rtol=1e-2)
+    assert np.isnan(shard.reference).all()
+
+
 def test_no_pair_at_all_is_an_error_that_names_the_recording(tmp_path):
     shard = shard_of(tmp_path, [record(k, imu=None) for k in range(3)])
     with pytest.raises(DataError, match="made up"):

@@ -7,7 +7,7 @@ import torch
 
 from hybridlio.errors import ConfigError
 from hybridlio.learned.odometry_network import OdometryNetwork, parameter_count
-from hybridlio.learned.presets import PAPER, PRESETS, TABLES, preset, table
+from hybridlio.learned.presets import PAPER, PRESETS, TABLES, preset, split, table
 from hybridlio.learned.settings import LossSettings, NetworkSettings, OptimiserSettings, Recipe, from_dict, to_dict
 
 
@@ -45,6 +45,14 @@ def test_recipes_survive_the_way_through_json(name):
 def test_weights_of_the_papers_network_stay_below_the_size_that_ships():
     with torch.device("meta"):
         assert parameter_count(OdometryNetwork(PAPER.network)) * 4 < 25e6
+
+
+def test_the_splits_are_the_papers_and_leave_03_out_where_the_imu_is_used():
+    assert split("easy", preset("no-imu").network) == (tuple(f"0{n}" for n in range(9)), ("09", "10"))
+    train, test = split("hard", PAPER.network)
+    assert (train, test) == (("00", "01", "02", "04", "05", "06"), ("07", "08", "09", "10"))
+    with pytest.raises(ConfigError, match="easy, hard"):
+        split("medium", PAPER.network)
 
 
 def test_unknown_names_list_what_there_is():
