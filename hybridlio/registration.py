@@ -13,15 +13,13 @@ import small_gicp
 
 from hybridlio import se3
 from hybridlio.estimates import Array
+from hybridlio.information import newton_step
 
 _ROTATION_CONVERGED_RAD = 2e-5
 _TRANSLATION_CONVERGED_M = 3e-4
 _REMATCH_ROTATION_RAD = 2e-4  # a centimetre at 50 m
 _REMATCH_TRANSLATION_M = 5e-3
 _REMATCH_STEPS = 8  # points between two equally near neighbours would have the pose go to and fro for ever
-# Normals of a surface are off by a few hundredths of a radian, so that points on one plane alone seem to say something
-# of motion along it: this much of a point's information, per point, is that noise.
-NORMAL_NOISE = 2e-3
 
 
 @dataclass(frozen=True)
@@ -133,8 +131,8 @@ def register(
 ) -> Registration:
     """Find the pose that lays ``source`` on ``surface``.
 
-    Directions that the points hardly constrain (:func:`degenerate_directions`) stay as in ``initial``
-    (Zhang, Kaess, Singh, "On degeneracy of optimization-based state estimation problems", ICRA 2016).
+    Directions that the points hardly constrain (:func:`hybridlio.information.degenerate_directions`) stay as in
+    ``initial``.
 
     Args:
         surface: points with normals.
@@ -150,40 +148,12 @@ def register(
         if iterations <= _REMATCH_STEPS and _moved(matches, pose):
             matches = _match(surface, source, pose, max(settings.max_distance_m, 3 * kernel), settings.threads)
         system = _linearise(matches, pose, kernel)
-        step = _solve(system)
+        step = newton_step(system.hessian, system.gradient) if len(system.residuals) >= 6 else np.zeros(6)
         pose = pose @ se3.exp(step)
         small = np.abs(step[:3]).max() < _ROTATION_CONVERGED_RAD and np.abs(step[3:]).max() < _TRANSLATION_CONVERGED_M
         converged = bool(small and kernel == settings.kernel_m)
         kernel = max(settings.kernel_m, kernel / 2)
     return _summary(system, len(source), settings, se3.orthonormalise(pose), iterations, converged)
-
-
-def scaled_spectrum(hessian: Array) -> tuple[Array, Array, Array]:
-    """Eigenvalues ``(6,)``, eigenvectors ``(6, 6)`` as columns, and the scaling ``(6,)`` that makes them comparable.
-
-    Rotations are measured in metres at the points' mean lever arm, so that all six directions have one unit.
-    """
-    lever = np.sqrt(max(np.trace(hessian[:3, :3]), 1e-12) / max(np.trace(hessian[3:, 3:]), 1e-12))
-    scale = np.r_[np.full(3, 1 / lever), np.ones(3)]
-    values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
-    return values, vectors, scale
-
-
-def degenerate_directions(hessian: Array) -> Array:
-    """``(D, 6)`` unit tangent directions along which the points say no more than the noise of their normals."""
-    values, vectors, scale = scaled_spectrum(hessian)
-    weak = values < 3 * NORMAL_NOISE * np.trace(hessian[3:, 3:])
-    directions = (vectors[:, weak] * scale[:, None]).T
-    return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
-
-
-def _solve(system: _Linearisation) -> Array:
-    if len(system.residuals) < 6:
-        return np.zeros(6)
-    values, vectors, scale = scaled_spectrum(system.hessian)
-    strong = values >= 3 * NORMAL_NOISE * np.trace(system.hessian[3:, 3:])
-    inverse = np.where(strong, 1 / np.maximum(values, 1e-12), 0.0)
-    return np.asarray(-scale * (vectors @ (inverse * (vectors.T @ (scale * system.gradient)))))
 
 
 def _summary(

@@ -11,16 +11,9 @@ import numpy as np
 from hybridlio import se3
 from hybridlio.errors import DataError
 from hybridlio.estimates import Array, RelativePose
+from hybridlio.information import FLOOR_SIGMAS, covariance_of, degenerate_directions
 from hybridlio.local_map import LocalMap, LocalMapSettings
-from hybridlio.registration import (
-    NORMAL_NOISE,
-    Registration,
-    RegistrationSettings,
-    Surface,
-    degenerate_directions,
-    register,
-    scaled_spectrum,
-)
+from hybridlio.registration import Registration, RegistrationSettings, Surface, register
 from hybridlio.sensors import NS_PER_S, Frame, Scan
 from hybridlio.voxel import voxel_average
 
@@ -66,10 +59,8 @@ _UNSURE_ROTATION_RAD = 0.02
 _SPARSE = 8  # one in so many points is enough to tell a metre from another
 _COARSE_ITERATIONS = 6
 _COARSE_KERNEL_M = 0.5
-_FLOOR_SIGMAS = np.r_[np.full(3, 5e-5), np.full(3, 1e-3)]  # rad, m: no registration is better than this
 _SHARE_OF_SAME_MAP = 1e-3
-_FLOOR_COVARIANCE = np.diag(_FLOOR_SIGMAS**2)
-_UNKNOWN_SIGMA_M = 10.0  # along a degenerate direction
+_FLOOR_COVARIANCE = np.diag(FLOOR_SIGMAS**2)
 
 
 class ScanMatching:
@@ -113,7 +104,7 @@ class ScanMatching:
         map_changed, self._map_changed = self._map_changed, False
         if self._settings.target == "last-scan" or self._map.wants(found.pose):
             self._keep(points)
-        covariance = covariance_of(found, self._settings.covariance_scale)
+        covariance = covariance_of(found.hessian, found.sigma_m, self._settings.covariance_scale)
         return RelativePose(
             se3.between(before, found.pose),
             covariance,
@@ -178,18 +169,6 @@ class ScanMatching:
             from_imu=initial.from_imu,
             details=_details(found, points) if found else {"points": float(points)},
         )
-
-
-def covariance_of(found: Registration, scale: float) -> Array:
-    """Covariance ``(6, 6)`` of a registration, from its Hessian less what the normals' noise feigns.
-
-    ``Σ = scale·σ²·H⁻¹`` with the residuals' σ; directions without information get a deviation of 10 m.
-    """
-    values, vectors, to_tangent = scaled_spectrum(found.hessian)
-    information = values - NORMAL_NOISE * np.trace(found.hessian[3:, 3:])
-    variance = np.minimum(scale * found.sigma_m**2 / np.maximum(information, 1e-9), _UNKNOWN_SIGMA_M**2)
-    root = vectors * np.sqrt(variance) * to_tangent[:, None]
-    return np.asarray(root @ root.T + _FLOOR_COVARIANCE)
 
 
 def _details(found: Registration, points: int) -> dict[str, float]:

@@ -14,6 +14,7 @@ from hybridlio import se3
 from hybridlio.errors import DataError
 
 NS_PER_S = 1_000_000_000
+LONGEST_INTERPOLATION_NS = 250_000_000  # inertial samples farther apart say nothing of what lies between them
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,14 +95,14 @@ class ImuSamples:
     def between(self, start_ns: int, end_ns: int) -> ImuSamples:
         """Samples from ``start_ns`` to ``end_ns``, with linearly interpolated ones at both ends.
 
-        An end outside the recording is not extrapolated: the result then starts or stops where the samples do. It is
-        empty where ``end_ns`` lies before ``start_ns``. Takes logarithmic time in the recording's length.
+        An end outside the recording, or inside a gap of more than :data:`LONGEST_INTERPOLATION_NS`, is left out: the
+        result then starts or stops where the samples do. It is empty where ``end_ns`` lies before ``start_ns``. Takes logarithmic time in the recording's length.
         """
         if end_ns < start_ns or not len(self):
             return ImuSamples.empty()
         first = int(np.searchsorted(self.stamps_ns, start_ns, side="right"))
         last = int(np.searchsorted(self.stamps_ns, end_ns, side="left"))
-        ends = [t for t in (start_ns, end_ns) if self.stamps_ns[0] <= t <= self.stamps_ns[-1]]
+        ends = [t for t in (start_ns, end_ns) if self._near_samples(t)]
         stamps = np.unique(np.concatenate([self.stamps_ns[first:last], np.array(ends, np.int64)]))
         if not len(stamps):
             return ImuSamples.empty()
@@ -111,6 +112,17 @@ class ImuSamples:
         columns = np.hstack([self.gyro_rad_s[near], self.accel_m_s2[near]])
         values = np.column_stack([np.interp(at, known, columns[:, i]) for i in range(6)])
         return ImuSamples(stamps, values[:, :3], values[:, 3:])
+
+    def _near_samples(self, stamp_ns: int) -> bool:
+        """Whether samples before and after the stamp are near enough to interpolate between."""
+        after = int(np.searchsorted(self.stamps_ns, stamp_ns, side="left"))
+        if after == len(self) or (after == 0 and self.stamps_ns[0] != stamp_ns):
+            return False
+        before = max(after - 1, 0)
+        return bool(
+            self.stamps_ns[after] == stamp_ns
+            or self.stamps_ns[after] - self.stamps_ns[before] <= LONGEST_INTERPOLATION_NS
+        )
 
     def longest_gap_s(self, start_ns: int, end_ns: int) -> float:
         """The longest time without a sample between ``start_ns`` and ``end_ns``, in seconds."""

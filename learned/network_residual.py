@@ -14,8 +14,8 @@ from torch import Tensor
 from hybridlio import se3
 from hybridlio.errors import ConfigError, DataError
 from hybridlio.estimates import RelativePose
+from hybridlio.information import covariance_of, degenerate_directions, newton_step
 from hybridlio.learned.correspondences import Clouds, match
-from hybridlio.learned.covariance import covariance, degenerate_directions, newton_step
 from hybridlio.learned.losses import GaussNewton, gauss_newton, loss
 from hybridlio.learned.lstm_initial_pose import inertial
 from hybridlio.learned.odometry_network import NetworkInput
@@ -201,7 +201,7 @@ class NetworkResidual:
         for _ in range(self._settings.refine_steps):
             information, gradient = _numpy(judged.near.information)[0], _numpy(judged.near.gradient)[0]
             # the information is the Hessian times k/2, the Geman-McClure kernel's scale
-            step = newton_step(information, gradient * self._settings.kernel_m / 2)
+            step = newton_step(information, gradient * self._settings.kernel_m / 2, limit_m=0.5)
             moved = _numpy(judged.pose)[0] @ se3.exp(step)
             tried = self._judge(self._tensor(se3.orthonormalise(moved)), last, current)
             if not tried.cost < judged.cost:
@@ -216,7 +216,7 @@ class NetworkResidual:
         sigma_m = float(judged.near.sigma_m)
         return RelativePose(
             se3.orthonormalise(_numpy(judged.pose)[0]),
-            covariance(information, sigma_m, self._settings.covariance_scale),
+            covariance_of(information, sigma_m, self._settings.covariance_scale),
             source=self.name,
             degenerate=degenerate_directions(information),
             from_imu=uses_imu and initial.from_imu,

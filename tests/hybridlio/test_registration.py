@@ -2,16 +2,8 @@ import numpy as np
 import pytest
 
 from hybridlio import se3
-from hybridlio.registration import (
-    RegistrationSettings,
-    Surface,
-    _linearise,
-    _match,
-    degenerate_directions,
-    register,
-    scaled_spectrum,
-)
-from hybridlio.scan_matching import covariance_of
+from hybridlio.information import covariance_of, degenerate_directions, scaled_spectrum
+from hybridlio.registration import RegistrationSettings, Surface, _linearise, _match, register
 
 EXACT = RegistrationSettings(threads=1)
 MOTION = se3.exp(np.array([0.01, -0.02, 0.05, 0.3, -0.2, 0.1]))
@@ -223,7 +215,7 @@ def test_the_covariance_is_symmetric_positive_definite_and_loose_only_where_dege
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     source = points[::5] + 0.02 * rng.standard_normal(points[::5].shape)
     found = register(Surface(points, normals), source, np.eye(4), EXACT)
-    covariance = covariance_of(found, 6.0)
+    covariance = covariance_of(found.hessian, found.sigma_m, 6.0)
     np.testing.assert_allclose(covariance, covariance.T, rtol=1e-12)
     assert np.linalg.eigvalsh(covariance)[0] > 0
     sigmas = np.sqrt(np.diag(covariance))
@@ -243,8 +235,8 @@ def test_the_covariance_is_of_a_right_perturbation(rng: np.random.Generator):
     world = register(Surface(se3.transform(turn, points), normals @ turn[:3, :3].T), source, turn, EXACT)
     scan = register(Surface(points, normals), seen_from(turn, source), turn, EXACT)
     # in the first the corridor still runs along the scan's x; in the second along its y
-    assert np.argmax(np.diag(covariance_of(world, 1.0))) == 3
-    assert np.argmax(np.diag(covariance_of(scan, 1.0))) == 4
+    assert np.argmax(np.diag(covariance_of(world.hessian, world.sigma_m, 1.0))) == 3
+    assert np.argmax(np.diag(covariance_of(scan.hessian, scan.sigma_m, 1.0))) == 4
 
 
 def test_twice_the_residuals_are_four_times_the_covariance(rng: np.random.Generator):
@@ -252,7 +244,7 @@ def test_twice_the_residuals_are_four_times_the_covariance(rng: np.random.Genera
     surface, noise, traces = Surface(points, normals), rng.standard_normal(points.shape), []
     for sigma in (0.01, 0.02):
         found = register(surface, points + sigma * noise, np.eye(4), RegistrationSettings(kernel_m=1.0, threads=1))
-        traces.append(np.trace(covariance_of(found, 1e4)))
+        traces.append(np.trace(covariance_of(found.hessian, found.sigma_m, 1e4)))
     assert traces[1] / traces[0] == pytest.approx(4.0, rel=0.1)
 
 
@@ -267,7 +259,7 @@ def test_the_errors_of_many_registrations_scatter_as_their_covariance_says(rng: 
         source = seen_from(MOTION, points + 0.02 * rng.standard_normal(points.shape))
         found = register(surface, source, MOTION, EXACT)
         error = off(found.pose)
-        nees.append(error @ np.linalg.solve(covariance_of(found, 1.0), error) / 6)
+        nees.append(error @ np.linalg.solve(covariance_of(found.hessian, found.sigma_m, 1.0), error) / 6)
     assert 0.6 < np.mean(nees) < 1.5
 
 
@@ -279,8 +271,8 @@ def test_too_few_points_leave_the_pose_as_it_was(rng: np.random.Generator, count
     points, normals = scene(rng, ROOM)
     found = register(Surface(points, normals), points[:count] + 0.1, MOTION, EXACT)
     np.testing.assert_allclose(found.pose, MOTION, atol=1e-12)
-    assert np.isfinite(covariance_of(found, 1.0)).all()
-    assert np.linalg.eigvalsh(covariance_of(found, 1.0))[0] > 0
+    assert np.isfinite(covariance_of(found.hessian, found.sigma_m, 1.0)).all()
+    assert np.linalg.eigvalsh(covariance_of(found.hessian, found.sigma_m, 1.0))[0] > 0
 
 
 def test_points_far_from_everything_match_nothing_and_cost_all(rng: np.random.Generator):

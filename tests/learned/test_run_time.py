@@ -9,7 +9,7 @@ import hybridlio as hl
 from hybridlio import se3
 from hybridlio.errors import ConfigError, DataError
 from hybridlio.estimates import RelativePose, State
-from hybridlio.learned.covariance import covariance, degenerate_directions, newton_step
+from hybridlio.information import covariance_of, degenerate_directions, newton_step
 from hybridlio.learned.lstm_initial_pose import LstmInitialPose
 from hybridlio.learned.network_residual import NetworkResidual, NetworkResidualSettings
 from hybridlio.learned.odometry_network import OdometryNetwork
@@ -202,14 +202,14 @@ def spread(*weak: int) -> np.ndarray:
 
 
 def test_the_covariance_is_the_inverse_information_where_that_is_full():
-    found = covariance(spread(), sigma_m=0.02, scale=1.0)
+    found = covariance_of(spread(), sigma_m=0.02, scale=1.0)
     # 2e-3 of the trace of translation is the normals' noise: 6 of 1000
     assert np.sqrt(found[4, 4] - 1e-6) == pytest.approx(0.02 / np.sqrt(994), rel=1e-3)
     assert degenerate_directions(spread()).shape == (0, 6)
 
 
 def test_directions_without_information_are_loose_and_no_step_is_taken_along_them():
-    found = covariance(spread(3), sigma_m=0.02, scale=1.0)
+    found = covariance_of(spread(3), sigma_m=0.02, scale=1.0)
     assert found[3, 3] == pytest.approx(100.0)
     assert np.abs(degenerate_directions(spread(3))).argmax(axis=1).tolist() == [3]
     step = newton_step(spread(3), np.array([0, 0, 0, 50.0, 50.0, 0]))

@@ -1,4 +1,8 @@
-"""Covariance and degenerate directions of a pose, from the loss's Gauss-Newton Hessian at it. NumPy only."""
+"""What matched points say of a pose: covariance, degenerate directions and step, from the Gauss-Newton Hessian.
+
+Shared by scan matching and the network, whose loss is the same. All Hessians are ``(6, 6)``, rotation first,
+of half the weighted squared distances to the planes, right perturbation.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,7 @@ Array = NDArray[np.float64]
 # Normals are off by a few hundredths of a radian, so points on one plane alone seem to say something of motion along
 # it: this much of a point's information, per point, is that noise.
 NORMAL_NOISE = 2e-3
-_FLOOR_SIGMAS = np.r_[np.full(3, 5e-5), np.full(3, 1e-3)]  # rad, m: no single step is known better
+FLOOR_SIGMAS = np.r_[np.full(3, 5e-5), np.full(3, 1e-3)]  # rad, m: no single step is known better
 _UNKNOWN_SIGMA_M = 10.0
 
 
@@ -38,11 +42,11 @@ def degenerate_directions(information: Array) -> Array:
     return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
 
-def covariance(information: Array, sigma_m: float, scale: float) -> Array:
+def covariance_of(information: Array, sigma_m: float, scale: float) -> Array:
     """``scale·σ²·H⁻¹`` ``(6, 6)``, rad² and m², rotation first; 10 m where the matches say nothing.
 
     Args:
-        information: of :class:`hybridlio.learned.losses.GaussNewton`, one ``(6, 6)``.
+        information: the Hessian.
         sigma_m: standard deviation of the distances to the planes.
         scale: how much larger it is than independent residuals would make it: points on one surface share its error.
     """
@@ -50,12 +54,15 @@ def covariance(information: Array, sigma_m: float, scale: float) -> Array:
     known = values - NORMAL_NOISE * np.trace(information[3:, 3:])
     variance = np.minimum(scale * sigma_m**2 / np.maximum(known, 1e-9), _UNKNOWN_SIGMA_M**2)
     root = vectors * np.sqrt(variance) * to_tangent[:, None]
-    return np.asarray(root @ root.T + np.diag(_FLOOR_SIGMAS**2))
+    return np.asarray(root @ root.T + np.diag(FLOOR_SIGMAS**2))
 
 
-def newton_step(information: Array, gradient: Array, limit: float = 0.5) -> Array:
-    """The step ``(6,)`` to the minimum of the quadratic, 0 along degenerate directions, at most ``limit`` metres."""
+def newton_step(information: Array, gradient: Array, limit_m: float = np.inf) -> Array:
+    """The step ``(6,)`` to the minimum of the quadratic, at most ``limit_m``, and none along degenerate directions.
+
+    (Zhang, Kaess, Singh, "On degeneracy of optimization-based state estimation problems", ICRA 2016.)
+    """
     values, vectors, scale = scaled_spectrum(information)
     inverse = np.where(strong_directions(information, values), 1 / np.maximum(values, 1e-12), 0.0)
     reduced = -(vectors @ (inverse * (vectors.T @ (scale * gradient))))
-    return np.asarray(scale * reduced * min(1.0, limit / max(float(np.linalg.norm(reduced)), 1e-12)))
+    return np.asarray(scale * reduced * min(1.0, limit_m / max(float(np.linalg.norm(reduced)), 1e-12)))
