@@ -95,7 +95,7 @@ class Builder:
         kernel = factor.robust if robust else None
         key = (factor.noise.form, factor.noise.values.tobytes(), kernel)
         if key not in self._models:
-            self._models[key] = _noise_model(factor.noise, kernel, self.data.dimension)
+            self._models[key] = noise_model(factor.noise, kernel, self.data.dimension)
         return self._models[key]
 
     def _between(self, _: Factor, keys: list[int], T: Any, model: Any) -> Any:
@@ -141,7 +141,8 @@ class Builder:
             graph.add(gtsam.PriorFactorConstantBias(B(self.index[key]), gtsam.imuBias.ConstantBias(), model))
 
 
-def _noise_model(noise: Noise, kernel: Robust | None, dimension: int) -> gtsam.noiseModel.Base:
+def noise_model(noise: Noise, kernel: Robust | None, dimension: int) -> gtsam.noiseModel.Base:
+    """GTSAM's noise model, in the order of its tangent vectors."""
     make: dict[str, Callable[[Array], gtsam.noiseModel.Base]] = {
         "sigmas": gtsam.noiseModel.Diagonal.Sigmas,
         "information": gtsam.noiseModel.Gaussian.Information,

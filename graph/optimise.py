@@ -19,8 +19,8 @@ from hybridlio.graph.levenberg import Progress, solve
 from hybridlio.graph.measurements import Factor
 from hybridlio.graph.solution import Solution
 
-Solver: TypeAlias = Literal["auto", "batch"]
-SOLVERS = ("auto", "batch")
+Solver: TypeAlias = Literal["auto", "batch", "gnc"]
+SOLVERS = ("auto", "batch", "gnc")
 
 
 def optimise(graph: GraphData, solver: str, initial: str, max_iterations: int, progress: Progress | None) -> Solution:
@@ -33,7 +33,15 @@ def optimise(graph: GraphData, solver: str, initial: str, max_iterations: int, p
     check_determined(graph)
     report = progress or _silent
     data = graph.without()
-    return Solution(data, solve(data, choose_start(data, initial), max_iterations, report))
+    if solver != "gnc":
+        return Solution(data, solve(data, choose_start(data, initial), max_iterations, report))
+    from hybridlio.graph.gnc import reject_outliers, start_without_loops
+
+    start = start_without_loops(data) if initial == "auto" else None
+    start, rejected = reject_outliers(data, choose_start(data, initial) if start is None else start, report)
+    kept = data.without(rejected)
+    check_determined(kept)
+    return Solution(data, solve(kept, start, max_iterations, report), rejected)
 
 
 def choose_start(data: GraphData, initial: str) -> Array:

@@ -28,7 +28,7 @@ class Solution:
         error: the same at the answer; rejected factors do not count.
         iterations: Levenberg-Marquardt steps.
         converged: whether the error had stopped falling.
-        rejected: ids of the factors that the solver found to be wrong.
+        rejected: ids of the factors that ``gnc`` found to be wrong; empty for other solvers.
     """
 
     def __init__(self, data: GraphData, solved: Solved, rejected: frozenset[int] = frozenset()) -> None:
