@@ -60,6 +60,7 @@ _SPARSE = 8  # one in so many points is enough to tell a metre from another
 _COARSE_ITERATIONS = 6
 _COARSE_KERNEL_M = 0.5
 _SHARE_OF_SAME_MAP = 1e-3
+_YOUNG_MAP = 5.0  # a map of one keyframe has ground only along that scan's rings, and guesses what lies between
 _FLOOR_COVARIANCE = np.diag(FLOOR_SIGMAS**2)
 
 
@@ -104,7 +105,8 @@ class ScanMatching:
         map_changed, self._map_changed = self._map_changed, False
         if self._settings.target == "last-scan" or self._map.wants(found.pose):
             self._keep(points)
-        covariance = covariance_of(found.hessian, found.sigma_m, self._settings.covariance_scale)
+        scale = self._settings.covariance_scale * (1 + _YOUNG_MAP / self._map.keyframes)
+        covariance = covariance_of(found.hessian, found.sigma_m, scale)
         return RelativePose(
             se3.between(before, found.pose),
             covariance,
