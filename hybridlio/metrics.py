@@ -24,7 +24,6 @@ from hybridlio.consistency import (
 )
 from hybridlio.drift import KITTI_LENGTHS_M, Drift, DriftAverage, kitti_drift, lengths_for
 from hybridlio.errors import DataError
-from hybridlio.metrics_table import evaluation_table, figures
 from hybridlio.sensors import NS_PER_S
 from hybridlio.trajectory import Trajectory
 from hybridlio.trajectory_errors import MAX_DIFFERENCE_NS, Association, PoseErrors, align, associate, ate, rpe
@@ -46,8 +45,6 @@ __all__ = [
     "associated_step_errors",
     "ate",
     "evaluate",
-    "evaluation_table",
-    "figures",
     "kitti_drift",
     "lengths_for",
     "pose_consistency",

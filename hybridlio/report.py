@@ -15,7 +15,8 @@ from hybridlio import __version__
 from hybridlio.consistency import Anees
 from hybridlio.drift import Drift
 from hybridlio.files import write_whole
-from hybridlio.metrics import Evaluation, figures
+from hybridlio.metrics import Evaluation
+from hybridlio.metrics_table import figures
 from hybridlio.report_data import Findings, ReportData, find
 
 if TYPE_CHECKING:

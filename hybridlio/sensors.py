@@ -96,7 +96,8 @@ class ImuSamples:
         """Samples from ``start_ns`` to ``end_ns``, with linearly interpolated ones at both ends.
 
         An end outside the recording, or inside a gap of more than :data:`LONGEST_INTERPOLATION_NS`, is left out: the
-        result then starts or stops where the samples do. It is empty where ``end_ns`` lies before ``start_ns``. Takes logarithmic time in the recording's length.
+        result then starts or stops where the samples do. It is empty where ``end_ns`` lies before ``start_ns``. Takes
+        logarithmic time in the recording's length.
         """
         if end_ns < start_ns or not len(self):
             return ImuSamples.empty()

@@ -38,7 +38,7 @@ def evaluate(
 ) -> None:
     """Judge a trajectory: KITTI's drift, ATE, RPE and, for a run folder, whether its covariances are true."""
     from hybridlio.metrics import evaluate as judge
-    from hybridlio.metrics import evaluation_table
+    from hybridlio.metrics_table import evaluation_table
 
     true, estimated, steps = _load(estimate, reference)
     result = judge(true, estimated, lengths_m=_numbers(lengths), steps=steps)

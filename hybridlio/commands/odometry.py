@@ -84,7 +84,7 @@ def _finish(folder: Path, run: Run, config: Config, is_latest: bool) -> None:
 
 
 def _say_result(folder: Path, run: Run, findings: Findings) -> None:
-    from hybridlio.metrics import evaluation_table
+    from hybridlio.metrics_table import evaluation_table
     from hybridlio.run_folder import POSES, REPORT
     from hybridlio.run_outputs import forward_speed_length_m, ms_per_scan
 

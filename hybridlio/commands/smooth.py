@@ -28,7 +28,7 @@ def smooth(
     _verbose: Verbose = 0,
 ) -> None:
     """Optimise all poses of a finished run at once, and leave the better trajectory with a report of its own."""
-    from hybridlio.metrics import evaluation_table
+    from hybridlio.metrics_table import evaluation_table
     from hybridlio.record import Record
     from hybridlio.run_folder import POSES, RECORD, REPORT, SMOOTHED, is_run_folder, read_run
     from hybridlio.run_outputs import write_smoothed

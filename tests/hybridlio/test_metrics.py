@@ -6,7 +6,8 @@ from rich.console import Console
 
 from hybridlio import metrics, se3
 from hybridlio.errors import DataError
-from hybridlio.metrics import Evaluation, Steps, evaluate, evaluation_table
+from hybridlio.metrics import Evaluation, Steps, evaluate
+from hybridlio.metrics_table import evaluation_table
 from hybridlio.trajectory import Trajectory
 
 STEP_COVARIANCE = np.diag([1e-4, 1e-4, 4e-4, 1e-4, 1e-4, 4e-4])

@@ -8,7 +8,8 @@ import pytest
 
 from hybridlio import se3
 from hybridlio.errors import DataError
-from hybridlio.metrics import Steps, evaluate, figures
+from hybridlio.metrics import Steps, evaluate
+from hybridlio.metrics_table import figures
 from hybridlio.report import ReportData, find, pictures, save_pictures, write_report
 from hybridlio.trajectory import Trajectory
 
