@@ -45,6 +45,21 @@ def test_own_initial_pose_source_takes_the_place_of_a_built_in_one(folder):
     assert wheels_m < 0.1
 
 
+def test_a_pose_graph_by_hand_closes_its_loop_and_rejects_the_wrong_one(folder):
+    text = run_example("pose_graph_by_hand.py", folder)
+    alone_m, _, closed_m, sigma_m = metres(text)
+    assert closed_m < 3 * sigma_m < alone_m
+    assert "the wrong one: True" in text
+    assert (folder / "square.g2o").is_file()
+
+
+def test_a_g2o_file_is_solved_and_written_beside(folder):
+    text = run_example("solve_g2o.py", folder)
+    before, after = (float(number) for number in re.findall(r"error (\S+) -> (\S+)", text)[0])
+    assert after < before
+    assert (folder / "spiral-solved.g2o").is_file()
+
+
 def test_no_example_goes_untested():
     named = re.findall(r'run_example\("(\w+\.py)"', Path(__file__).read_text())
     assert sorted(set(named)) == sorted(path.name for path in (ROOT / "examples").glob("*.py"))

@@ -1,0 +1,142 @@
+"""Pose graphs against bare GTSAM calls, in one process: ``python benchmarks/pose_graphs.py FOLDER [NAME …]``.
+
+FOLDER holds g2o files. For each one GTSAM solves from the file's initial values and from its own best initialisation
+(chordal in space; LAGO in the plane, which takes diagonal noise only). Its best result is the one of smallest error, or
+the quicker of equal ones; ours is timed from the file as well: reading, initial values, solving. ``--outliers`` adds a
+tenth of wrong loop closures by seed and lets ``gnc`` find them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import gtsam
+import numpy as np
+
+from hybridlio.graph import PoseGraph
+from hybridlio.graph.coordinates import to_matrices
+from hybridlio.graph.edges import is_step
+
+_EQUAL = 1e-5  # relative; errors closer than this are the same answer
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One way to solve a file: its error, and seconds for reading, initial values and solving together and alone."""
+
+    name: str
+    error: float
+    total_s: float
+    solve_s: float
+
+
+def bare(path: Path, space: bool, start: str) -> Outcome:
+    begin = time.perf_counter()
+    graph, values = gtsam.readG2o(str(path), space)
+    read_s = time.perf_counter() - begin
+    first = min(values.keys())
+    prior = gtsam.PriorFactorPose3 if space else gtsam.PriorFactorPose2
+    pose = values.atPose3(first) if space else values.atPose2(first)
+    graph.add(prior(first, pose, gtsam.noiseModel.Isotropic.Sigma(6 if space else 3, 1e-6)))
+    begin = time.perf_counter()
+    if start == "own":
+        values = gtsam.InitializePose3.initialize(graph) if space else lago(graph)
+    values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    solve_s = time.perf_counter() - begin
+    return Outcome(f"gtsam, {start} start", graph.error(values), read_s + solve_s, solve_s)
+
+
+def lago(graph: gtsam.NonlinearFactorGraph) -> gtsam.Values:
+    diagonal = gtsam.NonlinearFactorGraph()
+    for k in range(graph.size()):
+        factor = graph.at(k)
+        keys = factor.keys()
+        if len(keys) == 2:
+            sigmas = 1 / np.sqrt(np.diag(factor.noiseModel().information()))
+            model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+            diagonal.add(gtsam.BetweenFactorPose2(keys[0], keys[1], factor.measured(), model))
+    first = gtsam.noiseModel.Diagonal.Sigmas(np.full(3, 1e-6))
+    diagonal.add(gtsam.PriorFactorPose2(min(graph.keyVector()), gtsam.Pose2(), first))
+    return gtsam.lago.initialize(diagonal)
+
+
+def ours(path: Path) -> Outcome:
+    begin = time.perf_counter()
+    graph = PoseGraph.load(path)
+    loaded = time.perf_counter()
+    solution = graph.optimize()
+    end = time.perf_counter()
+    return Outcome("ours", solution.error, end - begin, end - loaded)
+
+
+def quickest(outcomes: list[Outcome]) -> Outcome:
+    return min(outcomes, key=lambda outcome: outcome.total_s)
+
+
+def compare(path: Path, runs: int) -> None:
+    space = PoseGraph.load(path).dimension == 3
+    # in turn, so that what else the machine does meets all alike
+    rounds = [(bare(path, space, "given"), bare(path, space, "own"), ours(path)) for _ in range(runs)]
+    given, own, mine = (quickest(list(column)) for column in zip(*rounds, strict=True))
+    least = min(given.error, own.error)
+    best = quickest([outcome for outcome in (given, own) if outcome.error <= least * (1 + _EQUAL)])
+    ratio, ratio_solve = mine.total_s / best.total_s, mine.solve_s / best.solve_s
+    print(
+        f"{path.stem:16s} {given.error:12.6g} {own.error:12.6g} {mine.error:12.6g} "
+        f"{best.total_s:8.3f} {mine.total_s:8.3f} {ratio:6.2f} {ratio_solve:6.2f}",
+        flush=True,
+    )
+
+
+def with_wrong_loops(path: Path, seed: int) -> tuple[PoseGraph, set[int]]:
+    graph, rng = PoseGraph.load(path), np.random.default_rng(seed)
+    loops = [factor for factor in graph.factors.values() if not is_step(factor)]
+    wrong: set[int] = set()
+    while len(wrong) < round(0.1 * len(loops)):
+        i, j = (int(k) for k in rng.choice(len(graph), 2, replace=False))
+        claim = loops[rng.integers(len(loops))]
+        if abs(i - j) > 1:
+            pose = to_matrices(claim.measured[None])[0]
+            wrong.add(graph.add_between(i, j, pose, information=claim.noise.information))
+    return graph, wrong
+
+
+def outliers(path: Path, seed: int) -> None:
+    clean = PoseGraph.load(path).optimize().poses[:, :3, 3]
+    graph, wrong = with_wrong_loops(path, seed)
+    begin = time.perf_counter()
+    solution = graph.optimize("gnc")
+    spent_s = time.perf_counter() - begin
+    rmse = np.sqrt(((solution.poses[:, :3, 3] - clean) ** 2).sum(axis=1).mean())
+    spread = np.sqrt(((clean - clean.mean(axis=0)) ** 2).sum(axis=1).mean())
+    missed, lost = len(wrong - solution.rejected), len(solution.rejected - wrong)
+    print(
+        f"{path.stem:16s} {seed:5d} {len(wrong):6d} {missed:7d} {lost:6d} {100 * rmse / spread:12.5f} {spent_s:8.2f}",
+        flush=True,
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("names", nargs="*")
+    parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--outliers", action="store_true")
+    options = parser.parse_args()
+    paths = [options.folder / f"{name}.g2o" for name in options.names] or sorted(options.folder.glob("*.g2o"))
+    if options.outliers:
+        print(f"{'':16s} {'seed':>5s} {'wrong':>6s} {'missed':>7s} {'lost':>6s} {'RMSE, % of spread':>12s} {'s':>3s}")
+        for path in paths:
+            for seed in range(options.runs):
+                outliers(path, seed)
+        return
+    print(f"{'':16s} {'gtsam given':>12s} {'gtsam own':>12s} {'ours':>12s} {'gtsam s':>8s} {'ours s':>8s} ratio  solve")
+    for path in paths:
+        compare(path, options.runs)
+
+
+if __name__ == "__main__":
+    main()
