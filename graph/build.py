@@ -22,7 +22,15 @@ from hybridlio.sensors import NS_PER_S, ImuNoise
 from hybridlio.startup import GRAVITY_M_S2
 
 FIXED_SIGMA = 1e-6  # rad, m: held as tightly as double precision solves well
+_X0 = X(0)
 _GRAVITY = np.array([0.0, 0.0, -GRAVITY_M_S2])
+_PLANAR_SIGMAS = np.array(co.GTSAM_ORDER[2])
+_PLANAR_MATRIX = np.arange(9).reshape(3, 3)[np.ix_(_PLANAR_SIGMAS, _PLANAR_SIGMAS)].ravel()
+_GAUSSIAN: dict[str, Callable[[Array], gtsam.noiseModel.Base]] = {
+    "sigmas": gtsam.noiseModel.Diagonal.Sigmas,
+    "information": gtsam.noiseModel.Gaussian.Information,
+    "covariance": gtsam.noiseModel.Gaussian.Covariance,
+}
 _ROBUST = {
     "huber": gtsam.noiseModel.mEstimator.Huber,
     "cauchy": gtsam.noiseModel.mEstimator.Cauchy,
@@ -61,10 +69,10 @@ class Builder:
         graph = gtsam.NonlinearFactorGraph()
         for kind, run in groupby(self.data.factors.values(), key=lambda factor: factor.kind):
             factors = list(run)
-            make = getattr(self, f"_{kind}")
-            for factor, measured in zip(factors, self._measured(factors), strict=True):
-                keys = [self.index[key] for key in factor.keys]
-                graph.add(make(factor, keys, measured, self._model(factor, robust)))
+            make, index = getattr(self, f"_{kind}"), self.index
+            models = self._noise_models(factors, robust)
+            for factor, measured, model in zip(factors, self._measured(factors), models, strict=True):
+                graph.add(make(factor, [index[key] for key in factor.keys], measured, model))
         self._add_fixed(graph, fixed_at)
         self._add_bias_starts(graph)
         return graph
@@ -73,7 +81,7 @@ class Builder:
         """Poses at their coordinates, velocities and biases where some factor has them."""
         values = gtsam.Values()
         for k, pose in enumerate(co.gtsam_poses(poses)):
-            values.insert(X(k), pose)
+            values.insert(_X0 + k, pose)
         for k, velocity in _velocities(self.data, self.index, poses).items():
             values.insert(V(k), velocity)
         for k in self.with_bias():
@@ -89,18 +97,24 @@ class Builder:
         measured = [factor.measured for factor in factors]
         return co.gtsam_poses(np.array(measured)) if factors[0].kind in ("between", "prior") else measured
 
-    def _model(self, factor: Factor, robust: bool) -> gtsam.noiseModel.Base | None:
-        if factor.noise is None:
-            return None
-        kernel = factor.robust if robust else None
-        key = (factor.noise.form, factor.noise.values.tobytes(), kernel)
-        if key not in self._models:
-            self._models[key] = noise_model(factor.noise, kernel, self.data.dimension)
-        return self._models[key]
+    def _noise_models(self, factors: list[Factor], robust: bool) -> list[gtsam.noiseModel.Base | None]:
+        """One for each factor; equal noise shares one."""
+        found: list[gtsam.noiseModel.Base | None] = []
+        known = self._models
+        for factor in factors:
+            noise, kernel = factor.noise, factor.robust if robust else None
+            if noise is None:
+                found.append(None)
+                continue
+            key = (noise.form, noise.values.tobytes(), kernel)
+            if key not in known:
+                known[key] = noise_model(noise, kernel, self.data.dimension)
+            found.append(known[key])
+        return found
 
     def _between(self, _: Factor, keys: list[int], T: Any, model: Any) -> Any:
         make = gtsam.BetweenFactorPose3 if self.data.dimension == 3 else gtsam.BetweenFactorPose2
-        return make(X(keys[0]), X(keys[1]), T, model)
+        return make(_X0 + keys[0], _X0 + keys[1], T, model)
 
     def _prior(self, _: Factor, keys: list[int], T: Any, model: Any) -> Any:
         make = gtsam.PriorFactorPose3 if self.data.dimension == 3 else gtsam.PriorFactorPose2
@@ -143,16 +157,10 @@ class Builder:
 
 def noise_model(noise: Noise, kernel: Robust | None, dimension: int) -> gtsam.noiseModel.Base:
     """GTSAM's noise model, in the order of its tangent vectors."""
-    make: dict[str, Callable[[Array], gtsam.noiseModel.Base]] = {
-        "sigmas": gtsam.noiseModel.Diagonal.Sigmas,
-        "information": gtsam.noiseModel.Gaussian.Information,
-        "covariance": gtsam.noiseModel.Gaussian.Covariance,
-    }
     values = noise.values
     if dimension == 2:
-        order = co.GTSAM_ORDER[2]
-        values = values[order] if noise.form == "sigmas" else values[order][:, order]
-    model = make[noise.form](values)
+        values = values[_PLANAR_SIGMAS] if noise.form == "sigmas" else values.ravel()[_PLANAR_MATRIX].reshape(3, 3)
+    model = _GAUSSIAN[noise.form](values)
     if kernel is None:
         return model
     width = kernel.width**2 if kernel.kernel == "dcs" else kernel.width

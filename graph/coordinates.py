@@ -69,13 +69,6 @@ def gtsam_poses(coordinates: Array) -> list[Any]:
     return [gtsam.Pose2(x, y, theta) for x, y, theta in coordinates.tolist()]
 
 
-def from_gtsam(poses: list[Any], dimension: Dimension) -> Array:
-    """Coordinates ``(N, 7)`` or ``(N, 3)`` of GTSAM's poses."""
-    if dimension == 2:
-        return np.array([[pose.x(), pose.y(), pose.theta()] for pose in poses])
-    return from_matrices(np.array([pose.matrix() for pose in poses]), dimension)
-
-
 def from_matrices(T: Array, dimension: Dimension) -> Array:
     """Coordinates ``(N, 7)`` or ``(N, 3)`` of poses ``(N, 4, 4)`` that are known to be such."""
     if dimension == 2:

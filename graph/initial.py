@@ -56,7 +56,7 @@ def find_roots(data: GraphData) -> dict[int, Array]:
     parts = groups(data, ("between",))
     roots = {}
     for part in parts:
-        key = min(part, key=lambda key: (key not in data.fixed, key not in priors, data.initial(key) is None))
+        key = min(part, key=lambda key: (key not in data.fixed, key not in priors, data.coordinates(key) is None))
         initial = data.initial(key)
         if key in priors and key not in data.fixed:
             initial = co.to_matrices(priors[key][None])[0]
@@ -107,7 +107,7 @@ def _align_to_gps(data: GraphData, T: Array) -> None:
     for part in groups(data, ("between",)):
         inside = set(part)
         here = [factor for factor in fixes if factor.keys[0] in inside]
-        if inside & placed or len(here) < _FIXES_TO_ALIGN or any(data.initial(key) is not None for key in part):
+        if inside & placed or len(here) < _FIXES_TO_ALIGN or any(data.coordinates(key) is not None for key in part):
             continue
         poses = T[[index[factor.keys[0]] for factor in here]]
         measured = np.array([factor.measured for factor in here])

@@ -15,7 +15,7 @@ Key: TypeAlias = "int | tuple[int, int]"
 _INDEX_BITS = 56
 _FIRST_LETTER = ord("a")
 _LAST_ROBOT = 127 - _FIRST_LETTER  # the top byte stays within a signed 64-bit integer
-_LARGEST_INTEGER = (_FIRST_LETTER << _INDEX_BITS) - 1
+PLAIN_KEYS = _FIRST_LETTER << _INDEX_BITS  # integers below it are keys by themselves
 
 
 def check_key(key: object) -> Key:
@@ -30,8 +30,8 @@ def check_key(key: object) -> Key:
             raise GraphError(f"key {key!r}: a robot is at most {_LAST_ROBOT}, an index below 2**{_INDEX_BITS}")
         return robot, index
     number = _integer(key, key)
-    if number > _LARGEST_INTEGER:
-        raise GraphError(f"key {key!r}: an integer key is at most {_LARGEST_INTEGER}")
+    if number >= PLAIN_KEYS:
+        raise GraphError(f"key {key!r}: an integer key is below {PLAIN_KEYS}")
     return number
 
 

@@ -1,17 +1,18 @@
-"""Levenberg-Marquardt on a pose graph, with the linear solver that its shape asks for."""
+"""Gauss-Newton and Levenberg-Marquardt on a pose graph, with the linear solver that its shape asks for."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, X
+from gtsam.symbol_shorthand import B
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from hybridlio import se3
 from hybridlio.errors import GraphError
 from hybridlio.estimates import Array
 from hybridlio.graph import coordinates as co
@@ -24,6 +25,7 @@ Progress: TypeAlias = Callable[[str, int, float], None]
 # half a metre at 5,000. QR does not, and on a chain it costs little; on a dense graph it costs several times more.
 _LONGEST_FOR_CHOLESKY = 1000
 _RELATIVE_TOLERANCE = 1e-6
+_ABSOLUTE_TOLERANCE = 1e-9
 _INERTIAL_ROUNDS = 2  # samples are summed up again around the biases that the first round found
 
 
@@ -36,7 +38,8 @@ class Solved:
         values: GTSAM's values at the answer.
         poses: ``(N, 7)`` or ``(N, 3)`` coordinates at the answer.
         error_before: half the sum of squared, whitened residuals at the start, by the kernels where there are any.
-        iterations: Levenberg-Marquardt steps.
+        error: the same at the answer.
+        iterations: steps of either.
         converged: whether the error had stopped falling.
         orthogonal: whether QR was used.
     """
@@ -46,6 +49,7 @@ class Solved:
     values: gtsam.Values
     poses: Array
     error_before: float
+    error: float
     iterations: int
     converged: bool
     orthogonal: bool
@@ -61,24 +65,24 @@ def solve(data: GraphData, start: Array, max_iterations: int, report: Progress) 
     orthogonal = needs_orthogonal(data)
     graph = builder.graph(start)
     values = builder.values(start)
-    error_before, iterations, converged = float(graph.error(values)), 0, False
+    errors: list[float] = []
+    iterations, converged = 0, False
     inertial = builder.with_bias()
     for number in range(_INERTIAL_ROUNDS if inertial else 1):
         if number:
             builder = Builder(data, _biases(values, inertial, len(data)))
             graph = builder.graph(start)
-        optimiser = _optimiser(graph, values, orthogonal, max_iterations, report)
-        values = _run(optimiser)
-        iterations += int(optimiser.iterations())
-        converged = optimiser.iterations() < max_iterations
-    poses = poses_of(values, data)
-    return Solved(data, graph, values, poses, error_before, iterations, converged, orthogonal)
+        errors.append(float(graph.error(values)))
+        values, done, converged = _descend(graph, values, orthogonal, max_iterations, report)
+        iterations += done
+    poses, error = poses_of(values, data), float(graph.error(values))
+    return Solved(data, graph, values, poses, errors[0], error, iterations, converged, orthogonal)
 
 
 def parameters(orthogonal: bool) -> gtsam.LevenbergMarquardtParams:
-    """As used everywhere here."""
+    """Of Levenberg-Marquardt, as used everywhere here."""
     params = gtsam.LevenbergMarquardtParams()
-    params.setLinearSolverType("MULTIFRONTAL_QR" if orthogonal else "MULTIFRONTAL_CHOLESKY")
+    params.setLinearSolverType(_linear_solver(orthogonal))
     params.setRelativeErrorTol(_RELATIVE_TOLERANCE)
     return params
 
@@ -102,8 +106,10 @@ def needs_orthogonal(data: GraphData) -> bool:
 
 def poses_of(values: gtsam.Values, data: GraphData) -> Array:
     """Coordinates ``(N, 7)`` or ``(N, 3)`` of all poses."""
-    read: Callable[[int], Any] = values.atPose3 if data.dimension == 3 else values.atPose2
-    return co.from_gtsam([read(X(k)) for k in range(len(data))], data.dimension)
+    if data.dimension == 2:
+        return np.array(gtsam.utilities.extractPose2(values)).reshape(-1, 3)
+    rows = np.array(gtsam.utilities.extractPose3(values)).reshape(-1, 12)  # rotation by rows, then position
+    return co.from_matrices(se3.make(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:]), 3)
 
 
 def _biases(values: gtsam.Values, places: list[int], count: int) -> Array:
@@ -113,17 +119,46 @@ def _biases(values: gtsam.Values, places: list[int], count: int) -> Array:
     return biases
 
 
-def _optimiser(
+def _descend(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, orthogonal: bool, max_iterations: int, report: Progress
-) -> gtsam.LevenbergMarquardtOptimizer:
+) -> tuple[gtsam.Values, int, bool]:
+    """Gauss-Newton as long as the error falls, Levenberg-Marquardt from there: values, iterations, converged."""
+    params = gtsam.GaussNewtonParams()
+    params.setLinearSolverType(_linear_solver(orthogonal))
+    optimiser = gtsam.GaussNewtonOptimizer(graph, values, params)
+    before = float(optimiser.error())
+    for done in range(1, max_iterations + 1):
+        values = gtsam.Values(optimiser.values())  # a copy: the next iteration frees what it returned
+        try:
+            optimiser.iterate()
+        except RuntimeError:  # damping may solve what is indeterminate here
+            return _damped(graph, values, orthogonal, max_iterations, done - 1, report)
+        after = float(optimiser.error())
+        if not after <= before:
+            return _damped(graph, values, orthogonal, max_iterations, done - 1, report)
+        report("optimising", done, after)
+        if before - after <= max(_RELATIVE_TOLERANCE * before, _ABSOLUTE_TOLERANCE):
+            return gtsam.Values(optimiser.values()), done, True
+        before = after
+    return gtsam.Values(optimiser.values()), max_iterations, False
+
+
+def _damped(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, orthogonal: bool, max_iterations: int, done: int,
+    report: Progress,
+) -> tuple[gtsam.Values, int, bool]:  # fmt: skip
+    """Levenberg-Marquardt after ``done`` iterations."""
     params = parameters(orthogonal)
-    params.setMaxIterations(max_iterations)
-    params.iterationHook = lambda iteration, _before, after: report("optimising", int(iteration), float(after))
-    return gtsam.LevenbergMarquardtOptimizer(graph, values, params)
-
-
-def _run(optimiser: gtsam.LevenbergMarquardtOptimizer) -> gtsam.Values:
+    params.setMaxIterations(max_iterations - done)
+    params.iterationHook = lambda number, _before, after: report("optimising", done + int(number), float(after))
+    optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
     try:
-        return optimiser.optimize()
+        values = optimiser.optimize()
     except RuntimeError as error:
         raise GraphError(f"the graph cannot be solved: {' '.join(str(error).split())}") from error
+    total = done + int(optimiser.iterations())
+    return values, total, total < max_iterations
+
+
+def _linear_solver(orthogonal: bool) -> str:
+    return "MULTIFRONTAL_QR" if orthogonal else "MULTIFRONTAL_CHOLESKY"

@@ -21,6 +21,7 @@ from hybridlio.graph.solution import Solution
 
 Solver: TypeAlias = Literal["auto", "batch", "gnc"]
 SOLVERS = ("auto", "batch", "gnc")
+_FITS = 2.0  # times the degrees of freedom
 
 
 def optimise(graph: GraphData, solver: str, initial: str, max_iterations: int, progress: Progress | None) -> Solution:
@@ -48,6 +49,7 @@ def choose_start(data: GraphData, initial: str) -> Array:
     """Where to start from: ``given`` initial values, or the best of several.
 
     These are the given values, chordal ones, and chordal ones without the factors that have a robust kernel.
+    Given values that fit about as well as they ever can are taken as they are.
 
     Raises:
         GraphError: values are missing and cannot be found.
@@ -57,6 +59,8 @@ def choose_start(data: GraphData, initial: str) -> Array:
         if start is None:
             missing = [key for key in data.keys if data.initial(key) is None]
             raise GraphError(f"pose {named(missing)} has no initial value; give one, or choose initial='auto'")
+        return start
+    if start is not None and misfit(data, start) <= _FITS * freedom(data):
         return start
     kernels = {number for number, f in data.factors.items() if f.kind == "between" and f.robust is not None}
     sure = [data.without(kernels)] if kernels else []
@@ -68,6 +72,12 @@ def choose_start(data: GraphData, initial: str) -> Array:
             if start is None:
                 raise
     return starts[0] if len(starts) == 1 else min(starts, key=lambda poses: misfit(data, poses))
+
+
+def freedom(data: GraphData) -> int:
+    """Measured numbers about poses less those to be found: what the misfit is when all is as it should be."""
+    sizes = [len(f.noise.values) for f in data.factors.values() if f.noise and f.kind in ("between", "prior", "gps")]
+    return max(sum(sizes) - co.TANGENT_SIZE[data.dimension] * len(data), 1)
 
 
 def misfit(data: GraphData, coordinates: Array) -> float:

@@ -176,12 +176,12 @@ class PoseGraph(GraphData):
         """Find the poses, velocities and biases that fit all factors best.
 
         Args:
-            solver: ``batch`` is Levenberg-Marquardt; ``gnc`` finds and rejects wrong loop closures (graduated
-                non-convexity, Yang et al., RA-L 2020) and takes factors between consecutive keys for right; ``auto``
-                is ``batch``.
+            solver: ``batch`` is Gauss-Newton, damped where the error would rise; ``gnc`` finds and rejects wrong loop
+                closures (graduated non-convexity, Yang et al., RA-L 2020) and takes factors between consecutive keys
+                for right; ``auto`` is ``batch``.
             initial: ``auto`` starts from the given initial values or from chordal ones, whichever fit better; from
                 ``given`` ones where it says so.
-            max_iterations: of Levenberg-Marquardt.
+            max_iterations: of Gauss-Newton and Levenberg-Marquardt together.
             progress: called with the stage, the iteration and the error there.
 
         Raises:

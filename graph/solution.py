@@ -26,14 +26,14 @@ class Solution:
     Attributes:
         error_before: half the sum of squared, whitened residuals at the start (robust ones by their kernel).
         error: the same at the answer; rejected factors do not count.
-        iterations: Levenberg-Marquardt steps.
+        iterations: Gauss-Newton and Levenberg-Marquardt steps.
         converged: whether the error had stopped falling.
         rejected: ids of the factors that ``gnc`` found to be wrong; empty for other solvers.
     """
 
     def __init__(self, data: GraphData, solved: Solved, rejected: frozenset[int] = frozenset()) -> None:
         self.error_before = solved.error_before
-        self.error = float(solved.graph.error(solved.values))
+        self.error = solved.error
         self.iterations = solved.iterations
         self.converged = solved.converged
         self.rejected = rejected

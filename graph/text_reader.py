@@ -15,7 +15,7 @@ from hybridlio.errors import DataError, GraphError, HybridLioError
 from hybridlio.estimates import Array
 from hybridlio.graph import coordinates as co
 from hybridlio.graph.g2o import BY_ROWS, OTHER, ROWS, Row
-from hybridlio.graph.keys import Key, from_integer, to_integer
+from hybridlio.graph.keys import PLAIN_KEYS, Key, from_integer, to_integer
 from hybridlio.graph.measurements import Factor, Kind, Noise, Robust, make_robust
 from hybridlio.graph.pose_graph import PoseGraph
 
@@ -106,7 +106,7 @@ def _kernel(path: Path, number: int, words: list[str]) -> Robust | None:
 
 
 def _checked_ids(path: Path, number: int, words: list[str]) -> list[str]:
-    if not all(word.isdecimal() for word in words):
+    if not "".join(words).isdecimal() or "" in words:
         raise DataError(f"{path}, row {number}: a pose's number is missing or no number: {' '.join(words)}")
     return words
 
@@ -123,11 +123,15 @@ def _check_offset(path: Path, number: int, words: list[str]) -> None:
 def _numbers(path: Path, tag: str, table: _Table) -> tuple[list[list[Key]], Array]:
     """Keys and the numbers ``(M, length)`` after them."""
     row = ROWS[tag]
-    keys = []
+    count = 2 if row.what == "edge" else 1
+    keys: list[list[Key]] = []
     for number, words in zip(table.lines, table.words, strict=True):
-        ids = [int(word) for word in _checked_ids(path, number, words[: row.ids])]
+        ids = list(map(int, _checked_ids(path, number, words[: row.ids])[:count]))
+        if max(ids) < PLAIN_KEYS:
+            keys.append([*ids])
+            continue
         try:
-            keys.append([from_integer(value) for value in ids[: 2 if row.what == "edge" else 1]])
+            keys.append([from_integer(value) for value in ids])
         except GraphError as error:
             raise DataError(f"{path}, row {number}: {error}") from error
     values = _to_float(path, table.lines, [words[row.ids :] for words in table.words])
