@@ -120,13 +120,7 @@ class Preintegration:
         if not covers(frame.imu, state.stamp_ns, frame.scan.stamp_ns):
             return self._coast(frame, state)
         step, covariance = predict_step(preintegrate(frame.imu, state, self._noise), state)
-        T_lidar_imu = se3.inverse(self._T_imu_lidar)
-        return RelativePose(
-            T_lidar_imu @ step @ self._T_imu_lidar,
-            se3.rotate_covariance(covariance, T_lidar_imu),
-            source=self.name,
-            from_imu=True,
-        )
+        return self._between_lidars(step, covariance, from_imu=True)
 
     def _coast(self, frame: Frame, state: State) -> RelativePose:
         """Straight on at the state's velocity, as unsure as a vehicle is free to accelerate and turn."""
@@ -134,13 +128,14 @@ class Preintegration:
         step = se3.make(np.eye(3), state.T_world_imu[:3, :3].T @ state.velocity_m_s * dt_s)
         sigmas = np.r_[np.full(3, _LARGEST_RATE_RAD_S * dt_s), np.full(3, _LARGEST_ACCELERATION_M_S2 * dt_s**2 / 2)]
         covariance = np.diag(sigmas**2) + np.pad(state.covariance[6:9, 6:9] * dt_s**2, (3, 0))
+        return self._between_lidars(step, covariance, ok=False)
+
+    def _between_lidars(self, step: Array, covariance: Array, ok: bool = True, from_imu: bool = False) -> RelativePose:
+        """A step of the IMU as one of the lidar."""
         T_lidar_imu = se3.inverse(self._T_imu_lidar)
-        return RelativePose(
-            T_lidar_imu @ step @ self._T_imu_lidar,
-            se3.rotate_covariance(covariance, T_lidar_imu),
-            source=self.name,
-            ok=False,
-        )
+        pose = T_lidar_imu @ step @ self._T_imu_lidar
+        covariance = se3.rotate_covariance(covariance, T_lidar_imu)
+        return RelativePose(pose, covariance, source=self.name, ok=ok, from_imu=from_imu)
 
     def correct(self, frame: Frame, estimate: RelativePose) -> None:
         """Nothing to learn: the graph's state carries it."""
