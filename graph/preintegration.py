@@ -125,9 +125,11 @@ class Preintegration:
     def _coast(self, frame: Frame, state: State) -> RelativePose:
         """Straight on at the state's velocity, as unsure as a vehicle is free to accelerate and turn."""
         dt_s = (frame.scan.stamp_ns - state.stamp_ns) / NS_PER_S
-        step = se3.make(np.eye(3), state.T_world_imu[:3, :3].T @ state.velocity_m_s * dt_s)
+        R_imu_world = state.T_world_imu[:3, :3].T
+        step = se3.make(np.eye(3), R_imu_world @ state.velocity_m_s * dt_s)
+        by_velocity = R_imu_world @ state.covariance[6:9, 6:9] @ R_imu_world.T * dt_s**2
         sigmas = np.r_[np.full(3, _LARGEST_RATE_RAD_S * dt_s), np.full(3, _LARGEST_ACCELERATION_M_S2 * dt_s**2 / 2)]
-        covariance = np.diag(sigmas**2) + np.pad(state.covariance[6:9, 6:9] * dt_s**2, (3, 0))
+        covariance = np.diag(sigmas**2) + np.pad(by_velocity, (3, 0))
         return self._between_lidars(step, covariance, ok=False)
 
     def _between_lidars(self, step: Array, covariance: Array, ok: bool = True, from_imu: bool = False) -> RelativePose:
