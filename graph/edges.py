@@ -58,12 +58,16 @@ def edges_of(data: GraphData) -> Edges:
     """All between-factors of a graph, in its order."""
     factors = [factor for factor in data.factors.values() if factor.kind == "between"]
     index = {key: k for k, key in enumerate(data.keys)}
-    ends = np.array([[index[key] for key in factor.keys] for factor in factors], dtype=np.int64).reshape(-1, 2)
+    ends = np.array([(index[f.keys[0]], index[f.keys[1]]) for f in factors], dtype=np.int64).reshape(-1, 2)
     measured = np.array([factor.measured for factor in factors]).reshape(-1, len(co.IDENTITY[data.dimension]))
     size = co.TANGENT_SIZE[data.dimension]
     information = np.array([factor.noise.information for factor in factors if factor.noise is not None])
-    steps = np.array([is_step(factor) for factor in factors], dtype=bool)
-    return Edges(ends[:, 0], ends[:, 1], co.to_matrices(measured), information.reshape(-1, size, size), steps)
+    i, j = ends[:, 0], ends[:, 1]
+    robots, numbers = (
+        np.array([(-1, k) if isinstance(k, int) else k for k in data.keys], dtype=np.int64).reshape(-1, 2).T
+    )
+    steps = (robots[i] == robots[j]) & (np.abs(numbers[i] - numbers[j]) == 1)
+    return Edges(i, j, co.to_matrices(measured), information.reshape(-1, size, size), steps)
 
 
 def is_step(factor: Factor) -> bool:

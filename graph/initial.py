@@ -22,8 +22,8 @@ METHODS = ("odometry", "spanning-tree", "chordal")
 _FIXES_TO_ALIGN = 3
 
 
-def find(data: GraphData, method: str) -> Array:
-    """Coordinates ``(N, 7)`` or ``(N, 3)`` of all poses, in the graph's order.
+def find(data: GraphData, method: str, edges: Edges | None = None) -> Array:
+    """Coordinates ``(N, 7)`` or ``(N, 3)`` of all poses, in the graph's order; ``edges`` if they are known.
 
     Raises:
         ConfigError: unknown method.
@@ -31,7 +31,7 @@ def find(data: GraphData, method: str) -> Array:
     """
     if method not in METHODS:
         raise ConfigError(f"no way to initialise is called {method!r}; there are {', '.join(METHODS)}")
-    edges, roots = edges_of(data), find_roots(data)
+    edges, roots = edges or edges_of(data), find_roots(data)
     if method == "chordal":
         T = chordal(roots, len(data), edges)
     elif method == "spanning-tree":

@@ -11,7 +11,7 @@ from hybridlio.errors import ConfigError, GraphError
 from hybridlio.estimates import Array
 from hybridlio.graph import coordinates as co
 from hybridlio.graph.checks import check_determined, groups
-from hybridlio.graph.edges import edges_of
+from hybridlio.graph.edges import Edges, edges_of
 from hybridlio.graph.graph_data import GraphData
 from hybridlio.graph.initial import find
 from hybridlio.graph.keys import named
@@ -60,18 +60,19 @@ def choose_start(data: GraphData, initial: str) -> Array:
             missing = [key for key in data.keys if data.initial(key) is None]
             raise GraphError(f"pose {named(missing)} has no initial value; give one, or choose initial='auto'")
         return start
-    if start is not None and misfit(data, start) <= _FITS * freedom(data):
+    edges = edges_of(data)
+    if start is not None and misfit(data, start, edges) <= _FITS * freedom(data):
         return start
     kernels = {number for number, f in data.factors.items() if f.kind == "between" and f.robust is not None}
     sure = [data.without(kernels)] if kernels else []
     starts = [] if start is None else [start]
     for part in [data, *(part for part in sure if len(groups(part, ("between",))) == len(groups(data, ("between",))))]:
         try:
-            starts.append(find(part, "chordal"))
+            starts.append(find(part, "chordal", edges if part is data else None))
         except GraphError:  # parts that inertial factors or given values place
             if start is None:
                 raise
-    return starts[0] if len(starts) == 1 else min(starts, key=lambda poses: misfit(data, poses))
+    return starts[0] if len(starts) == 1 else min(starts, key=lambda poses: misfit(data, poses, edges))
 
 
 def freedom(data: GraphData) -> int:
@@ -80,10 +81,10 @@ def freedom(data: GraphData) -> int:
     return max(sum(sizes) - co.TANGENT_SIZE[data.dimension] * len(data), 1)
 
 
-def misfit(data: GraphData, coordinates: Array) -> float:
+def misfit(data: GraphData, coordinates: Array, edges: Edges) -> float:
     """Twice the error of between-factors, priors and GPS: enough to tell a good start from a bad one."""
     poses = co.to_matrices(coordinates)
-    chi2 = edges_of(data).chi2(poses).tolist()
+    chi2 = edges.chi2(poses).tolist()
     between = [factor for factor in data.factors.values() if factor.kind == "between"]
     total = sum(f.robust.loss(x) if f.robust else x for f, x in zip(between, chi2, strict=True))
     index = {key: k for k, key in enumerate(data.keys)}
