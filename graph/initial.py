@@ -43,9 +43,9 @@ def find(data: GraphData, method: str, edges: Edges | None = None) -> Array:
 
 
 def find_roots(data: GraphData) -> dict[int, Array]:
-    """For each group of poses joined by between-factors one that the others follow, and its pose ``(4, 4)``.
+    """For each group of poses joined by between-factors those that the others follow, and their poses ``(4, 4)``.
 
-    A fixed pose first, then one with a prior, then one with an initial value.
+    All fixed poses; in a group without one, a pose with a prior, or else with an initial value, or else the first.
 
     Raises:
         GraphError: there are several groups and nothing says where one of them lies; a fixed pose lies nowhere.
@@ -54,13 +54,19 @@ def find_roots(data: GraphData) -> dict[int, Array]:
     priors = {f.keys[0]: f.measured for f in data.factors.values() if f.kind == "prior"}
     fixes = _gps_keys(data)
     parts = groups(data, ("between",))
-    roots = {}
+    roots: dict[int, Array] = {}
+    for key in data.fixed:
+        if (initial := data.initial(key)) is None:
+            raise GraphError(f"pose {key} is fixed but has no initial value; give one")
+        roots[index[key]] = initial
     for part in parts:
-        key = min(part, key=lambda key: (key not in data.fixed, key not in priors, data.coordinates(key) is None))
+        if not data.fixed.isdisjoint(part):
+            continue
+        key = min(part, key=lambda key: (key not in priors, data.coordinates(key) is None))
         initial = data.initial(key)
-        if key in priors and key not in data.fixed:
+        if key in priors:
             initial = co.to_matrices(priors[key][None])[0]
-        if initial is None and (key in data.fixed or (len(parts) > 1 and len(fixes & set(part)) < _FIXES_TO_ALIGN)):
+        if initial is None and len(parts) > 1 and len(fixes & set(part)) < _FIXES_TO_ALIGN:
             raise GraphError(f"nothing says where pose {named(part)} may lie; give an initial value")
         roots[index[key]] = np.eye(4) if initial is None else initial
     return roots

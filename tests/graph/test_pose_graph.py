@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from hybridlio import se3
+from hybridlio.errors import GraphError
 from hybridlio.graph import PoseGraph
 from hybridlio.graph.measurements import Robust
 
@@ -254,15 +255,40 @@ def test_a_solution_starts_the_next_one(rng):
     assert again.error_before == pytest.approx(solution.error, rel=1e-9)
 
 
-@pytest.mark.parametrize("solver", ["batch", "gnc"])
-def test_a_straight_chain_of_5000_poses_solves_in_every_solver(rng, solver):
+def test_fixed_poses_stay_where_they_are_and_the_rest_lies_between():
     graph = PoseGraph()
+    for key, x in ((0, 0.0), (4, 4.4)):
+        graph.add_pose(key, se3.make(np.eye(3), [x, 0, 0]))
+        graph.fix(key)
+    for k in range(4):
+        graph.add_between(k, k + 1, se3.make(np.eye(3), [1.0, 0, 0]), sigmas=0.1)
+    for solver in ("batch", "gnc"):
+        np.testing.assert_allclose(graph.optimize(solver).poses[[0, 1, 2, 3, 4], 0, 3].sum(), 11.0, atol=1e-4)
+        np.testing.assert_allclose(graph.optimize(solver).pose(4)[:3, 3], [4.4, 0, 0], atol=1e-6)
+    graph.unfix(4)
+    np.testing.assert_allclose(graph.optimize().pose(4)[:3, 3], [4.0, 0, 0], atol=1e-6)
+
+
+def test_a_fixed_pose_without_a_place_is_refused():
+    graph = PoseGraph()
+    graph.add_pose(3)
+    graph.fix(3)
+    with pytest.raises(GraphError, match="pose 3 is fixed but has no initial value"):
+        graph.optimize()
+
+
+@pytest.mark.parametrize(("solver", "dimension"), [("batch", 3), ("gnc", 3), ("batch", 2)])
+def test_a_straight_chain_of_5000_poses_solves_in_every_solver(rng, solver, dimension):
+    graph, used = PoseGraph(dimension), slice(0, 6) if dimension == 3 else slice(2, 5)
     graph.add_prior(0, np.eye(4), sigmas=1e-6)
     step = se3.make(np.eye(3), [1.0, 0, 0])
     for k in range(4999):
-        graph.add_between(k, k + 1, step, sigmas=[1e-4] * 3 + [1e-3] * 3)
-        graph.set_initial(k + 1, se3.make(np.eye(3), [k + 1.0, 0, 0]) @ se3.exp(0.01 * rng.normal(size=6)))
+        graph.add_between(k, k + 1, step, sigmas=([1e-4] * 3 + [1e-3] * 3)[used])
+        off = np.zeros(6)
+        off[used] = 0.01 * rng.normal(size=6)[used]
+        graph.set_initial(k + 1, se3.make(np.eye(3), [k + 1.0, 0, 0]) @ se3.exp(off))
     solution = graph.optimize(solver, initial="given")
     np.testing.assert_allclose(solution.pose(4999)[:3, 3], [4999, 0, 0], atol=1e-3)
     # the heading walks randomly, so the far end's side is off by σ √(n³/3)
-    assert np.sqrt(solution.covariance(4999)[4, 4]) == pytest.approx(1e-4 * np.sqrt(4999**3 / 3), rel=0.01)
+    side = solution.covariance(4999)[4, 4] if dimension == 3 else solution.covariance(4999)[2, 2]
+    assert np.sqrt(side) == pytest.approx(1e-4 * np.sqrt(4999**3 / 3), rel=0.01)
