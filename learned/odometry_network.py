@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from hybridlio.errors import ConfigError
 from hybridlio.learned import maps, se3
 from hybridlio.learned.imu_network import ImuNetwork
+from hybridlio.learned.projective import ProjectiveStep
 from hybridlio.learned.residual_network import ResidualNetwork
 from hybridlio.learned.settings import NetworkSettings
 
@@ -72,6 +73,7 @@ class OdometryNetwork(nn.Module):
         self.settings = settings
         self.mixed_precision = False
         self.imu_network = ImuNetwork(settings) if settings.imu in ("initial-pose", "feature") else None
+        self.projective = ProjectiveStep(settings) if settings.projective else None
         self.residual_network = ResidualNetwork(settings)
 
     def forward(self, given: NetworkInput) -> NetworkOutput:
@@ -98,6 +100,9 @@ class OdometryNetwork(nn.Module):
         pose, poses = initial, []
         for _ in range(self.settings.iterations):
             moved = maps.remap(given.current, normals, pose, geometry)
+            if self.projective is not None:
+                pose = self.projective(last, moved) @ pose
+                moved = maps.remap(given.current, normals, pose, geometry)
             with torch.autocast(given.last.device.type, torch.bfloat16, enabled=self.mixed_precision):
                 residual = self.residual_network(last, moved, features)
             pose = residual.float() @ pose

@@ -16,15 +16,19 @@ from hybridlio.learned.imu_network import rotation_matrix
 from hybridlio.learned.settings import NetworkSettings
 
 _GROUP = 8  # channels that are normalised together
+_MORE_CHANNELS = {"none": 0, "distance": 1, "gradient": 7}
+_DISTANCE_M = 0.1  # what is left after an initial pose, so that networks see numbers around 1
+_LEVER_M = 10.0  # makes gradients by rotation as large as those by translation
 
 
 class CircularConv(nn.Module):
-    """A square convolution without bias whose columns wrap around; rows are padded by zeros."""
+    """A square convolution whose columns wrap around; rows are padded by zeros. A bias only where no norm follows."""
 
-    def __init__(self, inputs: int, outputs: int, size: int, stride: tuple[int, int]) -> None:
+    def __init__(self, inputs: int, outputs: int, size: int, stride: tuple[int, int], bias: bool = False) -> None:
         super().__init__()
         self.reach = size // 2
-        self.conv = nn.Conv2d(inputs, outputs, size, stride, padding=(self.reach, 0), bias=False)
+        self.conv = nn.Conv2d(inputs, outputs, size, stride, padding=(self.reach, 0), bias=bias)
+        nn.init.kaiming_normal_(self.conv.weight, nonlinearity="relu")
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps ``(B, C, H, W)`` to ``(B, outputs, ⌈H/stride⌉, ⌈W/stride⌉)``."""
@@ -36,15 +40,18 @@ class BasicBlock(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, stride: tuple[int, int], settings: NetworkSettings) -> None:
         super().__init__()
-        self.first = CircularConv(inputs, outputs, 3, stride)
+        bare = settings.normalisation == "none"
+        self.first = CircularConv(inputs, outputs, 3, stride, bare)
         self.first_norm = _norm(outputs, settings)
-        self.second = CircularConv(outputs, outputs, 3, (1, 1))
+        self.second = CircularConv(outputs, outputs, 3, (1, 1), bare)
+        if bare:  # a block starts as its shortcut, so that signals keep their size through all of them
+            nn.init.zeros_(self.second.conv.weight)
         self.second_norm = _norm(outputs, settings)
         same = inputs == outputs and stride == (1, 1)
         self.shortcut = (
             nn.Identity()
             if same
-            else nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), _norm(outputs, settings))
+            else nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=bare), _norm(outputs, settings))
         )
 
     def forward(self, x: Tensor) -> Tensor:
@@ -62,7 +69,7 @@ class Encoder(nn.Module):
     def __init__(self, inputs: int, settings: NetworkSettings) -> None:
         super().__init__()
         self.pooled_columns = settings.pooled_columns
-        self.stem = CircularConv(inputs, settings.stem, 7, (1, 2))
+        self.stem = CircularConv(inputs, settings.stem, 7, (1, 2), settings.normalisation == "none")
         self.stem_norm = _norm(settings.stem, settings)
         layers, channels = [], settings.stem
         for stage, outputs in enumerate(settings.stages):
@@ -77,7 +84,7 @@ class Encoder(nn.Module):
         """The features of maps."""
         x = self.stages(torch.relu(self.stem_norm(self.stem(maps))))
         pooled = functional.adaptive_avg_pool2d(x, (1, self.pooled_columns)).flatten(1)
-        return torch.relu(self.full(pooled))
+        return self.full(pooled)  # type: ignore[no-any-return]
 
 
 class ResidualNetwork(nn.Module):
@@ -86,7 +93,7 @@ class ResidualNetwork(nn.Module):
     def __init__(self, settings: NetworkSettings) -> None:
         super().__init__()
         self.settings = settings
-        self.vertex_encoder = Encoder(7 if settings.distance_channel else 6, settings)
+        self.vertex_encoder = Encoder(6 + _MORE_CHANNELS[settings.distance], settings)
         if settings.normals != "none":
             shared = settings.siamese == "shared"
             self.normal_encoder = self.vertex_encoder if shared else Encoder(6, settings)
@@ -132,19 +139,29 @@ class ResidualNetwork(nn.Module):
 
     def _vertex_pair(self, last: tuple[Tensor, Tensor], current: tuple[Tensor, Tensor]) -> Tensor:
         channels = [last[0] / self.settings.vertex_scale_m, current[0] / self.settings.vertex_scale_m]
-        if self.settings.distance_channel:
-            channels.append(_distance(last, current[0]))
+        if self.settings.distance != "none":
+            channels.append(_distance(last, current[0], self.settings.distance == "gradient"))
         return torch.cat(channels, dim=1)
 
 
-def _distance(last: tuple[Tensor, Tensor], current: Tensor) -> Tensor:
-    """Signed distance ``(B, 1, H, W)``, within ±1 m, of points to the planes in their cells; 0 where either lacks."""
+def _distance(last: tuple[Tensor, Tensor], current: Tensor, gradient: bool) -> Tensor:
+    """Signed distance of points to the planes in their cells, in units of 0.1 m, within ±1 m; 0 where either lacks.
+
+    ``(B, 1, H, W)``; with ``gradient`` ``(B, 7, H, W)``: also d·n, and d·(p × n) for p in units of 10 m.
+    """
+    vertices, normals = last
     seen = (current != 0).any(dim=1, keepdim=True)
-    distance = (last[1] * (current - last[0])).sum(dim=1, keepdim=True)
-    return torch.where(seen, distance, 0.0).clamp(-1.0, 1.0)
+    distance = (normals * (current - vertices)).sum(dim=1, keepdim=True)
+    distance = torch.where(seen, distance, 0.0).clamp(-1.0, 1.0) / _DISTANCE_M
+    if not gradient:
+        return distance
+    turning = torch.linalg.cross(current / _LEVER_M, normals, dim=1)
+    return torch.cat([distance, distance * normals, distance * turning], dim=1)
 
 
 def _norm(channels: int, settings: NetworkSettings) -> nn.Module:
+    if settings.normalisation == "none":
+        return nn.Identity()
     if settings.normalisation == "batch":
         return nn.BatchNorm2d(channels)
     return nn.GroupNorm(max(channels // _GROUP, 1) if channels % _GROUP == 0 else 1, channels)

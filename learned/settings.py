@@ -38,12 +38,16 @@ class NetworkSettings:
             not in the paper.
         stem, stages: channels of the encoder's first convolution and of its stages, as ResNet-18; not in the paper.
         blocks: residual blocks a stage; not in the paper.
-        normalisation: ``batch`` (ResNet's) or ``group``, which does not depend on the batch.
+        normalisation: ``batch`` (ResNet's), ``group``, which does not depend on the batch, or ``none``.
         features: outputs of the fully connected layer after pooling; not in the paper.
         pooled_columns: sectors of azimuth that are pooled by themselves; 1 pools everything.
         iterations: how often the residual is estimated, each from the maps moved by all before; the paper's is 1.
-        distance_channel: the signed distance of each moved point to the plane in its cell as an input; not in the
+        distance: more inputs, from the plane of the last scan in each cell: the signed ``distance`` d of the moved
+            point to it, or with it the ``gradient`` of d²/2 by translation and rotation, d·n and d·(p × n). Not in the
             paper, and needs ``twins``.
+        projective: each iteration starts with a weighted step of point-to-plane registration between the maps
+            (:mod:`hybridlio.learned.projective`), which the residual network corrects; not in the paper.
+        weight_channels: of the network that gives its weights.
         vertex_scale_m: vertices are divided by it.
         residual_scale: the last layers' weights start smaller by it, so that training starts near δT = 1.
     """
@@ -61,22 +65,24 @@ class NetworkSettings:
     stem: int = 32
     stages: tuple[int, ...] = (32, 64, 128, 256)
     blocks: int = 2
-    normalisation: Literal["batch", "group"] = "batch"
+    normalisation: Literal["batch", "group", "none"] = "batch"
     features: int = 256
     pooled_columns: int = 1
     iterations: int = 1
-    distance_channel: bool = False
+    distance: Literal["none", "distance", "gradient"] = "none"
+    projective: bool = False
+    weight_channels: int = 8
     vertex_scale_m: float = 1.0
     residual_scale: float = 0.1
 
     def __post_init__(self) -> None:
         _check_choices(self)
         positive = ("imu_samples", "imu_hidden", "imu_layers", "stem", "blocks", "features", "pooled_columns")
-        _check_positive(self, *positive, "iterations", "vertex_scale_m", "residual_scale")
+        _check_positive(self, *positive, "iterations", "weight_channels", "vertex_scale_m", "residual_scale")
         if not self.stages or min(self.stages) < 1:
             raise ConfigError(f"network: stages needs channels of 1 or more each, got {self.stages}")
-        if self.distance_channel and self.siamese == "shared" and self.normals != "none":
-            raise ConfigError("network: distance_channel gives the encoders different inputs; set siamese to 'twins'")
+        if self.distance != "none" and self.siamese == "shared" and self.normals != "none":
+            raise ConfigError("network: distance gives the encoders different inputs; set siamese to 'twins'")
         if self.velocity and self.siamese == "shared":
             raise ConfigError("network: velocity gives the LSTMs different inputs; set siamese to 'twins'")
 

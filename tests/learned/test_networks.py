@@ -138,7 +138,9 @@ ROWS = [
     for head in ("attention", "mlp")
 ]
 MORE = [
-    {"siamese": "twins", "velocity": True, "distance_channel": True},
+    {"siamese": "twins", "velocity": True, "distance": "distance"},
+    {"projective": True, "iterations": 2},
+    {"normalisation": "none", "siamese": "twins", "distance": "gradient"},
     {"rotation": "log", "iterations": 3, "normalisation": "group", "pooled_columns": 4},
 ]
 

@@ -1,0 +1,81 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from hybridlio import se3
+from hybridlio.learned import maps
+from hybridlio.learned.pairs import Pairs
+from hybridlio.learned.projective import ProjectiveStep, plane_distance, weighted_step
+from hybridlio.learned.training import RunOptions, train
+from hybridlio.learned.validation import step_errors
+from hybridlio.projection import MapGeometry
+
+GEOMETRY = MapGeometry(20.0, -20.0, 40, 180)
+STEP = se3.exp([0.004, -0.003, 0.01, 0.15, -0.1, 0.05])
+
+
+def room_maps(T_world_lidar: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+    """Maps of a box of 16 x 12 x 4 m, seen along the middles of the cells."""
+    elevation = np.radians(GEOMETRY.fov_up_deg - (np.arange(40) + 0.5) * GEOMETRY.row_deg)[:, None]
+    azimuth = np.radians(180 - (np.arange(180) + 0.5) * GEOMETRY.column_deg)[None]
+    parts = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation) + 0 * azimuth]
+    rays = np.stack(parts, axis=-1)
+    turned = rays @ T_world_lidar[:3, :3].T
+    ranges = ((np.array([8.0, 6.0, 2.0]) * np.sign(turned) - T_world_lidar[:3, 3]) / turned).min(axis=-1)
+    vertices = torch.tensor(np.moveaxis(rays * ranges[..., None], -1, 0)[None], dtype=torch.float32)
+    return vertices, maps.normal_map(vertices)
+
+
+def test_steps_between_the_maps_find_the_pose_without_any_training(tiny_recipe):
+    step = ProjectiveStep(tiny_recipe.network)
+    last, (vertices, normals) = room_maps(np.eye(4)), room_maps(STEP)
+    pose = torch.eye(4)[None]
+    for _ in range(4):
+        pose = step(last, maps.remap(vertices, normals, pose, GEOMETRY)) @ pose
+    rotation_deg, translation_m = step_errors(pose.detach().double().numpy(), STEP[None])
+    assert rotation_deg < 0.05
+    assert translation_m < 0.01
+
+
+def test_one_step_solves_a_small_motion_of_planes():
+    generator = torch.Generator().manual_seed(0)
+    normals = torch.nn.functional.normalize(torch.randn(1, 3, 20, 30, generator=generator), dim=1)
+    vertices = 10 * torch.randn(1, 3, 20, 30, generator=generator)
+    moved_back = torch.tensor(se3.exp([1e-4, -2e-4, 3e-4, 0.01, -0.02, 0.03]), dtype=torch.float32)
+    shown = (vertices.flatten(2).transpose(1, 2) @ moved_back[:3, :3].T + moved_back[:3, 3]).transpose(1, 2)
+    shown = shown.reshape(vertices.shape)
+    distance, there = plane_distance((vertices, normals), shown)
+    found = weighted_step(normals, shown, distance, there)
+    assert torch.allclose(found[0] @ moved_back, torch.eye(4), atol=2e-4)
+
+
+def test_a_cell_of_no_weight_says_nothing():
+    generator = torch.Generator().manual_seed(0)
+    normals = torch.nn.functional.normalize(torch.randn(1, 3, 20, 30, generator=generator), dim=1)
+    vertices, distance = 10 * torch.randn(1, 3, 20, 30, generator=generator), torch.zeros(1, 1, 20, 30)
+    distance[..., :15] = 0.5
+    weights = torch.ones_like(distance)
+    weights[..., :15] = 0.0
+    assert torch.allclose(weighted_step(normals, vertices, distance, weights), torch.eye(4)[None], atol=1e-6)
+    assert weighted_step(normals, vertices, distance, torch.zeros_like(distance)).isfinite().all()
+
+
+def test_along_a_corridor_no_step_is_taken():
+    generator = torch.Generator().manual_seed(0)
+    vertices = 10 * torch.randn(1, 3, 20, 30, generator=generator)
+    normals = torch.zeros_like(vertices)
+    normals[:, 1], normals[:, 2, ::2] = 0.6, 0.8
+    normals[:, 1, 1::2] = 1.0
+    distance = (normals * torch.tensor([0.5, -0.02, 0.03])[:, None, None]).sum(1, keepdim=True)
+    found = weighted_step(normals, vertices, distance, torch.ones_like(distance))[0, :3, 3]
+    assert found.tolist() == pytest.approx([0.0, 0.02, -0.03], abs=1e-3)
+
+
+def test_training_moves_the_weights_and_keeps_what_the_step_finds(rooms, tiny_recipe, tmp_path):
+    network = replace(tiny_recipe.network, imu="given", projective=True, residual_scale=1e-3)
+    optimiser = replace(tiny_recipe.optimiser, initial_noise_rad=0.005, initial_noise_m=0.1, epochs=2)
+    recipe = replace(tiny_recipe, network=network, optimiser=optimiser)
+    trained = train(recipe, Pairs(rooms[:1], network), tmp_path, options=RunOptions(device="cpu"))
+    assert trained.projective.logit.weight.abs().max() > 0
