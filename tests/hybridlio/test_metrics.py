@@ -7,7 +7,7 @@ from rich.console import Console
 from hybridlio import metrics, se3
 from hybridlio.errors import DataError
 from hybridlio.metrics import Evaluation, Steps, evaluate
-from hybridlio.metrics_table import evaluation_table
+from hybridlio.metrics_table import evaluation_table, figures
 from hybridlio.trajectory import Trajectory
 
 STEP_COVARIANCE = np.diag([1e-4, 1e-4, 4e-4, 1e-4, 1e-4, 4e-4])
@@ -152,8 +152,8 @@ def test_the_table_has_a_line_for_each_figure_and_a_column_for_each_run(rng: np.
     reference, estimate, steps = drive(rng, 300)
     full, bare = evaluate(reference, estimate, steps=steps), evaluate(reference, reference)
     lines = rendered({"with": full, "without": bare}).splitlines()
-    for heading, value in metrics.figures(full).items():
+    for heading, value in figures(full).items():
         line = next(line for line in lines if heading in line)
         assert value in line
         # the reference has no covariances to judge
-        assert metrics.figures(bare).get(heading, "–") in line
+        assert figures(bare).get(heading, "–") in line
