@@ -156,11 +156,22 @@ def register(
     return _summary(system, len(source), settings, se3.orthonormalise(pose), iterations, converged)
 
 
+def cost_at(surface: Surface, source: Array, pose: Array, kernel_m: float, threads: int) -> float:
+    """Mean robust cost, between 0 and 1, of ``source`` at a pose, without a step from there."""
+    matches = _match(surface, source, pose, 3 * kernel_m, threads)
+    return _cost(_linearise(matches, pose, kernel_m).residuals, len(source), kernel_m)
+
+
+def _cost(residuals: Array, points: int, kernel_m: float) -> float:
+    r2 = residuals**2
+    return float((r2 / (kernel_m**2 + r2)).sum() + points - len(r2)) / max(points, 1)
+
+
 def _summary(
     system: _Linearisation, points: int, settings: RegistrationSettings, pose: Array, iterations: int, converged: bool
 ) -> Registration:
     r2 = system.residuals**2
-    cost = float((r2 / (settings.kernel_m**2 + r2)).sum() + points - len(r2)) / max(points, 1)
+    cost = _cost(system.residuals, points, settings.kernel_m)
     weight = max(float(system.weights.sum()), 1e-12)
     sigma = float(np.sqrt((system.weights * r2).sum() / weight))
     return Registration(pose, system.hessian, sigma, len(r2) / max(points, 1), cost, iterations, converged)

@@ -13,7 +13,7 @@ from hybridlio.errors import DataError
 from hybridlio.estimates import Array, RelativePose
 from hybridlio.information import FLOOR_SIGMAS, covariance_of, degenerate_directions
 from hybridlio.local_map import LocalMap, LocalMapSettings
-from hybridlio.registration import Registration, RegistrationSettings, Surface, register
+from hybridlio.registration import Registration, RegistrationSettings, Surface, cost_at, register
 from hybridlio.sensors import NS_PER_S, Frame, Scan
 from hybridlio.voxel import voxel_average
 
@@ -58,6 +58,7 @@ _UNSURE_TRANSLATION_M = 0.5
 _UNSURE_ROTATION_RAD = 0.02
 _SPARSE = 8  # one in so many points is enough to tell a metre from another
 _COARSE_ITERATIONS = 6
+_LIKELY = 12
 _COARSE_KERNEL_M = 0.5
 _SHARE_OF_SAME_MAP = 1e-3
 _YOUNG_MAP = 5.0  # a map of one keyframe has ground only along that scan's rings, and guesses what lies between
@@ -153,11 +154,13 @@ class ScanMatching:
     def _search(
         self, surface: Surface, source: Array, start: Array, dt_s: float, rates_deg_s: tuple[float, ...]
     ) -> Array:
-        """The best of several motions, by a few steps each with a few of the points."""
-        sparse, coarse = source[::_SPARSE], replace(self._settings.registration, max_iterations=_COARSE_ITERATIONS)
+        """The best of several motions: all are judged by a few of the points, the likelier ones after a few steps."""
+        sparse, settings = source[::_SPARSE], self._settings.registration
         motions = product(self._settings.start_speeds_m_s, np.deg2rad(rates_deg_s))
         starts = [start @ se3.exp(np.array([0, 0, rate, speed, 0, 0]) * dt_s) for speed, rate in motions]
-        tries = [register(surface, sparse, T, coarse, _COARSE_KERNEL_M) for T in starts]
+        starts.sort(key=lambda T: cost_at(surface, sparse, T, _COARSE_KERNEL_M, settings.threads))
+        coarse = replace(settings, max_iterations=_COARSE_ITERATIONS)
+        tries = [register(surface, sparse, T, coarse, _COARSE_KERNEL_M) for T in starts[:_LIKELY]]
         return min(tries, key=lambda found: found.cost).pose
 
     def _bridge(self, initial: RelativePose, points: int, found: Registration | None) -> RelativePose:
