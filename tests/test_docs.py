@@ -8,11 +8,13 @@ from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 
+import numpy as np
 import pytest
 import typer
 
 import hybridlio as hl
 from hybridlio.cli import app
+from hybridlio.graph import PoseGraph
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -81,9 +83,16 @@ def test_every_setting_is_explained_and_none_that_does_not_exist():
     assert explained == settings - groups
 
 
-def test_the_readmes_python_runs(tmp_path):
-    (block,) = blocks(ROOT / "README.md", "python")
+def test_the_readmes_python_runs(tmp_path, monkeypatch):
+    odometry, pose_graph = blocks(ROOT / "README.md", "python")
     drive = hl.simulate(tmp_path, hl.SimulationConfig(seconds=1.0, lidar="16-beam"))
     shown: dict[str, object] = {}
-    exec(re.sub(r'open_sequence\(".*?"\)', f"open_sequence({str(drive)!r})", block), shown)
+    exec(re.sub(r'open_sequence\(".*?"\)', f"open_sequence({str(drive)!r})", odometry), shown)
     assert shown["evaluation"].ate_m < 0.1
+    graph = PoseGraph()
+    graph.add_prior(0, np.eye(4), sigmas=(1e-3,) * 6)
+    graph.add_between(0, 1, np.eye(4), sigmas=(0.1,) * 6)
+    graph.save(tmp_path / "map.g2o")
+    monkeypatch.chdir(tmp_path)
+    exec(pose_graph, shown)
+    assert shown["solution"].error < 1e-9
