@@ -152,10 +152,7 @@ def evaluate(
     Raises:
         DataError: the two share less than two moments, or the steps do not fit the estimate.
     """
-    if steps is not None and not len(steps.poses) == len(steps.covariances) == len(estimate) - 1:
-        raise DataError(
-            f"{len(steps.poses)} steps with {len(steps.covariances)} covariances do not fit {len(estimate)} poses"
-        )
+    _check_steps(steps, estimate)
     both = associate(reference, estimate, max_difference_ns)
     drift = kitti_drift(both.reference, both.estimate)
     chosen = _chosen_drift(both, lengths_m, bool(len(drift)))
@@ -194,6 +191,13 @@ def evaluate(
         pose_consistency=poses,
         step_consistency=step,
     )
+
+
+def _check_steps(steps: Steps | None, estimate: Trajectory) -> None:
+    if steps is not None and not len(steps.poses) == len(steps.covariances) == len(estimate) - 1:
+        raise DataError(
+            f"{len(steps.poses)} steps with {len(steps.covariances)} covariances do not fit {len(estimate)} poses"
+        )
 
 
 def _warnings(both: Association) -> list[str]:

@@ -92,7 +92,7 @@ def test_the_readmes_python_runs(tmp_path, monkeypatch):
     graph = PoseGraph()
     graph.add_prior(0, np.eye(4), sigmas=(1e-3,) * 6)
     graph.add_between(0, 1, np.eye(4), sigmas=(0.1,) * 6)
-    graph.save(tmp_path / "map.g2o")
+    graph.save(tmp_path / "map.g2o", graph.optimize())
     monkeypatch.chdir(tmp_path)
     exec(pose_graph, shown)
     assert shown["solution"].error < 1e-9
