@@ -15,7 +15,7 @@ from hybridlio.graph.solver import incremental_solver, reason
 from hybridlio.sensors import NS_PER_S, Calibration, Frame, ImuNoise
 
 # While tilt, speed and biases are still found, every step solves the few poses there are anew.
-_WARM_UP_STEPS = 20
+WARM_UP_STEPS = 20
 
 
 class IncrementalBackend:
@@ -92,7 +92,7 @@ class IncrementalBackend:
         )  # fmt: skip
 
     def _solve(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        if self._k >= _WARM_UP_STEPS:
+        if self._k >= WARM_UP_STEPS:
             self._isam.update(graph, values)
             return
         self._graph.push_back(graph)

@@ -68,6 +68,12 @@ def _incremental(setup: Setup) -> Backend:
     return IncrementalBackend(setup.calibration, setup.imu_noise)
 
 
+def _fixed_lag(setup: Setup) -> Backend:
+    from hybridlio.graph.fixed_lag import FixedLagBackend
+
+    return FixedLagBackend(setup.calibration, setup.imu_noise)
+
+
 INITIAL_POSE_SOURCES: dict[str, Callable[[Setup], InitialPoseSource]] = {
     "preintegration": _preintegration,
     "kalman": _kalman,
@@ -80,6 +86,7 @@ RESIDUAL_SOURCES: dict[str, Callable[[Setup], ResidualSource]] = {
 }
 BACKENDS: dict[str, Callable[[Setup], Backend]] = {
     "incremental": _incremental,
+    "fixed-lag": _fixed_lag,
 }
 
 

@@ -1,0 +1,54 @@
+"""The fixed-lag backend against the incremental one, and its memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hybridlio.errors import ConfigError
+from hybridlio.graph.fixed_lag import FixedLagBackend
+from hybridlio.graph.online import IncrementalBackend
+from hybridlio.sensors import Calibration, ImuNoise, ImuSamples
+
+
+def drive_through(backend: IncrementalBackend, chain: Any, with_imu: bool = True) -> list[int]:
+    """The chain through a backend; how many variables it holds after each step."""
+    backend.start(chain.start if with_imu else replace(chain.start, has_imu=False))
+    sizes = []
+    for frame, relative in zip(chain.frames[1:], chain.relative, strict=True):
+        backend.update(frame if with_imu else replace(frame, imu=ImuSamples.empty()), relative)
+        sizes.append(backend._isam.getLinearizationPoint().size())
+    return sizes
+
+
+@pytest.mark.parametrize("drift_share", [None, 0.1])
+@pytest.mark.parametrize("with_imu", [True, False], ids=["imu", "no imu"])
+def test_the_newest_state_is_the_incremental_backends(
+    chain: Callable[..., Any], with_imu: bool, drift_share: float | None
+) -> None:
+    drive = chain(seed=5, steps=150, drift_share=drift_share)
+    lagged = FixedLagBackend(drive.calibration, drive.noise, lag_scans=30)
+    whole = IncrementalBackend(drive.calibration, drive.noise)
+    drive_through(lagged, drive, with_imu)
+    drive_through(whole, drive, with_imu)
+    sigmas = np.sqrt(np.diag(whole._state.covariance))
+    np.testing.assert_allclose(lagged._state.T_world_imu, whole._state.T_world_imu, atol=0.05 * sigmas[:6].min())
+    np.testing.assert_allclose(lagged._state.covariance, whole._state.covariance, rtol=0.02, atol=1e-9)
+    np.testing.assert_allclose(lagged.last_step().covariance, whole.last_step().covariance, rtol=0.02, atol=1e-12)
+
+
+def test_memory_stops_growing_at_the_lag(chain: Callable[..., Any]) -> None:
+    drive = chain(seed=6, steps=120, drift_share=0.1)
+    sizes = drive_through(FixedLagBackend(drive.calibration, drive.noise, lag_scans=40), drive)
+    assert sizes[20] > sizes[10]
+    assert set(sizes[70:]) == {sizes[70]}
+    assert sizes[70] <= 5 * 42 < max(sizes)
+
+
+def test_a_lag_shorter_than_the_start_needs_is_refused() -> None:
+    with pytest.raises(ConfigError, match="too short"):
+        FixedLagBackend(Calibration(), ImuNoise(), lag_scans=5)
