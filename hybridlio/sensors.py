@@ -125,12 +125,6 @@ class ImuSamples:
             or self.stamps_ns[after] - self.stamps_ns[before] <= LONGEST_INTERPOLATION_NS
         )
 
-    def longest_gap_s(self, start_ns: int, end_ns: int) -> float:
-        """The longest time without a sample between ``start_ns`` and ``end_ns``, in seconds."""
-        first = int(np.searchsorted(self.stamps_ns, start_ns, side="left"))
-        inside = self.stamps_ns[first : int(np.searchsorted(self.stamps_ns, end_ns, side="right"))]
-        return float(np.diff(np.concatenate([[start_ns], inside, [end_ns]])).max() / NS_PER_S)
-
 
 @dataclass(frozen=True)
 class ImuNoise:

@@ -81,15 +81,6 @@ class TestImuSamplesBetween:
         assert len(recording().between(START_NS + 500 * MS, START_NS + 400 * MS)) == 0
 
 
-def test_the_longest_gap_counts_the_time_before_the_first_and_after_the_last_sample() -> None:
-    imu = ImuSamples(np.array([10, 20, 50, 60]) * MS, np.zeros((4, 3)), np.zeros((4, 3)))
-    assert imu.longest_gap_s(10 * MS, 60 * MS) == pytest.approx(0.030)
-    assert imu.longest_gap_s(-90 * MS, 60 * MS) == pytest.approx(0.100)
-    assert imu.longest_gap_s(10 * MS, 160 * MS) == pytest.approx(0.100)
-    assert imu.longest_gap_s(25 * MS, 35 * MS) == pytest.approx(0.010)
-    assert ImuSamples.empty().longest_gap_s(0, 70 * MS) == pytest.approx(0.070)
-
-
 @pytest.mark.parametrize(
     ("stamps", "gyro", "accel", "says"),
     [
