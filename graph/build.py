@@ -161,8 +161,11 @@ def noise_model(noise: Noise, kernel: Robust | None, dimension: int) -> gtsam.no
     if dimension == 2:
         values = values[_PLANAR_SIGMAS] if noise.form == "sigmas" else values.ravel()[_PLANAR_MATRIX].reshape(3, 3)
     model = _GAUSSIAN[noise.form](values)
-    if kernel is None:
-        return model
+    return model if kernel is None else kernel_model(kernel, model)
+
+
+def kernel_model(kernel: Robust, model: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
+    """GTSAM's noise model with a robust kernel on it."""
     width = kernel.width**2 if kernel.kernel == "dcs" else kernel.width
     return gtsam.noiseModel.Robust.Create(_ROBUST[kernel.kernel](width), model)
 

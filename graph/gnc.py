@@ -24,7 +24,7 @@ from hybridlio.graph.levenberg import Progress, needs_orthogonal, parameters, po
 from hybridlio.graph.measurements import Noise
 
 _INLIER_SHARE = 0.99  # of right factors have a χ² below the bound
-_GRADUATION = 1.4  # the paper's
+GRADUATION = 1.4  # the paper's
 _ITERATIONS_A_STEP = 2
 _STEPS = 200
 _LEAST_WEIGHT = 1e-9  # where the loops hold parts together, each keeps a trace
@@ -59,7 +59,7 @@ def reject_outliers(data: GraphData, start: Array, report: Progress) -> tuple[Ar
     control = 0.0
     for step in range(_STEPS):
         chi2 = edges.chi2(co.to_matrices(poses_of(values, data)))
-        control = control * _GRADUATION if step else bound / max(2 * float(chi2.max()) - bound, bound)
+        control = control * GRADUATION if step else bound / max(2 * float(chi2.max()) - bound, bound)
         weights = truncated_weights(chi2, bound, control)
         report("rejecting", step, float(np.minimum(chi2, bound).sum()))
         if ((weights == 0) | (weights == 1)).all():

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -14,7 +15,9 @@ from hybridlio import se3
 from hybridlio.errors import GraphError
 from hybridlio.estimates import Array, State
 from hybridlio.graph import factors
+from hybridlio.graph.factor_groups import FactorGroup
 from hybridlio.graph.preintegration import covers, preintegrate
+from hybridlio.graph.robust import Added, check_treatment
 from hybridlio.graph.solver import incremental_solver, reason
 from hybridlio.record import Record
 from hybridlio.trajectory import Trajectory
@@ -22,6 +25,7 @@ from hybridlio.trajectory import Trajectory
 Progress = Callable[[str, int, int], None]
 
 _MAX_ITERATIONS = 50
+_ITERATIONS_A_STEP = 2  # while wrong measurements are looked for
 _ROUNDS = 2  # samples are summed up again with the biases that the first round found
 
 
@@ -37,6 +41,7 @@ class Smoothed:
         error_before, error_after: half the sum of squared, whitened residuals at the online estimate and at the answer.
         iterations: Levenberg-Marquardt steps of the last round.
         converged: whether the error had stopped falling.
+        found: what each group of further measurements found, by its name.
     """
 
     trajectory: Trajectory
@@ -48,30 +53,46 @@ class Smoothed:
     error_after: float
     iterations: int
     converged: bool
+    found: dict[str, Any] = field(default_factory=dict)
 
 
-def smooth(record: Record, progress: Progress | None = None) -> Smoothed:
+def smooth(
+    record: Record,
+    progress: Progress | None = None,
+    *,
+    groups: Sequence[FactorGroup] = (),
+    robust: str | None = None,
+) -> Smoothed:
     """Optimise all poses, velocities, biases and gravity of a run at once (Levenberg-Marquardt).
 
     Args:
         record: of the run, from :meth:`hybridlio.odometry.Odometry.record` or a run folder's ``odometry.npz``.
         progress: called with the stage, what is done of it and what there is in all.
+        groups: more measurements.
+        robust: how to treat those of the groups' measurements that may be wrong: ``huber``, ``cauchy``,
+            ``geman-mcclure``, ``dcs`` or ``gnc``; by default as each group prefers.
 
     Raises:
         GraphError: the graph cannot be solved.
+        ConfigError: an unknown treatment.
     """
     report = progress or _silent
+    added = Added(groups, check_treatment(robust))
     states = _online_states(record)
     error_before: float | None = None
     for number in range(_ROUNDS):
         report("optimising", number, _ROUNDS)
         graph, values = _build(record, states)
+        graph, values = added.to(graph, values, states, _few_iterations)
         error_before = graph.error(values) if error_before is None else error_before
         optimiser = _optimiser(graph, values)
         values = _solve(optimiser)
         states = _read(values, states)
-    covariances = _covariances(graph, values, len(states), report)
-    return _smoothed(record, states, covariances, error_before or 0.0, optimiser)
+        added.keep(values)
+    isam = _marginals(graph, values)
+    covariances = _covariances(isam, len(states), report)
+    found = added.found(values, states, isam)
+    return _smoothed(record, states, covariances, error_before or 0.0, optimiser, found)
 
 
 def _silent(stage: str, done: int, total: int) -> None:
@@ -109,11 +130,13 @@ def _build(record: Record, states: list[State]) -> tuple[gtsam.NonlinearFactorGr
     return graph, values
 
 
-def _optimiser(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.LevenbergMarquardtOptimizer:
+def _optimiser(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, iterations: int = _MAX_ITERATIONS
+) -> gtsam.LevenbergMarquardtOptimizer:
     params = gtsam.LevenbergMarquardtParams()
     params.setLinearSolverType("MULTIFRONTAL_QR")  # Cholesky finds long straight chains indeterminate
     params.setRelativeErrorTol(1e-6)
-    params.setMaxIterations(_MAX_ITERATIONS)
+    params.setMaxIterations(iterations)
     return gtsam.LevenbergMarquardtOptimizer(graph, values, params)
 
 
@@ -143,13 +166,22 @@ def _read_one(values: gtsam.Values, k: int, state: State) -> State:
     )
 
 
-def _covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, count: int, progress: Progress) -> Array:
-    """``(N, 6, 6)`` marginals of the IMU poses, relative to the first, which is the origin."""
+def _few_iterations(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+    return _solve(_optimiser(graph, values, _ITERATIONS_A_STEP))
+
+
+def _marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.ISAM2:
+    """The solved graph as one that tells marginal covariances."""
     isam = incremental_solver()
     try:
         isam.update(graph, values)
     except RuntimeError as error:
         raise GraphError(f"smoothing: the graph does not fix every variable: {reason(error)}") from error
+    return isam
+
+
+def _covariances(isam: gtsam.ISAM2, count: int, progress: Progress) -> Array:
+    """``(N, 6, 6)`` marginals of the IMU poses, relative to the first, which is the origin."""
     out = np.empty((count, 6, 6))
     for k in range(count):
         progress("covariances", k, count)
@@ -163,6 +195,7 @@ def _smoothed(
     covariances: Array,
     error_before: float,
     optimiser: gtsam.LevenbergMarquardtOptimizer,
+    found: dict[str, Any],
 ) -> Smoothed:
     T = record.calibration.T_imu_lidar
     T_inv = se3.inverse(T)
@@ -179,4 +212,5 @@ def _smoothed(
         error_after=float(optimiser.error()),
         iterations=iterations,
         converged=iterations < _MAX_ITERATIONS,
+        found=found,
     )
