@@ -84,8 +84,8 @@ class Added:
                 sure.add(factor)
         values, weights = reject(sure, pooled, values, solve)
         ends = np.cumsum([len(self._parts[k].doubtful) for k in chosen])[:-1]
-        for k, part in zip(chosen, np.split(weights, ends), strict=True):
-            self._weights[k] = part
+        for k, own in zip(chosen, np.split(weights, ends), strict=True):
+            self._weights[k] = np.asarray(own)
         return values
 
     def keep(self, values: gtsam.Values) -> None:
