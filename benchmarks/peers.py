@@ -28,12 +28,11 @@ from numpy.typing import NDArray
 from hybridlio import se3
 from hybridlio.config import Config
 from hybridlio.datasets.registry import open_sequence
-from hybridlio.datasets.sequence import Sequence
+from hybridlio.datasets.sequence import Sequence, part_of
 from hybridlio.errors import HybridLioError
 from hybridlio.files import write_whole
 from hybridlio.metrics import Evaluation, evaluate
 from hybridlio.odometry import Odometry
-from hybridlio.run import part_of
 from hybridlio.sensors import Frame
 from hybridlio.trajectory import Trajectory
 

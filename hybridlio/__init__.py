@@ -4,6 +4,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # what type checkers and editors see; at run time each name loads when first used
+    from hybridlio.batch import run_batch
+    from hybridlio.batch_table import Batch
     from hybridlio.config import Config
     from hybridlio.datasets.registry import open_sequence
     from hybridlio.datasets.sequence import Sequence
@@ -12,6 +14,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time each name l
     from hybridlio.graph.offline import smooth
     from hybridlio.metrics import evaluate
     from hybridlio.odometry import Estimate, Odometry
+    from hybridlio.recordings import Recording, find_recordings
     from hybridlio.sensors import Calibration, Frame, GpsFix, ImuNoise, ImuSamples, Scan
     from hybridlio.simulation.config import SimulationConfig
     from hybridlio.simulation.simulate import simulate
@@ -20,6 +23,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time each name l
 __version__ = "0.1.0"
 
 __all__ = [
+    "Batch",
     "Calibration",
     "Config",
     "Estimate",
@@ -29,6 +33,7 @@ __all__ = [
     "ImuNoise",
     "ImuSamples",
     "Odometry",
+    "Recording",
     "RelativePose",
     "Scan",
     "Sequence",
@@ -37,12 +42,16 @@ __all__ = [
     "Trajectory",
     "__version__",
     "evaluate",
+    "find_recordings",
     "open_sequence",
+    "run_batch",
     "simulate",
     "smooth",
 ]
 
 _HOMES = {
+    "batch": ("run_batch",),
+    "batch_table": ("Batch",),
     "config": ("Config",),
     "datasets.registry": ("open_sequence",),
     "datasets.sequence": ("Sequence",),
@@ -51,6 +60,7 @@ _HOMES = {
     "graph.offline": ("smooth",),
     "metrics": ("evaluate",),
     "odometry": ("Estimate", "Odometry"),
+    "recordings": ("Recording", "find_recordings"),
     "sensors": ("Calibration", "Frame", "GpsFix", "ImuNoise", "ImuSamples", "Scan"),
     "simulation.config": ("SimulationConfig",),
     "simulation.simulate": ("simulate",),

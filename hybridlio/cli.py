@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from hybridlio import __version__
+from hybridlio.commands.batch import batch
 from hybridlio.commands.common import start_quietly
 from hybridlio.commands.compare import compare
 from hybridlio.commands.config import config
@@ -45,5 +46,5 @@ def main(
     """Lidar-inertial odometry: from a drive to a trajectory with covariances, a pose graph and a report."""
 
 
-for _command in (simulate, odometry, smooth, compare, evaluate, config, view):
+for _command in (simulate, odometry, smooth, batch, compare, evaluate, config, view):
     app.command()(_command)

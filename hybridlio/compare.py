@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hybridlio import tables
 from hybridlio.config import Config
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.errors import DataError
@@ -181,19 +182,7 @@ def _step_errors(run: Run, poses: Array) -> StepErrors | None:
 
 def table(comparison: Comparison) -> Table:
     """The comparison for the terminal."""
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
-    out = Table(title=Text(heading(comparison)), caption=Text(_LEGEND), box=box.SIMPLE_HEAD, padding=0)
-    rows = columns(comparison)
-    for name in rows[0]:
-        is_name = name in _NAMES
-        lines = name if is_name else "\n".join(name.rsplit(" ", 1))
-        out.add_column(Text(lines), justify="left" if is_name else "right")
-    for row in rows:
-        out.add_row(*map(Text, row.values()))
-    return out
+    return tables.for_terminal(columns(comparison), _NAMES, heading(comparison), _LEGEND)
 
 
 def heading(comparison: Comparison) -> str:
@@ -214,10 +203,9 @@ def heading(comparison: Comparison) -> str:
 def columns(comparison: Comparison) -> list[dict[str, str]]:
     """The rows under their headings, all under the same; columns that say nothing are left out."""
     rows = [_cells(row) for row in comparison.rows]
-    names = dict.fromkeys(name for row in rows for name in row)
     same = [name for name in _NAMES[1:] if len({row[name] for row in rows}) == 1]
-    told = [name for name in names if name not in same and any(row.get(name, "–") != "–" for row in rows)]
-    return [{name: row.get(name, "–") for name in told} for row in rows]
+    told = [name for name in tables.headings(rows) if name not in same]
+    return [{name: row.get(name, tables.NOTHING) for name in told} for row in rows]
 
 
 def _cells(row: Compared) -> dict[str, str]:
@@ -225,31 +213,25 @@ def _cells(row: Compared) -> dict[str, str]:
     out = {"initial pose": row.initial_pose, "residual": row.residual, "backend": row.backend}
     if e is not None:
         short = e.t_rel_percent is None
-        out["t_rel [%]"] = _text(e.chosen_t_rel_percent if short else e.t_rel_percent, 3)
-        out["r_rel [°/100m]"] = _text(e.chosen_r_rel_deg_per_100m if short else e.r_rel_deg_per_100m, 3)
-        out["ATE [m]"] = _text(e.ate_m, 3)
+        out["t_rel [%]"] = tables.number(e.chosen_t_rel_percent if short else e.t_rel_percent, 3)
+        out["r_rel [°/100m]"] = tables.number(e.chosen_r_rel_deg_per_100m if short else e.r_rel_deg_per_100m, 3)
+        out["ATE [m]"] = tables.number(e.ate_m, 3)
     for name, errors in (("initial", row.initial), ("final", row.final)):
         if errors is not None:
-            out[f"{name} [mm]"] = _text(1e3 * errors.median_m, 1)
-            out[f"{name} [°]"] = _text(errors.median_deg, 3)
+            out[f"{name} [mm]"] = tables.number(1e3 * errors.median_m, 1)
+            out[f"{name} [°]"] = tables.number(errors.median_deg, 3)
     out |= {
-        "path [m]": _text(row.path_length_m, 2),
-        "time [ms]": _text(row.ms_median, 1),
-        "p90 [ms]": _text(row.ms_p90, 1),
+        "path [m]": tables.number(row.path_length_m, 2),
+        "time [ms]": tables.number(row.ms_median, 1),
+        "p90 [ms]": tables.number(row.ms_p90, 1),
     }
     out["bridged"] = str(row.bridged)
-    return out | {"ended early": f"after {row.scans} scans: {row.error}" if row.error else "–"}
-
-
-def _text(value: float | None, decimals: int) -> str:
-    return "–" if value is None else f"{value:.{decimals}f}"
+    return out | {"ended early": f"after {row.scans} scans: {row.error}" if row.error else tables.NOTHING}
 
 
 def to_markdown(comparison: Comparison) -> str:
     """The comparison as a Markdown table."""
-    rows = columns(comparison)
-    lines = [list(rows[0]), ["---"] * len(rows[0]), *(list(row.values()) for row in rows)]
-    body = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    body = tables.to_markdown(columns(comparison), _NAMES)
     return f"{heading(comparison)}\n\n{body}\n\n{_LEGEND}\n"
 
 

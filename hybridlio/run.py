@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridlio.config import Config
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.errors import ConfigError, DataError
+from hybridlio.errors import DataError
 from hybridlio.estimates import Array
 from hybridlio.metrics import Steps
 from hybridlio.odometry import Estimate, Odometry
@@ -22,6 +23,8 @@ from hybridlio.trajectory import Trajectory
 _log = logging.getLogger(__name__)
 
 Progress = Callable[[int, int, float], None]
+
+_WITHOUT_IMU = "constant-velocity"
 
 
 @dataclass(eq=False)
@@ -185,13 +188,9 @@ def _frame(run: Run, k: int) -> Frame:
         return run.sequence.without_scan(k)
 
 
-def part_of(sequence: Sequence, frames: str | None) -> Sequence:
-    """The frames ``A:B`` of a sequence, as Python counts them; all without a range."""
-    if frames is None:
-        return sequence
-    ends = frames.split(":")
-    try:
-        start, stop = (int(end) if end.strip() else None for end in ends)
-    except ValueError:
-        raise ConfigError(f"frames {frames!r}: give a range such as 100:200, 100: or :200") from None
-    return sequence.part(start, stop)
+def suited_to(sequence: Sequence, config: Config) -> Config:
+    """The configuration, with an initial pose that needs no inertial data where the recording has none."""
+    if len(sequence.imu):
+        return config
+    _log.warning("%s: no inertial data, so initial poses by %s", sequence.name, _WITHOUT_IMU)
+    return config.model_copy(update={"initial_pose": _WITHOUT_IMU})

@@ -11,9 +11,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-HEAVY = {"torch", "gtsam", "open3d", "matplotlib", "small_gicp", "scipy", "pydantic", "typer"}
+HEAVY = {"torch", "gtsam", "open3d", "matplotlib", "small_gicp", "scipy", "pydantic", "typer", "joblib"}
 # the only modules of hybridlio that may know that graph and learned exist
-JOINING = ("__main__", "cli", "compare", "odometry", "run", "run_folder", "run_outputs", "sources")
+JOINING = ("__main__", "batch", "cli", "compare", "odometry", "run", "run_folder", "run_outputs", "sources")
 MAX_MODULE_LINES, MAX_TEST_LINES, MAX_FUNCTION_LINES, MAX_IMPORT_S = 300, 400, 60, 0.3
 
 

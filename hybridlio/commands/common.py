@@ -117,7 +117,7 @@ def open_data(
 ) -> Sequence:
     """The recording that the options mean, or the asked-for part of it."""
     from hybridlio.datasets.registry import open_sequence
-    from hybridlio.run import part_of
+    from hybridlio.datasets.sequence import part_of
 
     return part_of(open_sequence(data, sequence=sequence, reader=reader, raw_root=raw_root), frames)
 

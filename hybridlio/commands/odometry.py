@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from hybridlio.report_data import Findings
     from hybridlio.run import Run
 
-_WITHOUT_IMU = "constant-velocity"
-
 
 @guarded
 def odometry(
@@ -45,16 +43,14 @@ def odometry(
     Without -o, runs/latest is a link to the newest. Ctrl-C keeps what was estimated so far.
     """
     from hybridlio.odometry import Odometry
-    from hybridlio.run import run_odometry
+    from hybridlio.run import run_odometry, suited_to
     from hybridlio.run_folder import new_run_folder
 
     chosen = common.settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
     estimator = Odometry(config=chosen)  # wrong names fail before the recording is opened
     recording = common.open_data(data, sequence, reader, raw_root, frames)
-    if not len(recording.imu) and initial_pose is None and config is None:
-        complain(f"warning: no inertial data, so initial poses by {_WITHOUT_IMU}", "yellow")
-        chosen = chosen.model_copy(update={"initial_pose": _WITHOUT_IMU})
-        estimator = Odometry(config=chosen)
+    if initial_pose is None and config is None and (suited := suited_to(recording, chosen)) != chosen:
+        chosen, estimator = suited, Odometry(config=suited)
     folder = new_run_folder(recording.name, out, overwrite)
     with progress("odometry") as tick:
         run = run_odometry(recording, estimator, lambda done, total, metres: tick(done, total, f"{metres:.1f} m"))

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlio.errors import DataError
+from hybridlio.errors import ConfigError, DataError
 from hybridlio.sensors import NS_PER_S, Calibration, Frame, GpsFix, ImuNoise, ImuSamples, LidarModel, Scan
 from hybridlio.trajectory import Trajectory
 
@@ -161,3 +161,15 @@ class Sequence:
         steps = np.diff(self.stamps_ns) / NS_PER_S
         large = np.flatnonzero(steps > 1.5 * np.median(steps)) if len(steps) else np.empty(0, np.int64)
         return tuple((int(k) + 1, float(steps[k])) for k in large)
+
+
+def part_of(sequence: Sequence, frames: str | None) -> Sequence:
+    """The frames ``A:B`` of a sequence, as Python counts them; all without a range."""
+    if frames is None:
+        return sequence
+    ends = frames.split(":")
+    try:
+        start, stop = (int(end) if end.strip() else None for end in ends)
+    except ValueError:
+        raise ConfigError(f"frames {frames!r}: give a range such as 100:200, 100: or :200") from None
+    return sequence.part(start, stop)

@@ -7,11 +7,11 @@ import pytest
 from hybridlio import se3
 from hybridlio.config import Config
 from hybridlio.datasets.registry import open_sequence
-from hybridlio.datasets.sequence import Sequence
+from hybridlio.datasets.sequence import Sequence, part_of
 from hybridlio.errors import ConfigError, DataError, GraphError
 from hybridlio.initial_pose import NoResidual
 from hybridlio.odometry import Odometry
-from hybridlio.run import Run, part_of, run_odometry
+from hybridlio.run import Run, run_odometry
 from hybridlio.sensors import Scan
 
 

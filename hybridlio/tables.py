@@ -1,0 +1,51 @@
+"""Rows of words under headings, as Markdown and for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Mapping
+from collections.abc import Sequence as Items
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+NOTHING = "–"
+
+Row = Mapping[str, str]
+
+
+def number(value: float | None, decimals: int) -> str:
+    """A number with so many decimals; a dash for none."""
+    return NOTHING if value is None else f"{value:.{decimals}f}"
+
+
+def headings(rows: Items[Row]) -> list[str]:
+    """The headings of all rows, in the order in which they first come, without those under which nothing is said."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    return [name for name in names if any(row.get(name, NOTHING) != NOTHING for row in rows)]
+
+
+def to_markdown(rows: Items[Row], words: Container[str] = ()) -> str:
+    """The rows as a Markdown table; columns in ``words`` are flush left, all others, numbers, flush right."""
+    names = headings(rows)
+    lines = [names, ["---" if name in words else "---:" for name in names]]
+    lines += [[row.get(name, NOTHING).replace("|", "\\|").replace("\n", " ") for name in names] for row in rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def for_terminal(rows: Items[Row], words: Container[str] = (), title: str = "", caption: str = "") -> Table:
+    """The rows as a table for the terminal; the last word of a number's heading stands below the others."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text  # plain text: in markup "[m]" would be a style
+
+    table = Table(title=Text(title) if title else None, caption=Text(caption) if caption else None)
+    table.box, table.padding = box.SIMPLE_HEAD, 0
+    for name in headings(rows):
+        is_word = name in words
+        table.add_column(
+            Text(name if is_word else "\n".join(name.rsplit(" ", 1))), justify="left" if is_word else "right"
+        )
+    for row in rows:
+        table.add_row(*(Text(row.get(name, NOTHING)) for name in headings(rows)))
+    return table

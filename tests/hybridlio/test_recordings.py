@@ -1,0 +1,101 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybridlio.errors import ConfigError, DataError
+from hybridlio.recordings import Recording, find_recordings
+
+
+def make_recording(folder: Path) -> Path:
+    """A folder of one scan, as the folder reader takes it."""
+    (folder / "scans").mkdir(parents=True)
+    np.zeros((1, 4), np.float32).tofile(folder / "scans/000000.bin")
+    (folder / "timestamps.txt").write_text("0.0\n")
+    return folder
+
+
+@pytest.fixture
+def drives(tmp_path) -> Path:
+    for name in ("north", "south", "west"):
+        make_recording(tmp_path / "drives" / name)
+    return tmp_path / "drives"
+
+
+def names(found) -> list[str]:
+    return [recording.name for recording in found]
+
+
+def test_a_folder_of_several_recordings_stands_for_all_of_them(drives):
+    assert names(find_recordings([drives])) == ["north", "south", "west"]
+
+
+def test_sequences_choose_among_them_in_the_order_asked_for(drives):
+    found = find_recordings([drives], sequence="west,north")
+    assert names(found) == ["west", "north"]
+    assert all(len(recording.open()) == 1 for recording in found)
+
+
+def test_a_pattern_stands_for_what_it_matches(drives):
+    assert names(find_recordings([f"{drives}/*th"])) == ["north", "south"]
+
+
+def test_each_recording_is_found_once_however_often_it_is_meant(drives):
+    assert names(find_recordings([f"{drives}/*th", drives / "north"])) == ["north", "south"]
+
+
+def test_a_text_list_holds_paths_from_its_own_folder_with_sequences_and_comments(drives):
+    (drives / "list.txt").write_text("# mine\nnorth\n. west  # by name\n\n'south'\n")
+    assert names(find_recordings([drives / "list.txt"])) == ["north", "west", "south"]
+
+
+def test_a_yaml_list_holds_paths_or_mappings(drives):
+    (drives / "list.yaml").write_text("- north\n- {path: ., sequence: west, frames: '0:1'}\n")
+    first, second = find_recordings([drives / "list.yaml"], frames=":")
+    assert (first.name, first.frames) == ("north", ":")
+    assert (second.name, second.frames) == ("west", "0:1")
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "words"),
+    [
+        ("a.txt", "one two three\n", "line 1.*3 words"),
+        ("a.txt", "'open\n", "line 1"),
+        ("a.yaml", "path: x\n", "expected a list"),
+        ("a.yaml", "- {path: x, speed: 3}\n", "entry 1: unknown key 'speed'"),
+        ("a.yaml", "- {sequence: x}\n", "entry 1: expected a path"),
+        ("a.yaml", "- [", "cannot be read"),
+    ],
+)
+def test_a_malformed_list_is_refused_with_the_place(tmp_path, file, text, words):
+    (tmp_path / file).write_text(text)
+    with pytest.raises(DataError, match=words):
+        find_recordings([tmp_path / file])
+
+
+def test_what_holds_no_recording_is_kept_and_fails_when_it_is_opened(tmp_path):
+    (gone,) = find_recordings([tmp_path / "gone"])
+    assert gone.name == "gone"
+    with pytest.raises(DataError, match="no such folder"):
+        gone.open()
+
+
+def test_an_empty_list_is_refused(tmp_path):
+    (tmp_path / "empty.txt").write_text("# nothing\n")
+    with pytest.raises(ConfigError, match="no recording"):
+        find_recordings([tmp_path / "empty.txt"])
+
+
+def test_recordings_of_one_name_get_names_of_their_own_that_depend_on_nothing_else(tmp_path):
+    one, two = make_recording(tmp_path / "a/drive"), make_recording(tmp_path / "b/drive")
+    there, back = find_recordings([one, two]), find_recordings([two, one])
+    assert len(set(names(there))) == 2
+    assert {r.path: r.name for r in there} == {r.path: r.name for r in back}
+    assert all(name.startswith("drive-") for name in names(there))
+
+
+def test_names_are_good_for_folders():
+    (odd,) = find_recordings([Recording("/nowhere/../a b:c")])
+    assert odd.name == "a_b_c"
