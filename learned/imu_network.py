@@ -21,7 +21,9 @@ class ImuNetwork(nn.Module):
 
     Rows are divided by 9.81 m/s² and 0.5 rad/s, so that weights for both kinds are of one size. With ``velocity`` the
     translation LSTM sees the last velocity (in units of 10 m/s) in every row, and its output is added to what that
-    velocity gives in the time between the scans: acceleration alone cannot tell a constant speed.
+    velocity gives in the time between the scans: acceleration alone cannot tell a constant speed. With ``mean_rate``
+    the orientation LSTM's output is added to what the mean angular velocity gives. What is added to is a first guess,
+    so the layers that correct it start small.
     """
 
     def __init__(self, settings: NetworkSettings) -> None:
@@ -32,6 +34,11 @@ class ImuNetwork(nn.Module):
         if settings.imu != "feature":
             self.translation = nn.Linear(settings.imu_hidden, 3)
             self.rotation = nn.Linear(settings.imu_hidden, 3)
+            with torch.no_grad():
+                for layer, corrects in ((self.translation, settings.velocity), (self.rotation, settings.mean_rate)):
+                    if corrects:
+                        layer.weight *= settings.residual_scale
+                        layer.bias.zero_()
 
     def features(self, imu: Tensor, velocity_m_s: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """What the LSTMs end with, ``(B, hidden)`` of accelerations and of angular velocities.
@@ -51,7 +58,12 @@ class ImuNetwork(nn.Module):
         t = self.translation(of_accel)
         if self.settings.velocity and velocity_m_s is not None and dt_s is not None:
             t = t + velocity_m_s * dt_s[:, None]
-        return se3.make(rotation_matrix(self.rotation(of_gyro), self.settings), t)
+        turned = self.rotation(of_gyro)
+        if self.settings.mean_rate and dt_s is not None:
+            gyro = imu[..., :3]
+            mean = ((gyro[:, 1:] + gyro[:, :-1]) / 2).mean(dim=1)
+            turned = turned + mean * dt_s[:, None]
+        return se3.make(rotation_matrix(turned, self.settings), t)
 
 
 def rotation_matrix(three: Tensor, settings: NetworkSettings) -> Tensor:

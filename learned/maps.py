@@ -19,6 +19,21 @@ _INDEX_BITS = 32
 
 
 @torch.no_grad()
+def cells(points: Tensor, geometry: MapGeometry) -> tuple[Tensor, Tensor]:
+    """Flat cells ``(B, N)`` int64 that points ``(B, 3, N)`` fall into, and whether they fall into any ``(B, N)``.
+
+    Points that are not finite, lie in the origin or outside the rows fall into none; their cell is 0.
+    """
+    x, y, z = points.unbind(1)
+    depth = (x * x + y * y + z * z).sqrt()
+    row = (geometry.fov_up_deg - torch.rad2deg(torch.asin(z / depth))) / geometry.row_deg
+    column = (180.0 - torch.rad2deg(torch.atan2(y, x))) / geometry.column_deg
+    inside = (row >= 0) & (row < geometry.rows) & (depth < torch.inf)  # NaN compares false
+    flat = row.long() * geometry.columns + column.long() % geometry.columns
+    return torch.where(inside, flat, 0), inside
+
+
+@torch.no_grad()
 def winners(points: Tensor, geometry: MapGeometry) -> Tensor:
     """Which point each cell shows: the index of the nearest ``(B, H·W)`` int64, −1 where a cell is empty.
 
@@ -28,20 +43,16 @@ def winners(points: Tensor, geometry: MapGeometry) -> Tensor:
         geometry: the cells.
     """
     batch, count, _ = points.shape
-    cells = geometry.rows * geometry.columns
-    x, y, z = points.float().unbind(-1)
-    depth = torch.sqrt(x * x + y * y + z * z)
-    row = (geometry.fov_up_deg - torch.rad2deg(torch.asin(z / depth))) / geometry.row_deg
-    column = (180.0 - torch.rad2deg(torch.atan2(y, x))) / geometry.column_deg
-    inside = (row >= 0) & (row < geometry.rows) & (depth < torch.inf)  # NaN compares false
-    cell = row.nan_to_num(0.0).long() * geometry.columns + column.nan_to_num(0.0).long() % geometry.columns
+    number = geometry.rows * geometry.columns
+    cell, inside = cells(points.float().transpose(1, 2), geometry)
+    depth = points.float().square().sum(-1).sqrt()
     index = torch.arange(count, device=points.device)
     # positive floats order like their bits: the least of (depth, index) in one integer is the nearest point
     key = (depth.view(torch.int32).long() << _INDEX_BITS) | index
-    cell = torch.where(inside, cell, cells)  # one cell more, thrown away, takes what is outside
-    nearest = torch.full((batch, cells + 1), _FAR, dtype=torch.int64, device=points.device)
+    cell = torch.where(inside, cell, number)  # one cell more, thrown away, takes what is outside
+    nearest = torch.full((batch, number + 1), _FAR, dtype=torch.int64, device=points.device)
     nearest.scatter_reduce_(1, cell, key, reduce="amin")
-    nearest = nearest[:, :cells]
+    nearest = nearest[:, :number]
     return torch.where(nearest == _FAR, -1, nearest & ((1 << _INDEX_BITS) - 1))
 
 

@@ -26,8 +26,16 @@ def pose_loss(pose: Tensor, clouds: tuple[Clouds, Clouds], settings: LossSetting
 
 
 def objective(output: NetworkOutput, batch: PairBatch, settings: LossSettings, geometry: MapGeometry) -> LossValue:
-    """The loss of a batch, averaged over the network's iterations."""
+    """The loss of a batch, averaged over the network's steps, with the initial pose's where it is given a weight."""
     clouds = clouds_for(batch, settings)
-    values = [pose_loss(pose, clouds, settings, geometry) for pose in output.poses]
-    total = torch.stack([value.total for value in values]).mean(0)
-    return LossValue(total, values[-1].po2pl_m, values[-1].pl2pl, values[-1].matched)
+    poses = [*output.poses, output.initial] if settings.initial_weight else list(output.poses)
+    if settings.matched_at == "answer":
+        matches = match(output.pose, *clouds, settings, geometry)
+        values = [loss(matches, pose, settings) for pose in poses]
+    else:
+        values = [pose_loss(pose, clouds, settings, geometry) for pose in poses]
+    steps, answer = len(output.poses), values[len(output.poses) - 1]
+    total = torch.stack([value.total for value in values[:steps]]).mean(0)
+    for value in values[steps:]:
+        total = total + settings.initial_weight * value.total
+    return LossValue(total, answer.po2pl_m, answer.pl2pl, answer.matched)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from hybridlio.errors import ConfigError
 from hybridlio.learned import maps, se3
 from hybridlio.learned.imu_network import ImuNetwork
-from hybridlio.learned.projective import ProjectiveStep
+from hybridlio.learned.projective import ProjectiveSteps
 from hybridlio.learned.residual_network import ResidualNetwork
 from hybridlio.learned.settings import NetworkSettings
 
@@ -25,6 +25,7 @@ class NetworkInput:
         dt_s: ``(B,)`` time between the scans.
         velocity_m_s: ``(B, 3)`` at scan k, in its axes; zeros where not known.
         initial: ``(B, 4, 4)`` initial poses from elsewhere, for ``imu="given"``; else None or not looked at.
+        shake: ``(B, 4, 4)`` by which initial poses are perturbed on the right before they are refined, or None.
     """
 
     last: Tensor
@@ -33,6 +34,7 @@ class NetworkInput:
     dt_s: Tensor
     velocity_m_s: Tensor
     initial: Tensor | None = None
+    shake: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +43,7 @@ class NetworkOutput:
 
     Attributes:
         initial: ``T̂`` ``(B, 4, 4)``.
-        poses: ``T = δT·T̂`` ``(B, 4, 4)`` after each iteration; the paper's network has one.
+        poses: ``T = δT·T̂`` ``(B, 4, 4)`` after each step; the paper's network has one.
     """
 
     initial: Tensor
@@ -49,12 +51,12 @@ class NetworkOutput:
 
     @property
     def pose(self) -> Tensor:
-        """``T_k_k1`` ``(B, 4, 4)``, the last iteration's."""
+        """``T_k_k1`` ``(B, 4, 4)``, the last step's."""
         return self.poses[-1]
 
     @property
     def residual(self) -> Tensor:
-        """``δT`` ``(B, 4, 4)``, of all iterations together."""
+        """``δT`` ``(B, 4, 4)``, of all steps together."""
         return self.pose @ se3.inverse(self.initial)
 
 
@@ -73,8 +75,8 @@ class OdometryNetwork(nn.Module):
         self.settings = settings
         self.mixed_precision = False
         self.imu_network = ImuNetwork(settings) if settings.imu in ("initial-pose", "feature") else None
-        self.projective = ProjectiveStep(settings) if settings.projective else None
-        self.residual_network = ResidualNetwork(settings)
+        self.projective = ProjectiveSteps(settings) if settings.projective_steps else None
+        self.residual_network = ResidualNetwork(settings) if settings.encoder else None
 
     def forward(self, given: NetworkInput) -> NetworkOutput:
         """Estimate the relative poses of a batch.
@@ -88,25 +90,29 @@ class OdometryNetwork(nn.Module):
             raise ConfigError(
                 f"the network takes maps of {geometry.rows} x {geometry.columns} cells, got {rows} x {columns}"
             )
-        return self.refine(given, *self._from_imu(given))
+        initial, features = self._from_imu(given)
+        start = initial if given.shake is None else initial @ given.shake
+        refined = self.refine(given, start, features)
+        # what the IMU network says is judged as it says it; a given initial pose counts with what shook it
+        return refined if self.settings.imu == "given" else NetworkOutput(initial, refined.poses)
 
     def refine(
         self, given: NetworkInput, initial: Tensor, features: tuple[Tensor, Tensor] | None = None
     ) -> NetworkOutput:
         """Estimate the residual of any initial poses ``(B, 4, 4)``; ``features`` are those of :meth:`imu_features`."""
-        geometry = self.settings.geometry
         last = (given.last, maps.normal_map(given.last))
-        normals = maps.normal_map(given.current)
+        current = (given.current, maps.normal_map(given.current))
         pose, poses = initial, []
         for _ in range(self.settings.iterations):
-            moved = maps.remap(given.current, normals, pose, geometry)
             if self.projective is not None:
-                pose = self.projective(last, moved) @ pose
-                moved = maps.remap(given.current, normals, pose, geometry)
-            with torch.autocast(given.last.device.type, torch.bfloat16, enabled=self.mixed_precision):
-                residual = self.residual_network(last, moved, features)
-            pose = residual.float() @ pose
-            poses.append(pose)
+                poses += self.projective(last, current, pose)
+                pose = poses[-1]
+            if self.residual_network is not None:
+                moved = maps.remap(*current, pose, self.settings.geometry)
+                with torch.autocast(given.last.device.type, torch.bfloat16, enabled=self.mixed_precision):
+                    residual = self.residual_network(last, moved, features)
+                pose = residual.float() @ pose
+                poses.append(pose)
         return NetworkOutput(initial, tuple(poses))
 
     def imu_features(self, given: NetworkInput) -> tuple[Tensor, Tensor] | None:

@@ -15,7 +15,7 @@ from hybridlio.errors import DataError
 from hybridlio.learned import se3
 from hybridlio.learned.correspondences import Clouds
 from hybridlio.learned.odometry_network import NetworkInput
-from hybridlio.learned.settings import NetworkSettings
+from hybridlio.learned.settings import NetworkSettings, OptimiserSettings
 from hybridlio.learned.shards import Shard
 
 
@@ -121,18 +121,19 @@ def padded(clouds: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]]) ->
     return Clouds(torch.from_numpy(points), torch.from_numpy(normals), torch.from_numpy(there))
 
 
-def shaken(batch: PairBatch, rotation_rad: float, translation_m: float, seed: int) -> PairBatch:
-    """The batch with its given initial poses perturbed on the right, each by a draw of its own.
+def shaken(batch: PairBatch, settings: OptimiserSettings, seed: int) -> PairBatch:
+    """The batch with initial poses to be perturbed on the right, and velocities perturbed, each by a draw of its own.
 
     A pair's draw depends on the seed and on the pair alone, so it is the same in every process and after resuming.
     """
-    if batch.network.initial is None or not (rotation_rad or translation_m):
+    pose = np.r_[np.full(3, settings.initial_noise_rad), np.full(3, settings.initial_noise_m)]
+    sigmas = np.r_[pose, np.full(3, settings.velocity_noise_m_s)]
+    if not sigmas.any():
         return batch
-    sigmas = np.r_[np.full(3, rotation_rad), np.full(3, translation_m)]
-    draws = [np.random.default_rng([seed, int(index)]).normal(size=6) * sigmas for index in batch.index]
-    noise = se3.exp(torch.tensor(np.array(draws), dtype=torch.float32))
-    initial = batch.network.initial @ noise.to(batch.network.initial.device)
-    return replace(batch, network=replace(batch.network, initial=initial))
+    draws = np.array([np.random.default_rng([seed, int(index)]).normal(size=9) * sigmas for index in batch.index])
+    noise = torch.tensor(draws, dtype=torch.float32, device=batch.reference.device)
+    velocity = batch.network.velocity_m_s + noise[:, 6:]
+    return replace(batch, network=replace(batch.network, shake=se3.exp(noise[:, :6]), velocity_m_s=velocity))
 
 
 def _stack(arrays: Sequence[NDArray[Any]]) -> Tensor:

@@ -1,4 +1,4 @@
-"""Recipes by name: the published set-up, every row of the paper's tables 2 to 5, and the two methods it compares with.
+"""Recipes by name: the published set-up, what ships, every row of tables 2 to 5, and the methods compared with there.
 
 Source: UnDeepLIO, "Implementation Details" and "Ablation Study". What the paper leaves open (sizes of the LSTMs and of
 the encoder, how many epochs) stands at the defaults of :mod:`hybridlio.learned.settings`, the same in every row.
@@ -25,8 +25,46 @@ def _paper_with(name: str, loss: Mapping[str, Any] = MappingProxyType({}), **net
 _ONLY_PO2PL = {"lambda_": 0.0}
 _ONLY_PL2PL = {"alpha": 0.0}
 
+DEFAULT = Recipe(
+    "default",
+    NetworkSettings(
+        siamese="twins",
+        rotation="log",
+        imu_hidden=32,
+        imu_layers=1,
+        velocity=True,
+        mean_rate=True,
+        projective_steps=3,
+        stem=16,
+        stem_stride=(4, 4),
+        stages=(16, 32),
+        blocks=1,
+        normalisation="group",
+        features=32,
+        distance="gradient",
+        vertex_scale_m=20.0,
+        residual_scale=1e-3,
+    ),
+    LossSettings(reduction="mean", matched_at="answer", initial_weight=0.1, keep_ground=True, max_distance_m=1.0),
+    OptimiserSettings(
+        epochs=10,
+        batch=8,
+        learning_rate=1e-3,
+        schedule="cosine",
+        clip_norm=1.0,
+        initial_noise_rad=0.004,
+        initial_noise_m=0.08,
+        velocity_noise_m_s=0.1,
+    ),
+)
+"""What ships: the published structure, smaller, behind weighted steps of registration between the maps.
+
+Each departure from ``paper``, and what it is worth, is in docs/learned.md.
+"""
+
 _ALL = (
     PAPER,
+    DEFAULT,
     _paper_with("imu-feature", imu="feature"),
     _paper_with("no-imu", imu="none"),
     _paper_with("normals-joined", normals="joined"),

@@ -1,12 +1,15 @@
-"""A step of point-to-plane registration between two maps, cell by cell, with weights that a small network gives.
+"""Steps of point-to-plane registration between two maps, with weights that a small network gives.
 
 Not in the paper. Cells are the matches: each point of the current scan, moved by the pose so far, is held against the
-plane of the last scan in its cell, and one weighted Gauss-Newton step of the point-to-plane loss is solved in closed
-form. The step is differentiable, so the unsupervised loss teaches the weights which cells to trust (moving cars, edges,
-leaves). Untrained, all cells count alike but for a robust kernel.
+plane of the last scan in the cell that it falls into, and one weighted Gauss-Newton step of the point-to-plane loss is
+solved in closed form. The steps are differentiable, so the unsupervised loss teaches the weights which points to trust
+(moving cars, edges, leaves): both scans go through the same convolutions once, and a point's weight is a small network
+of the features of both its cells and of its distance. Untrained, all points count alike but for a robust kernel.
 """
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor, nn
@@ -14,68 +17,137 @@ from torch import Tensor, nn
 from hybridlio.learned import maps, se3
 from hybridlio.learned.residual_network import CircularConv
 from hybridlio.learned.settings import NetworkSettings
+from hybridlio.projection import MapGeometry
 
 _KERNEL_M = 0.3
 _LEVER_M = 10.0  # rotations are measured at this lever, so that the system is well scaled
 _DAMPING = 5e-4  # of the normal equations a point: directions that hardly any cell constrains stay as they are
 _LIMIT_M = 1.0
+_DISTANCE_M = 0.1  # what is left after an initial pose, so that networks see numbers around 1
+_COARSE = 2  # features have a cell for so many rows and columns of the maps
+
+Maps = tuple[Tensor, Tensor]
 
 
-class ProjectiveStep(nn.Module):
-    """Weights for the cells, and the residual that they give."""
+class ProjectiveSteps(nn.Module):
+    """From two pairs of maps and a pose to better poses, one for each step."""
 
     def __init__(self, settings: NetworkSettings) -> None:
         super().__init__()
-        self.scale_m = settings.vertex_scale_m
+        self.settings = settings
+        self.log_kernel = nn.Parameter(torch.full((settings.projective_steps,), math.log(_KERNEL_M)))
+        self.weights = PointWeights(settings) if settings.weight_channels else None
+
+    def forward(self, last: Maps, current: Maps, pose: Tensor) -> list[Tensor]:
+        """Poses ``T_k_k1`` ``(B, 4, 4)`` after each step.
+
+        A step takes the pose before it as given: gradients go through the weights, not back through earlier steps.
+
+        Args:
+            last: vertex and normal maps ``(B, 3, H, W)`` of the last scan.
+            current: those of the current scan, in its own frame.
+            pose: ``(B, 4, 4)`` to start from.
+        """
+        planes = _planes(*last)
+        points, seen = current[0].flatten(2), maps.valid_cells(current[0]).flatten(1)[:, None]
+        logits = None if self.weights is None else self.weights(last, current)
+        poses = []
+        for kernel_m in self.log_kernel.exp():
+            pose = pose.detach()
+            moved = pose[:, :3, :3] @ points + pose[:, :3, 3:]
+            cell, inside = maps.cells(moved, self.settings.geometry)
+            normals, distance, there = _held_against(planes, moved, cell, inside[:, None] & seen)
+            weights = there * (kernel_m**2 / (kernel_m**2 + distance.square())).square()
+            if logits is not None:
+                weights = weights * torch.sigmoid(logits(cell, distance))
+            pose = weighted_step(normals, moved, distance, weights) @ pose
+            poses.append(pose)
+        return poses
+
+
+class PointWeights(nn.Module):
+    """What each point of the current map counts, by the features of its cell in both maps and its distance."""
+
+    def __init__(self, settings: NetworkSettings) -> None:
+        super().__init__()
+        self.scale_m, self.geometry = settings.vertex_scale_m, settings.geometry
         channels = settings.weight_channels
-        self.layers = nn.Sequential(
-            CircularConv(14, channels, 3, (1, 1), bias=True),
+        self.features = nn.Sequential(
+            CircularConv(6, channels, 3, (_COARSE, _COARSE), bias=True),
             nn.ReLU(),
             CircularConv(channels, channels, 3, (1, 1), bias=True),
             nn.ReLU(),
         )
-        self.logit = nn.Conv2d(channels, 1, 1)
+        self.of_last = nn.Conv2d(channels, channels, 1)
+        self.of_current = nn.Conv2d(channels, channels, 1, bias=False)
+        self.of_distance = nn.Conv1d(1, channels, 1, bias=False)
+        self.logit = nn.Conv1d(channels, 1, 1)
         for parameter in self.logit.parameters():
             nn.init.zeros_(parameter)
 
-    def forward(self, last: tuple[Tensor, Tensor], current: tuple[Tensor, Tensor]) -> Tensor:
-        """``δT`` ``(B, 4, 4)`` that lays the current maps on the last ones; arguments as the residual network's."""
-        distance, there = plane_distance(last, current[0])
-        robust = (_KERNEL_M**2 / (_KERNEL_M**2 + distance.square())).square()
-        weights = torch.sigmoid(self.logit(self.layers(self._inputs(last, current, distance, there))))
-        return weighted_step(last[1], current[0], distance, weights * robust * there)
-
-    def _inputs(
-        self, last: tuple[Tensor, Tensor], current: tuple[Tensor, Tensor], distance: Tensor, there: Tensor
-    ) -> Tensor:
-        vertices = [last[0] / self.scale_m, current[0] / self.scale_m]
-        return torch.cat([*vertices, last[1], current[1], distance / 0.1, there], dim=1)
+    def forward(self, last: Maps, current: Maps) -> _Logits:
+        """The weights' logits, as a function of the cells that points fall into and their distances there."""
+        both = [torch.cat([vertices / self.scale_m, normals], dim=1) for vertices, normals in (last, current)]
+        of_last, of_current = self.features(torch.cat(both)).chunk(2)
+        coarse = _coarse_cells(self.geometry, of_last.device)
+        own = self.of_current(of_current).flatten(2)[..., coarse]
+        return _Logits(self, self.of_last(of_last).flatten(2), own, coarse)
 
 
-def plane_distance(last: tuple[Tensor, Tensor], vertices: Tensor) -> tuple[Tensor, Tensor]:
-    """Signed distance ``(B, 1, H, W)`` in metres of vertices to the last scan's planes in their cells, and where it is.
+class _Logits:
+    """Logits ``(B, 1, N)`` of points by the flat cells ``(B, N)`` they fall into and their distances ``(B, 1, N)``."""
 
-    It is 0 where either lacks, or where it exceeds 1 m.
-    """
-    distance = (last[1] * (vertices - last[0])).sum(dim=1, keepdim=True)
-    there = maps.valid_cells(vertices) & maps.valid_cells(last[1])
-    near = there[:, None] & (distance.abs() < _LIMIT_M)
-    return torch.where(near, distance, 0.0), near.to(distance.dtype)
+    def __init__(self, net: PointWeights, of_last: Tensor, own: Tensor, coarse: Tensor) -> None:
+        self.net, self.of_last, self.own, self.coarse = net, of_last, own, coarse
+
+    def __call__(self, cell: Tensor, distance: Tensor) -> Tensor:
+        there = self.coarse[cell][:, None].expand(-1, self.of_last.shape[1], -1)
+        size = distance.abs().detach() / _DISTANCE_M
+        hidden = torch.relu(self.of_last.gather(2, there) + self.own + self.net.of_distance(size))
+        return self.net.logit(hidden)  # type: ignore[no-any-return]
 
 
-def weighted_step(normals: Tensor, vertices: Tensor, distance: Tensor, weights: Tensor) -> Tensor:
-    """``δT`` ``(B, 4, 4)`` of one Gauss-Newton step of ``Σ w d²``, for moved vertices and planes of the same cells.
+def _coarse_cells(geometry: MapGeometry, device: torch.device) -> Tensor:
+    """For each cell of the maps the flat cell of the features ``(H·W,)``."""
+    rows = torch.arange(geometry.rows, device=device) // _COARSE
+    columns = torch.arange(geometry.columns, device=device) // _COARSE
+    return (rows[:, None] * math.ceil(geometry.columns / _COARSE) + columns).flatten()
+
+
+def _planes(vertices: Tensor, normals: Tensor) -> Tensor:
+    """``(B, 4, H·W)``: the normal n of each cell, and n·v; 0 where it has no plane."""
+    return torch.cat([normals, (normals * vertices).sum(dim=1, keepdim=True)], dim=1).flatten(2)
+
+
+def _held_against(planes: Tensor, points: Tensor, cell: Tensor, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Normals ``(B, 3, N)``, signed distances ``(B, 1, N)`` in metres, and where there are such, as 0 and 1.
 
     Args:
-        normals, vertices: ``(B, 3, H, W)`` in one frame.
-        distance, weights: ``(B, 1, H, W)``.
+        planes: of :func:`_planes`.
+        points: ``(B, 3, N)`` in the planes' frame.
+        cell: ``(B, N)`` they fall into.
+        known: ``(B, 1, N)`` which of them are points at all.
+    """
+    chosen = planes.gather(2, cell[:, None].expand(-1, 4, -1))
+    normals = chosen[:, :3]
+    distance = (normals * points).sum(dim=1, keepdim=True) - chosen[:, 3:]
+    there = known & (distance.abs() < _LIMIT_M) & (normals != 0).any(dim=1, keepdim=True)
+    return normals, torch.where(there, distance, 0.0), there.to(distance.dtype)
+
+
+def weighted_step(normals: Tensor, points: Tensor, distance: Tensor, weights: Tensor) -> Tensor:
+    """``δT`` ``(B, 4, 4)`` of one Gauss-Newton step of ``Σ w d²``, for points and the planes that they belong to.
+
+    Args:
+        normals, points: ``(B, 3, N)`` in one frame.
+        distance, weights: ``(B, 1, N)``.
     """
     # d of Exp(ξ)·p is n·(ω × p + v) = (p × n)·ω + n·v
-    J = torch.cat([torch.linalg.cross(vertices, normals, dim=1) / _LEVER_M, normals], dim=1).flatten(2)
-    w, d = weights.flatten(2), distance.flatten(2)
-    total = w.sum(-1, keepdim=True).clamp(min=1e-6)
-    H = (J * w) @ J.transpose(1, 2) / total
-    g = (J * w) @ d.transpose(1, 2) / total
+    J = torch.cat([torch.linalg.cross(points, normals, dim=1) / _LEVER_M, normals], dim=1)
+    weighted = J * weights
+    total = weights.sum(-1, keepdim=True).clamp(min=1e-6)
+    H = weighted @ J.transpose(1, 2) / total
+    g = weighted @ distance.transpose(1, 2) / total
     eye = torch.eye(6, dtype=H.dtype, device=H.device)
     xi = -torch.linalg.solve(H + _DAMPING * eye, g)[..., 0]
     return se3.exp(torch.cat([xi[:, :3] / _LEVER_M, xi[:, 3:]], dim=1))

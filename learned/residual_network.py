@@ -63,13 +63,14 @@ class BasicBlock(nn.Module):
 class Encoder(nn.Module):
     """Stem, stages, average pooling and a fully connected layer: maps ``(B, C, H, W)`` to features ``(B, features)``.
 
-    Every stage halves the columns, and the rows but in the first: a map has far more columns than rows.
+    Every stage halves the columns, and the rows but in the first: a map has far more columns than rows. The stem halves
+    the columns too, unless the settings say more.
     """
 
     def __init__(self, inputs: int, settings: NetworkSettings) -> None:
         super().__init__()
         self.pooled_columns = settings.pooled_columns
-        self.stem = CircularConv(inputs, settings.stem, 7, (1, 2), settings.normalisation == "none")
+        self.stem = CircularConv(inputs, settings.stem, 7, settings.stem_stride, settings.normalisation == "none")
         self.stem_norm = _norm(settings.stem, settings)
         layers, channels = [], settings.stem
         for stage, outputs in enumerate(settings.stages):

@@ -36,7 +36,10 @@ class NetworkSettings:
         imu_hidden, imu_layers: size of the LSTMs; not in the paper.
         velocity: the translation LSTM also sees the last velocity and starts from what it gives at constant speed;
             not in the paper.
+        mean_rate: the orientation LSTM starts from the rotation that the mean angular velocity gives; not in the paper.
+        encoder: whether the residual network is there; without it, ``projective_steps`` give the residual.
         stem, stages: channels of the encoder's first convolution and of its stages, as ResNet-18; not in the paper.
+        stem_stride: rows and columns that the first convolution moves by; not in the paper.
         blocks: residual blocks a stage; not in the paper.
         normalisation: ``batch`` (ResNet's), ``group``, which does not depend on the batch, or ``none``.
         features: outputs of the fully connected layer after pooling; not in the paper.
@@ -45,9 +48,9 @@ class NetworkSettings:
         distance: more inputs, from the plane of the last scan in each cell: the signed ``distance`` d of the moved
             point to it, or with it the ``gradient`` of d²/2 by translation and rotation, d·n and d·(p × n). Not in the
             paper, and needs ``twins``.
-        projective: each iteration starts with a weighted step of point-to-plane registration between the maps
-            (:mod:`hybridlio.learned.projective`), which the residual network corrects; not in the paper.
-        weight_channels: of the network that gives its weights.
+        projective_steps: each iteration starts with so many weighted steps of point-to-plane registration between the
+            maps (:mod:`hybridlio.learned.projective`), which the residual network corrects; not in the paper.
+        weight_channels: of the network that gives their weights; 0 takes the robust kernel's weights alone.
         vertex_scale_m: vertices are divided by it.
         residual_scale: the last layers' weights start smaller by it, so that training starts near δT = 1.
     """
@@ -62,7 +65,10 @@ class NetworkSettings:
     imu_hidden: int = 128
     imu_layers: int = 2
     velocity: bool = False
+    mean_rate: bool = False
+    encoder: bool = True
     stem: int = 32
+    stem_stride: tuple[int, int] = (1, 2)
     stages: tuple[int, ...] = (32, 64, 128, 256)
     blocks: int = 2
     normalisation: Literal["batch", "group", "none"] = "batch"
@@ -70,7 +76,7 @@ class NetworkSettings:
     pooled_columns: int = 1
     iterations: int = 1
     distance: Literal["none", "distance", "gradient"] = "none"
-    projective: bool = False
+    projective_steps: int = 0
     weight_channels: int = 8
     vertex_scale_m: float = 1.0
     residual_scale: float = 0.1
@@ -78,7 +84,17 @@ class NetworkSettings:
     def __post_init__(self) -> None:
         _check_choices(self)
         positive = ("imu_samples", "imu_hidden", "imu_layers", "stem", "blocks", "features", "pooled_columns")
-        _check_positive(self, *positive, "iterations", "weight_channels", "vertex_scale_m", "residual_scale")
+        _check_positive(self, *positive, "iterations", "vertex_scale_m", "residual_scale")
+        if (
+            min(self.projective_steps, self.weight_channels) < 0
+            or len(self.stem_stride) != 2
+            or min(self.stem_stride) < 1
+        ):
+            raise ConfigError(
+                "network: projective_steps and weight_channels must not be negative, stem_stride two of 1 up"
+            )
+        if not self.encoder and not self.projective_steps:
+            raise ConfigError("network: without encoder it needs projective_steps, else nothing gives a residual")
         if not self.stages or min(self.stages) < 1:
             raise ConfigError(f"network: stages needs channels of 1 or more each, got {self.stages}")
         if self.distance != "none" and self.siamese == "shared" and self.normals != "none":
@@ -100,6 +116,10 @@ class LossSettings:
         kernel_m: where the kernel bends.
         max_distance_m: points farther from their match count for nothing; the paper has no limit.
         reduction: ``sum`` over the points (the paper's) or their ``mean``.
+        matched_at: matches are looked for at ``each`` pose that is judged, or once at the ``answer``, the last of them.
+        initial_weight: of the loss at the initial pose itself beside that of the answers, which hardly depend on it
+            once the residual undoes its error; the paper's is 0.
+        keep_ground: the clouds keep the ground, which the paper removes; decided when recordings are prepared.
     """
 
     alpha: float = 1.0
@@ -110,13 +130,17 @@ class LossSettings:
     kernel_m: float = 0.1
     max_distance_m: float = float("inf")
     reduction: Literal["sum", "mean"] = "sum"
+    matched_at: Literal["each", "answer"] = "each"
+    initial_weight: float = 0.0
+    keep_ground: bool = False
 
     def __post_init__(self) -> None:
         _check_choices(self)
         _check_positive(self, "kernel_m", "max_distance_m")
-        if self.alpha < 0 or self.lambda_ < 0 or self.alpha + self.lambda_ == 0:
+        if min(self.alpha, self.lambda_, self.initial_weight) < 0 or self.alpha + self.lambda_ == 0:
             raise ConfigError(
-                f"loss: alpha and lambda_ must not be negative or both 0, got {self.alpha}, {self.lambda_}"
+                f"loss: weights must not be negative, nor alpha and lambda_ both 0, got {self.alpha}, {self.lambda_}, "
+                f"{self.initial_weight}"
             )
 
 
@@ -134,7 +158,9 @@ class OptimiserSettings:
         clip_norm: gradients longer than this are shortened; 0 leaves them.
         seed: of the weights, the order of the pairs and the noise.
         mixed_precision: encoders compute in bfloat16 on a GPU.
-        initial_noise_rad, initial_noise_m: standard deviation by axis of what a given initial pose is shaken by.
+        initial_noise_rad, initial_noise_m: standard deviation by axis of what initial poses are shaken by before the
+            residual network sees them.
+        velocity_noise_m_s: standard deviation by axis of what the last velocity is shaken by.
     """
 
     epochs: int = 100
@@ -150,14 +176,16 @@ class OptimiserSettings:
     mixed_precision: bool = False
     initial_noise_rad: float = 0.0
     initial_noise_m: float = 0.0
+    velocity_noise_m_s: float = 0.0
 
     def __post_init__(self) -> None:
         _check_choices(self)
         _check_positive(self, "epochs", "batch", "learning_rate", "step_epochs", "step_factor")
         if len(self.betas) != 2 or not all(0 <= beta < 1 for beta in self.betas):
             raise ConfigError(f"optimiser: betas are two numbers from 0 to below 1, got {self.betas}")
-        if min(self.weight_decay, self.clip_norm, self.initial_noise_rad, self.initial_noise_m) < 0:
-            raise ConfigError("optimiser: weight decay, clip_norm and initial noise must not be negative")
+        noises = (self.initial_noise_rad, self.initial_noise_m, self.velocity_noise_m_s)
+        if min(self.weight_decay, self.clip_norm, *noises) < 0:
+            raise ConfigError("optimiser: weight decay, clip_norm and noise must not be negative")
 
 
 @dataclass(frozen=True)

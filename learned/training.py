@@ -212,10 +212,7 @@ class _Run:
         # a share is never empty: a short last batch is dealt out again from its start
         mine = indices[self.place.rank :: self.place.count] or indices[:1]
         batch, settings = self.pairs.batch(mine), self.recipe.optimiser
-        if self.recipe.network.imu == "given":
-            seed = settings.seed * 1_000_003 + epoch
-            batch = shaken(batch, settings.initial_noise_rad, settings.initial_noise_m, seed)
-        return batch
+        return shaken(batch, settings, seed=settings.seed * 1_000_003 + epoch)
 
     def _step(self, indices: list[int], batch: PairBatch) -> tuple[float, float]:
         """One step of the optimiser; the loss and the mean distance over all processes' pairs."""

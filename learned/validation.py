@@ -66,15 +66,13 @@ def run_steps(
     device: torch.device | str = "cpu",
     progress: Callable[[int, int], None] | None = None,
 ) -> Steps:
-    """Estimate every pair. Given initial poses are shaken as in training, by draws of seed 0."""
+    """Estimate every pair. Initial poses are shaken as in training, by draws of seed 0."""
     was_training, size = network.training, recipe.optimiser.batch
     network.eval()
     parts: list[tuple[Array, ...]] = []
     for start in range(0, len(pairs), size):
         batch = pairs.batch(range(start, min(start + size, len(pairs))))
-        if recipe.network.imu == "given":
-            batch = shaken(batch, recipe.optimiser.initial_noise_rad, recipe.optimiser.initial_noise_m, seed=0)
-        batch = batch.to(device)
+        batch = shaken(batch, recipe.optimiser, seed=0).to(device)
         out = network(batch.network)
         value = objective(out, batch, recipe.loss, recipe.network.geometry)
         tensors = (out.pose, out.initial, batch.reference, value.total, value.po2pl_m)

@@ -23,6 +23,20 @@ from hybridlio.learned.settings import Recipe, from_dict, to_dict
 _LISTED = 6  # mismatches that a message names
 
 
+def shipped(name: str = "default") -> Path:
+    """Path of the weights of a name that come with the package, ``learned/NAME.safetensors``.
+
+    Raises:
+        ConfigError: there are none; lists those there are.
+    """
+    folder = Path(__file__).resolve().parent
+    path = folder / f"{name}.safetensors"
+    if not path.is_file():
+        known = ", ".join(sorted(file.stem for file in folder.glob("*.safetensors"))) or "none"
+        raise ConfigError(f"no shipped weights named {name!r}; there are {known}, or give a file's path")
+    return path
+
+
 @dataclass(frozen=True, eq=False)
 class Weights:
     """A file of weights.

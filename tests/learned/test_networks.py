@@ -103,6 +103,22 @@ def test_a_velocity_moves_the_initial_pose_by_as_much_as_it_gives_in_the_time():
     assert torch.allclose(net(x.imu, x.velocity_m_s, x.dt_s)[:, :3, 3], 0.1 * x.velocity_m_s)
 
 
+def test_a_constant_rate_turns_the_initial_pose_by_as_much_as_it_gives_in_the_time():
+    net = ImuNetwork(replace(TINY, mean_rate=True, rotation="log"))
+    torch.nn.init.zeros_(net.rotation.weight)
+    rate, dt = torch.tensor([[0.1, -0.2, 0.5], [0.0, 0.0, -0.3]]), torch.tensor([0.1, 0.2])
+    imu = torch.cat([rate, torch.zeros(2, 3)], dim=1)[:, None].expand(-1, 15, -1)
+    assert torch.allclose(net(imu, None, dt)[:, :3, :3], se3.so3_exp(rate * dt[:, None]), atol=1e-6)
+
+
+def test_an_initial_pose_is_shaken_before_it_is_refined_and_is_judged_as_it_was():
+    net, x = network().eval(), given()
+    shake = se3.exp(torch.tensor([[0.0, 0.0, 0.01, 0.1, 0.0, 0.0]])).expand(3, 4, 4)
+    plain, shaken = net(x), net(replace(x, shake=shake))
+    assert torch.equal(shaken.initial, plain.initial)
+    assert torch.allclose(shaken.pose, net.refine(x, plain.initial @ shake).pose, atol=1e-6)
+
+
 def test_siamese_lstms_and_encoders_share_their_weights_and_twins_do_not():
     shared, twins = network(), network(siamese="twins")
     assert shared.imu_network.gyro_lstm is shared.imu_network.accel_lstm
@@ -139,7 +155,9 @@ ROWS = [
 ]
 MORE = [
     {"siamese": "twins", "velocity": True, "distance": "distance"},
-    {"projective": True, "iterations": 2},
+    {"projective_steps": 2, "iterations": 2},
+    {"projective_steps": 2, "encoder": False, "weight_channels": 0},
+    {"siamese": "twins", "velocity": True, "mean_rate": True, "rotation": "log", "stem_stride": (2, 4)},
     {"normalisation": "none", "siamese": "twins", "distance": "gradient"},
     {"rotation": "log", "iterations": 3, "normalisation": "group", "pooled_columns": 4},
 ]
@@ -149,10 +167,13 @@ MORE = [
 def test_every_variant_gives_poses_and_a_gradient_to_every_weight(changes):
     net = network(**changes)
     out = net(given())
-    assert len(out.poses) == net.settings.iterations
+    settings = net.settings
+    assert len(out.poses) == settings.iterations * (settings.projective_steps + settings.encoder)
     R = out.pose[:, :3, :3]
     assert torch.allclose(R @ R.transpose(1, 2), torch.eye(3).expand(3, 3, 3), atol=1e-5)
-    out.pose.square().sum().backward()
+    # steps take the pose before them as given: each is taught by what it gives itself
+    taught = [out.initial, *out.poses] if settings.projective_steps else [out.pose]
+    torch.stack(taught).square().sum().backward()
     missing = [name for name, p in net.named_parameters() if p.grad is None or not p.grad.isfinite().all()]
     assert missing == []
 

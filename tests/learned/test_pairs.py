@@ -11,7 +11,7 @@ from hybridlio import se3
 from hybridlio.errors import DataError
 from hybridlio.learned.pairs import Pairs, padded, shaken
 from hybridlio.learned.preparing import prepare_shard
-from hybridlio.learned.settings import NetworkSettings
+from hybridlio.learned.settings import NetworkSettings, OptimiserSettings
 from hybridlio.learned.shards import ScanRecord, Shard, write_shard
 from hybridlio.preparation import PreparationOptions, prepare
 from hybridlio.projection import MapGeometry
@@ -133,12 +133,15 @@ def test_a_shard_that_fails_to_be_written_leaves_nothing_behind(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_noise_of_the_initial_pose_depends_on_the_pair_and_the_seed_alone(tmp_path):
+def test_noise_of_initial_pose_and_velocity_depends_on_the_pair_and_the_seed_alone(tmp_path):
     pairs = Pairs([shard_of(tmp_path, [record(k) for k in range(5)])], replace(SETTINGS, imu="given"))
-    whole, part = shaken(pairs.batch([0, 1, 2, 3]), 0.01, 0.1, seed=7), shaken(pairs.batch([2]), 0.01, 0.1, seed=7)
-    other = shaken(pairs.batch([2]), 0.01, 0.1, seed=8)
-    assert torch.equal(whole.network.initial[2], part.network.initial[0])
-    assert not torch.allclose(other.network.initial, part.network.initial)
+    noise = OptimiserSettings(initial_noise_rad=0.01, initial_noise_m=0.1, velocity_noise_m_s=0.2)
+    whole, part = shaken(pairs.batch([0, 1, 2, 3]), noise, seed=7), shaken(pairs.batch([2]), noise, seed=7)
+    other = shaken(pairs.batch([2]), noise, seed=8)
+    for name in ("shake", "velocity_m_s"):
+        assert torch.equal(getattr(whole.network, name)[2], getattr(part.network, name)[0])
+        assert not torch.allclose(getattr(other.network, name), getattr(part.network, name))
+    assert shaken(pairs.batch([2]), OptimiserSettings(), seed=7).network.shake is None
 
 
 def test_clouds_are_padded_to_the_largest():

@@ -7,7 +7,7 @@ import torch
 from hybridlio import se3
 from hybridlio.learned import maps
 from hybridlio.learned.pairs import Pairs
-from hybridlio.learned.projective import ProjectiveStep, plane_distance, weighted_step
+from hybridlio.learned.projective import ProjectiveSteps, weighted_step
 from hybridlio.learned.training import RunOptions, train
 from hybridlio.learned.validation import step_errors
 from hybridlio.projection import MapGeometry
@@ -28,54 +28,73 @@ def room_maps(T_world_lidar: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
     return vertices, maps.normal_map(vertices)
 
 
+def steps(recipe, count, **changes):
+    network = replace(recipe.network, geometry=GEOMETRY, projective_steps=count, **changes)
+    torch.manual_seed(0)
+    return ProjectiveSteps(network)
+
+
 def test_steps_between_the_maps_find_the_pose_without_any_training(tiny_recipe):
-    step = ProjectiveStep(tiny_recipe.network)
-    last, (vertices, normals) = room_maps(np.eye(4)), room_maps(STEP)
-    pose = torch.eye(4)[None]
-    for _ in range(4):
-        pose = step(last, maps.remap(vertices, normals, pose, GEOMETRY)) @ pose
-    rotation_deg, translation_m = step_errors(pose.detach().double().numpy(), STEP[None])
+    poses = steps(tiny_recipe, 4)(room_maps(np.eye(4)), room_maps(STEP), torch.eye(4)[None])
+    assert len(poses) == 4
+    rotation_deg, translation_m = step_errors(poses[-1].detach().double().numpy(), STEP[None])
     assert rotation_deg < 0.05
     assert translation_m < 0.01
 
 
+def test_untrained_weights_leave_the_kernel_alone(tiny_recipe):
+    given = room_maps(np.eye(4)), room_maps(STEP), torch.eye(4)[None]
+    learned, bare = steps(tiny_recipe, 2)(*given), steps(tiny_recipe, 2, weight_channels=0)(*given)
+    assert torch.allclose(learned[-1], bare[-1], atol=1e-5)
+
+
+def test_weights_follow_the_points_and_not_their_order_in_the_batch(tiny_recipe):
+    net = steps(tiny_recipe, 2)
+    torch.nn.init.normal_(net.weights.logit.weight)
+    one, other, at = room_maps(np.eye(4)), room_maps(STEP), torch.eye(4)[None]
+    last, current = (tuple(map(torch.cat, zip(*pair, strict=True))) for pair in ((one, other), (other, one)))
+    both = net(last, current, at.expand(2, 4, 4))[-1]
+    assert torch.allclose(both[:1], net(one, other, at)[-1], atol=1e-5)
+    assert torch.allclose(both[1:], net(other, one, at)[-1], atol=1e-5)
+    assert not torch.allclose(both[:1], steps(tiny_recipe, 2)(one, other, at)[-1], atol=1e-5)
+
+
 def test_one_step_solves_a_small_motion_of_planes():
     generator = torch.Generator().manual_seed(0)
-    normals = torch.nn.functional.normalize(torch.randn(1, 3, 20, 30, generator=generator), dim=1)
-    vertices = 10 * torch.randn(1, 3, 20, 30, generator=generator)
+    normals = torch.nn.functional.normalize(torch.randn(1, 3, 600, generator=generator), dim=1)
+    points = 10 * torch.randn(1, 3, 600, generator=generator)
     moved_back = torch.tensor(se3.exp([1e-4, -2e-4, 3e-4, 0.01, -0.02, 0.03]), dtype=torch.float32)
-    shown = (vertices.flatten(2).transpose(1, 2) @ moved_back[:3, :3].T + moved_back[:3, 3]).transpose(1, 2)
-    shown = shown.reshape(vertices.shape)
-    distance, there = plane_distance((vertices, normals), shown)
-    found = weighted_step(normals, shown, distance, there)
+    shown = moved_back[:3, :3] @ points + moved_back[:3, 3:]
+    distance = (normals * (shown - points)).sum(1, keepdim=True)
+    found = weighted_step(normals, shown, distance, torch.ones_like(distance))
     assert torch.allclose(found[0] @ moved_back, torch.eye(4), atol=2e-4)
 
 
-def test_a_cell_of_no_weight_says_nothing():
+def test_a_point_of_no_weight_says_nothing():
     generator = torch.Generator().manual_seed(0)
-    normals = torch.nn.functional.normalize(torch.randn(1, 3, 20, 30, generator=generator), dim=1)
-    vertices, distance = 10 * torch.randn(1, 3, 20, 30, generator=generator), torch.zeros(1, 1, 20, 30)
-    distance[..., :15] = 0.5
+    normals = torch.nn.functional.normalize(torch.randn(1, 3, 600, generator=generator), dim=1)
+    points, distance = 10 * torch.randn(1, 3, 600, generator=generator), torch.zeros(1, 1, 600)
+    distance[..., :300] = 0.5
     weights = torch.ones_like(distance)
-    weights[..., :15] = 0.0
-    assert torch.allclose(weighted_step(normals, vertices, distance, weights), torch.eye(4)[None], atol=1e-6)
-    assert weighted_step(normals, vertices, distance, torch.zeros_like(distance)).isfinite().all()
+    weights[..., :300] = 0.0
+    assert torch.allclose(weighted_step(normals, points, distance, weights), torch.eye(4)[None], atol=1e-6)
+    assert weighted_step(normals, points, distance, torch.zeros_like(distance)).isfinite().all()
 
 
 def test_along_a_corridor_no_step_is_taken():
     generator = torch.Generator().manual_seed(0)
-    vertices = 10 * torch.randn(1, 3, 20, 30, generator=generator)
-    normals = torch.zeros_like(vertices)
+    points = 10 * torch.randn(1, 3, 600, generator=generator)
+    normals = torch.zeros_like(points)
     normals[:, 1], normals[:, 2, ::2] = 0.6, 0.8
     normals[:, 1, 1::2] = 1.0
-    distance = (normals * torch.tensor([0.5, -0.02, 0.03])[:, None, None]).sum(1, keepdim=True)
-    found = weighted_step(normals, vertices, distance, torch.ones_like(distance))[0, :3, 3]
+    distance = (normals * torch.tensor([0.5, -0.02, 0.03])[:, None]).sum(1, keepdim=True)
+    found = weighted_step(normals, points, distance, torch.ones_like(distance))[0, :3, 3]
     assert found.tolist() == pytest.approx([0.0, 0.02, -0.03], abs=1e-3)
 
 
 def test_training_moves_the_weights_and_keeps_what_the_step_finds(rooms, tiny_recipe, tmp_path):
-    network = replace(tiny_recipe.network, imu="given", projective=True, residual_scale=1e-3)
+    network = replace(tiny_recipe.network, imu="given", projective_steps=2, residual_scale=1e-3)
     optimiser = replace(tiny_recipe.optimiser, initial_noise_rad=0.005, initial_noise_m=0.1, epochs=2)
     recipe = replace(tiny_recipe, network=network, optimiser=optimiser)
     trained = train(recipe, Pairs(rooms[:1], network), tmp_path, options=RunOptions(device="cpu"))
-    assert trained.projective.logit.weight.abs().max() > 0
+    assert trained.projective.weights.logit.weight.abs().max() > 0

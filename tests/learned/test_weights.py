@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 from hybridlio.errors import ConfigError, DataError
 from hybridlio.learned.odometry_network import OdometryNetwork
 from hybridlio.learned.pairs import Pairs
-from hybridlio.learned.weights import load_weights, own_tensors, put_weights, save_weights
+from hybridlio.learned.weights import load_weights, own_tensors, put_weights, save_weights, shipped
 
 
 @pytest.mark.parametrize("siamese", ["shared", "twins"])
@@ -73,3 +73,12 @@ def test_training_needs_neither_gtsam_nor_open3d_nor_small_gicp(project_root):
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=project_root, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-1000:]
+
+
+def test_the_shipped_weights_load_and_are_small():
+    path = shipped()
+    weights = load_weights(path)
+    assert weights.network().settings == weights.recipe.network
+    assert sum(file.stat().st_size for file in path.parent.glob("*.safetensors")) <= 25e6
+    with pytest.raises(ConfigError, match="default"):
+        shipped("nothing")
