@@ -1,11 +1,12 @@
-"""hybridlio beside KISS-ICP and RKO-LIO: the same scans, one process, the same number of threads.
+"""hybridlio beside KISS-ICP, RKO-LIO, small_gicp and Open3D's ICP on the same scans; benchmarks/README.md says more.
 
     pip install 'hybridlio[peers]'
     python benchmarks/peers.py DATA [--sequence 0005] [--frames 0:100] [--repeats 3] [-o DIR]
+    python benchmarks/peers.py DRIVE_A DRIVE_B … -o DIR        # and how they compare on average
 
-Each system gets scans that are already read, as it wants them; timed is the call that takes a scan (and, where it
-takes them, the inertial samples). Repeats are interleaved, so that a busy machine disturbs all alike. With -o the
-table goes to peers.md and every figure to peers.json.
+Each system runs in a process of its own, all in lockstep: one scan of one system at a time, with the same number of
+threads. Each gets scans that are already read, as it wants them; timed is the call that takes a scan (and, where it
+takes them, the inertial samples). With -o the table goes to peers.md and every figure to peers.json.
 """
 
 from __future__ import annotations
@@ -14,164 +15,41 @@ import argparse
 import json
 import os
 import platform
-import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from functools import partial
 from importlib import metadata
-from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from lockstep import Pass, resident_growth_mb, run_in_lockstep
+from systems import PEERS, Make, our_systems, peer_systems
 
-from hybridlio import se3
-from hybridlio.config import Config
+from hybridlio import se3, tables
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence, part_of
 from hybridlio.errors import HybridLioError
 from hybridlio.files import write_whole
 from hybridlio.metrics import Evaluation, evaluate
-from hybridlio.odometry import Odometry
-from hybridlio.sensors import Frame
+from hybridlio.terminal import progress
 from hybridlio.trajectory import Trajectory
 
-Array = NDArray[np.float64]
-Step = Callable[[Frame], Array]
+Figures = dict[str, Any]
+
+_DRIFT = "t_rel [%]"
 
 
-@dataclass
-class Ran:
-    """A system's answer.
-
-    Attributes:
-        name: the system's.
-        poses: ``(N, 4, 4)`` lidar poses.
-        stamps_ns: ``(N,)`` when they hold.
-        ms: milliseconds for each scan of each repeat.
-    """
-
-    name: str
-    poses: list[Array] = field(default_factory=list)
-    stamps_ns: list[int] = field(default_factory=list)
-    ms: list[float] = field(default_factory=list)
+def opened(data: Path, sequence: str | None, frames: str | None) -> Sequence:
+    return part_of(open_sequence(data, sequence=sequence), frames)
 
 
-def ours(initial_pose: str, residual: str, threads: int) -> Callable[[Sequence], Step]:
-    settings = Config(initial_pose=initial_pose, residual=residual).model_dump()
-    settings["scan_matching"]["local_map"]["threads"] = threads
-
-    def make(_: Sequence) -> Step:
-        odometry = Odometry(config=Config.model_validate(settings))
-        return lambda frame: odometry.step(frame).pose
-
-    return make
+def trajectory_of(one: Pass) -> Trajectory:
+    poses = np.array([answer.pose for answer in one.answers])
+    stamps = np.array([answer.stamp_ns for answer in one.answers])
+    given = [answer.covariance for answer in one.answers if answer.covariance is not None]
+    return Trajectory(stamps, se3.between(poses[0], poses), np.array(given) if len(given) == len(poses) else None)
 
 
-def kiss_icp(threads: int) -> Callable[[Sequence], Step]:
-    """Its defaults for a range of 100 m; it compensates motion only where points carry times, to the sweep's end."""
-    from kiss_icp.config import KISSConfig
-    from kiss_icp.kiss_icp import KissICP
-
-    def make(sequence: Sequence) -> Step:
-        config = KISSConfig()
-        config.data.deskew = sequence[0].scan.time_offsets_ns is not None
-        config.mapping.voxel_size = 1.0
-        config.registration.max_num_threads = threads
-        system = KissICP(config)
-
-        def step(frame: Frame) -> Array:
-            offsets = frame.scan.time_offsets_ns
-            times = np.empty(0) if offsets is None else (offsets - offsets.min()) / max(np.ptp(offsets), 1)
-            system.register_frame(frame.scan.points.astype(np.float64), times)
-            return np.array(system.last_pose)
-
-        return step
-
-    return make
-
-
-def rko_lio(threads: int) -> Callable[[Sequence], Step]:
-    """Its defaults; its poses are the IMU's. It wants times that are not all equal, and extrinsics without rounding."""
-    from rko_lio.config import LIOConfig
-    from rko_lio.lio import LIO
-
-    def make(sequence: Sequence) -> Step:
-        system = LIO(LIOConfig(deskew=sequence[0].scan.time_offsets_ns is not None, max_num_threads=threads))
-        T_imu_lidar = se3.orthonormalise(sequence.calibration.T_imu_lidar)
-        fed_ns = -(2**62)
-
-        def step(frame: Frame) -> Array:
-            nonlocal fed_ns
-            imu, scan = frame.imu, frame.scan
-            for stamp, accel, gyro in zip(imu.stamps_ns.tolist(), imu.accel_m_s2, imu.gyro_rad_s, strict=True):
-                if stamp > fed_ns:  # frames share the sample on their border
-                    system.add_imu_measurement(accel, gyro, stamp)
-                    fed_ns = stamp
-            times = (
-                np.full(len(scan), scan.stamp_ns)
-                if scan.time_offsets_ns is None
-                else scan.stamp_ns + scan.time_offsets_ns
-            )
-            if scan.time_offsets_ns is None:
-                times[0] -= 1000
-            system.register_scan(scan.points.astype(np.float64), times, T_imu_lidar)
-            return np.asarray(se3.inverse(T_imu_lidar) @ system.pose() @ T_imu_lidar)
-
-        return step
-
-    return make
-
-
-def systems(sequence: Sequence, options: argparse.Namespace) -> dict[str, Callable[[Sequence], Step]]:
-    """What can run on this recording, ours first."""
-    pairs = product(options.initial_pose.split(","), options.residual.split(","))
-    out = {f"{a} + {b}": ours(a, b, options.threads) for a, b in pairs}
-    peers = {"kiss-icp": kiss_icp} | ({"rko_lio": rko_lio} if len(sequence.imu) else {})
-    for name, make in peers.items():
-        try:
-            out[name] = make(options.threads)
-        except ImportError:
-            print(f"{name} is not installed: pip install 'hybridlio[peers]'")
-    return out
-
-
-def run(name: str, make: Callable[[Sequence], Step], sequence: Sequence, ran: Ran) -> None:
-    """One pass over the sequence, its poses in place of an earlier pass's, its times beside them."""
-    step, at_end = make(sequence), name in ("kiss-icp", "rko_lio")
-    ran.poses, ran.stamps_ns = [], []
-    for k in range(len(sequence)):
-        frame = sequence[k]
-        start = time.perf_counter()
-        pose = step(frame)
-        ran.ms.append(1e3 * (time.perf_counter() - start))
-        ran.poses.append(pose)
-        offsets = frame.scan.time_offsets_ns
-        ran.stamps_ns.append(frame.scan.stamp_ns + (int(offsets.max()) if at_end and offsets is not None else 0))
-
-
-def figures(ran: Ran, sequence: Sequence, ours_ms: float) -> dict[str, Any]:
-    """Everything that is said of a system, as plain values."""
-    poses = np.array(ran.poses)
-    trajectory = Trajectory(np.array(ran.stamps_ns), se3.between(poses[0], poses))
-    judged = _judged(trajectory, sequence)
-    out: dict[str, Any] = {"system": ran.name}
-    if judged is not None:
-        short = judged.t_rel_percent is None
-        out["t_rel [%]"] = judged.chosen_t_rel_percent if short else judged.t_rel_percent
-        out["r_rel [°/100 m]"] = judged.chosen_r_rel_deg_per_100m if short else judged.r_rel_deg_per_100m
-        out |= {"ATE [m]": judged.ate_m, "end error [m]": judged.end_error_m}
-    out["path [m]"] = trajectory.length_m
-    if sequence.forward_speed_m_s is not None:
-        driven_m = float(np.trapezoid(sequence.forward_speed_m_s, sequence.stamps_ns / 1e9))
-        if driven_m > 1:
-            out["against forward speed [%]"] = 100 * (trajectory.length_m / driven_m - 1)
-    out["moved [m]"] = float(np.linalg.norm(trajectory.poses[-1, :3, 3]))
-    median, p90 = np.percentile(ran.ms, [50, 90]).tolist()
-    return out | {"median [ms]": median, "p90 [ms]": p90, "times ours": median / ours_ms}
-
-
-def _judged(trajectory: Trajectory, sequence: Sequence) -> Evaluation | None:
+def judged(trajectory: Trajectory, sequence: Sequence) -> Evaluation | None:
     if sequence.reference is None or sequence.reference.length_m < 1:
         return None
     try:
@@ -181,61 +59,143 @@ def _judged(trajectory: Trajectory, sequence: Sequence) -> Evaluation | None:
         return None
 
 
-def markdown(rows: list[dict[str, Any]]) -> str:
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    lines = [names, ["---"] + ["---:"] * (len(names) - 1)]
-    lines += [[_cell(row.get(name)) for name in names] for row in rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+def drift_of(judgement: Evaluation) -> tuple[float | None, float | None]:
+    """Drift over KITTI's lengths, or over those that fit a shorter path."""
+    if judgement.t_rel_percent is not None:
+        return judgement.t_rel_percent, judgement.r_rel_deg_per_100m
+    return judgement.chosen_t_rel_percent, judgement.chosen_r_rel_deg_per_100m
 
 
-def _cell(value: object) -> str:
-    return f"{value:.3f}" if isinstance(value, float) else "–" if value is None else str(value)
+def accuracy(one: Pass, sequence: Sequence) -> Figures:
+    """How well, as far as the recording's references bear it."""
+    if len(one.answers) < 2:
+        return {}
+    trajectory, out = trajectory_of(one), {}
+    judgement = judged(trajectory, sequence)
+    if judgement is not None:
+        out[_DRIFT], out["r_rel [°/100 m]"] = drift_of(judgement)
+        out |= {"ATE [m]": judgement.ate_m, "end error [m]": judgement.end_error_m}
+    out["path [m]"] = trajectory.length_m
+    if sequence.forward_speed_m_s is not None and len(trajectory) == len(sequence):
+        driven_m = float(np.trapezoid(sequence.forward_speed_m_s, sequence.stamps_ns / 1e9))
+        if driven_m > 1:
+            out["against forward speed [%]"] = 100 * (trajectory.length_m / driven_m - 1)
+        else:
+            out["moved though standing [m]"] = trajectory.length_m
+    return out
 
 
-def circumstances(sequence: Sequence, options: argparse.Namespace) -> dict[str, Any]:
-    packages = ("hybridlio", "kiss-icp", "rko_lio", "small_gicp", "gtsam", "numpy")
-    found = {p.metadata["Name"]: p.version for p in metadata.distributions() if p.metadata["Name"] in packages}
-    reference = sequence.reference
+def cost(passes: list[Pass], ours: list[Pass]) -> Figures:
+    """How quickly and in how much memory: medians of the repeats, and how far apart their ratios to ours are."""
+    passes = [one for one in passes if one.ms]
+    if not passes:
+        return {}
+    medians, first = [np.median(one.ms) for one in passes], [np.median(one.ms) for one in ours]
+    ratios = [theirs / mine for theirs, mine in zip(medians, first, strict=False)]
+    slow = [np.percentile(one.ms, 90) / np.percentile(mine.ms, 90) for one, mine in zip(passes, ours, strict=False)]
     return {
-        "sequence": sequence.name,
-        "scans": len(sequence),
-        "reference_length_m": None if reference is None else reference.length_m,
+        "median [ms]": float(np.median(medians)),
+        "p90 [ms]": float(np.median([np.percentile(one.ms, 90) for one in passes])),
+        "times ours": float(np.median(ratios)),
+        "least": float(min(ratios)),
+        "most": float(max(ratios)),
+        "p90 times ours": float(np.median(slow)),
+        "start to first pose [s]": float(np.median([one.start_s for one in passes])),
+        "peak memory [MB]": float(np.median([one.peak_mb for one in passes])),
+        "memory growth [MB]": float(np.median([resident_growth_mb(one) for one in passes])),
+    }
+
+
+def compared(data: Path, options: argparse.Namespace) -> tuple[Sequence, dict[str, Figures]]:
+    """Every system's figures on one recording, ours first."""
+    sequence = opened(data, options.sequence, options.frames)
+    systems: dict[str, Make] = our_systems(options.initial_pose, options.residual, options.backend)
+    systems |= peer_systems(options.peers, sequence)
+    again = partial(opened, data, options.sequence, options.frames)
+    runs: dict[str, list[Pass]] = {name: [] for name in systems}
+    for repeat in range(options.repeats):
+        with progress(f"{sequence.name}, pass {repeat + 1} of {options.repeats}") as tick:
+            for name, one in run_in_lockstep(systems, again, len(sequence), options.threads, tick).items():
+                runs[name].append(one)
+    ours = next(iter(runs.values()))
+    rows = {}
+    for name, passes in runs.items():
+        failed = next((one.error for one in passes if one.error), None)
+        rows[name] = accuracy(passes[-1], sequence) | cost(passes, ours) | ({"ended early": failed} if failed else {})
+    return sequence, rows
+
+
+def words(rows: dict[str, Figures]) -> list[dict[str, str]]:
+    def word(value: object) -> str:
+        return f"{value:.3f}" if isinstance(value, float) else tables.NOTHING if value is None else str(value)
+
+    return [{"system": name, **{key: word(value) for key, value in row.items()}} for name, row in rows.items()]
+
+
+def averages(recordings: dict[str, dict[str, Figures]]) -> dict[str, Figures]:
+    """Of each system: mean drift over all recordings, and ours over it on average and at worst."""
+    systems = list(next(iter(recordings.values())))
+    out: dict[str, Figures] = {}
+    for name in systems:
+        theirs = np.array([rows[name].get(_DRIFT, np.nan) for rows in recordings.values()], dtype=float)
+        mine = np.array([rows[systems[0]].get(_DRIFT, np.nan) for rows in recordings.values()], dtype=float)
+        out[name] = {
+            "mean t_rel [%]": float(theirs.mean()),
+            "ours / its, of the means": float(mine.mean() / theirs.mean()),
+            "mean of ours / its": float((mine / theirs).mean()),
+            "worst ours / its": float((mine / theirs).max()),
+            "mean times ours": float(np.mean([rows[name].get("times ours", np.nan) for rows in recordings.values()])),
+        }
+    return out
+
+
+def circumstances(options: argparse.Namespace) -> Figures:
+    packages = ("hybridlio", "kiss-icp", "rko_lio", "small_gicp", "open3d", "gtsam", "numpy")
+    found = {p.metadata["Name"]: p.version for p in metadata.distributions() if p.metadata["Name"] in packages}
+    return {
         "threads": options.threads,
         "repeats": options.repeats,
         "cores": os.cpu_count(),
-        "load": os.getloadavg(),
+        "load": [round(value, 1) for value in os.getloadavg()],
         "machine": platform.machine(),
         "packages": found,
     }
 
 
-def main() -> None:
+def parsed() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
+    parser.add_argument("data", type=Path, nargs="+")
     parser.add_argument("--sequence")
     parser.add_argument("--frames", metavar="A:B")
-    parser.add_argument("--initial-pose", default="preintegration", metavar="A,B,…")
-    parser.add_argument("--residual", default="scan-matching", metavar="A,B,…")
+    parser.add_argument("--initial-pose", default="preintegration", metavar="A,B,…", help="or each")
+    parser.add_argument("--residual", default="scan-matching", metavar="A,B,…", help="or each")
+    parser.add_argument("--backend", default="incremental", metavar="A,B,…", help="or each")
+    parser.add_argument("--peers", default=",".join(PEERS), metavar="A,B,…", help="'' for none")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("-o", "--out", type=Path)
-    options = parser.parse_args()
-    sequence = part_of(open_sequence(options.data, sequence=options.sequence), options.frames)
-    chosen = systems(sequence, options)
-    runs = {name: Ran(name) for name in chosen}
-    for repeat in range(options.repeats):
-        for name, make in chosen.items():
-            print(f"{name}, pass {repeat + 1} of {options.repeats}", flush=True)
-            run(name, make, sequence, runs[name])
-    ours_ms = float(np.median(next(iter(runs.values())).ms))
-    rows = [figures(ran, sequence, ours_ms) for ran in runs.values()]
-    said = circumstances(sequence, options)
+    return parser.parse_args()
+
+
+def main() -> None:
+    options = parsed()
+    said, recordings, parts = circumstances(options), {}, []
+    told: Figures = {}
+    for data in options.data:
+        sequence, rows = compared(data, options)
+        name = sequence.name if sequence.name not in recordings else str(data)
+        length = "" if sequence.reference is None else f", {sequence.reference.length_m:.0f} m"
+        recordings[name] = rows
+        told[name] = {"scans": len(sequence), "systems": rows}
+        parts.append(f"{name}: {len(sequence)} scans{length}\n\n{tables.to_markdown(words(rows), ('system',))}\n")
+        print(f"\n{parts[-1]}", flush=True)
+    if len(recordings) > 1:
+        parts.append(f"all of them\n\n{tables.to_markdown(words(averages(recordings)), ('system',))}\n")
+        print(f"\n{parts[-1]}")
     head = ", ".join(f"{key} {value}" for key, value in said.items() if key not in ("packages", "machine"))
-    text = f"{head}\n\n{markdown(rows)}\n"
-    print(f"\n{text}")
     if options.out is not None:
-        write_whole(options.out / "peers.md", text)
-        write_whole(options.out / "peers.json", json.dumps({**said, "systems": rows}, indent=2) + "\n")
+        write_whole(options.out / "peers.md", "\n".join([head + "\n", *parts]))
+        write_whole(options.out / "peers.json", json.dumps({**said, "recordings": told}, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ def simulate(
     length_m: Annotated[float | None, typer.Option("--length-m", help="How far to drive instead, in metres.")] = None,
     seed: Annotated[int, typer.Option(help="Decides road, town, traffic and noise.")] = 1,
     speed: Annotated[float, typer.Option(help="Cruising speed in m/s.")] = 10.0,
+    driving: Annotated[str, typer.Option(help="calm, or hard: brakes late, takes bends fast.")] = "calm",
     scene: Annotated[str, typer.Option(help="town, corridor or field.")] = "town",
     lidar: Annotated[str, typer.Option(help="hdl-64e, 32-beam or 16-beam.")] = "hdl-64e",
     distortion: Annotated[bool, typer.Option("--distortion", help="Let the car move during a sweep.")] = False,
@@ -44,7 +45,7 @@ def simulate(
     from hybridlio.simulation import simulate as write_drive
 
     values = {
-        "seconds": seconds, "length_m": length_m, "seed": seed, "speed_m_s": speed, "scene": scene, "lidar": lidar,
+        "seconds": seconds, "length_m": length_m, "seed": seed, "speed_m_s": speed, "driving": driving, "scene": scene, "lidar": lidar,
         "motion_distortion": distortion, "gps": gps, "loops": loops, "start_moving": not start_at_rest,
         "poses": poses, "poses_frame": poses_frame,
     }  # fmt: skip

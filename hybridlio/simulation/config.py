@@ -11,6 +11,7 @@ from hybridlio.errors import ConfigError
 from hybridlio.sensors import LIDAR_MODELS, ImuNoise, LidarModel
 
 Scene = Literal["town", "corridor", "field"]
+Driving = Literal["calm", "hard"]
 
 
 class SimulationConfig(BaseModel):
@@ -21,6 +22,7 @@ class SimulationConfig(BaseModel):
         length_m: drive this far instead of for ``seconds``.
         seed: decides road, world, noise; drives of other seeds share nothing.
         speed_m_s: cruising speed; curves, junctions and stops are slower. Not used along a pose file.
+        driving: ``calm``, or ``hard``: bends at 6 m/s² sideways, brakes at 7 m/s². Not used along a pose file.
         scene: ``town`` (houses, gardens, open stretches), ``corridor`` (smooth parallel walls: hardly anything says
             how far one went) or ``field`` (open ground and a few distant trees: hardly anything at all).
         lidar: a name of :data:`hybridlio.sensors.LIDAR_MODELS`.
@@ -43,6 +45,7 @@ class SimulationConfig(BaseModel):
     length_m: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
     seed: int = Field(default=1, ge=0)
     speed_m_s: float = Field(default=10.0, ge=1.0, le=40.0)
+    driving: Driving = "calm"
     scene: Scene = "town"
     lidar: str = "hdl-64e"
     motion_distortion: bool = False

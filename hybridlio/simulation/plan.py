@@ -16,7 +16,7 @@ from hybridlio.simulation.path import SmoothPath
 from hybridlio.simulation.pose_files import path_along, read_lidar_poses
 from hybridlio.simulation.revisits import level_revisits
 from hybridlio.simulation.rig import LIDAR_HEIGHT_M, SCAN_RATE_HZ, T_IMU_LIDAR
-from hybridlio.simulation.roads import LANE_OFFSET_M, STEP_M, Road, drive, generate_centreline
+from hybridlio.simulation.roads import LANE_OFFSET_M, MANNERS, STEP_M, Road, drive, generate_centreline
 from hybridlio.simulation.traffic import MovingCar, traffic
 from hybridlio.simulation.vehicle import FINE_S, drive_path, lane_of
 from hybridlio.simulation.world import World
@@ -76,7 +76,8 @@ def _along_generated_road(config: SimulationConfig) -> Drive:
     most = 4 * length / config.speed_m_s + 60.0 if config.length_m else seconds
     ticks = np.arange(round(-_MARGIN_S / FINE_S), round((most + _MARGIN_S) / FINE_S) + 1)
     times = np.asarray(ticks * FINE_S, dtype=np.float64)
-    s = _BEHIND_M + drive(lane, _BEHIND_M, config.speed_m_s, times, config.start_moving, rng)
+    manner = MANNERS[config.driving]
+    s = _BEHIND_M + drive(lane, _BEHIND_M, config.speed_m_s, times, config.start_moving, rng, manner)
     if config.length_m:
         driven = s - s[round(_MARGIN_S / FINE_S)]
         seconds = max(float(times[min(int(np.searchsorted(driven, config.length_m)), len(times) - 101)]), 0.2)

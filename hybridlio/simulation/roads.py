@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from hybridlio.simulation.config import Scene
+from hybridlio.simulation.config import Driving, Scene
 
 Array = NDArray[np.float64]
 
@@ -17,7 +17,18 @@ STEP_M = 0.5
 LANE_OFFSET_M = 1.75
 CORNER_SIGMA_M = 11.0  # corners end up with a radius of 0.89 of it
 _STOP_CHANCE = 0.25
-_LATERAL_M_S2, _BRAKE_M_S2, _ACCELERATE_M_S2 = 2.0, 1.8, 1.4
+
+
+@dataclass(frozen=True)
+class Manner:
+    """How hard a driver takes bends, brakes and speeds up."""
+
+    lateral_m_s2: float
+    brake_m_s2: float
+    accelerate_m_s2: float
+
+
+MANNERS: dict[Driving, Manner] = {"calm": Manner(2.0, 1.8, 1.4), "hard": Manner(6.0, 7.0, 3.5)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,25 +141,31 @@ def _loop_corners(rng: np.random.Generator, length_m: float, round_trip_m: float
     return np.asarray(np.array([grid[n] for n in walk]) @ turn.T)
 
 
-def speed_limit(road: Road, cruise_m_s: float, rng: np.random.Generator) -> Array:
+def speed_limit(road: Road, cruise_m_s: float, rng: np.random.Generator, manner: Manner = MANNERS["calm"]) -> Array:
     """The speed one would drive at each ``STEP_M`` of the road, from its curves and one's mood, braking in time."""
     s = np.arange(0.0, road.length_m, STEP_M)
     mood = 1.0 + 0.12 * np.sin(2 * np.pi * s / rng.uniform(150, 400) + rng.uniform(0, 6)) - 0.08
-    bend = np.sqrt(_LATERAL_M_S2 / np.maximum(np.abs(road.curvature(s)), 1e-4))
+    bend = np.sqrt(manner.lateral_m_s2 / np.maximum(np.abs(road.curvature(s)), 1e-4))
     limit = np.minimum(cruise_m_s * mood, bend)
     for i in range(len(limit) - 2, -1, -1):
-        limit[i] = min(limit[i], np.sqrt(limit[i + 1] ** 2 + 2 * _BRAKE_M_S2 * STEP_M))
+        limit[i] = min(limit[i], np.sqrt(limit[i + 1] ** 2 + 2 * manner.brake_m_s2 * STEP_M))
     return np.asarray(limit)
 
 
 def drive(
-    road: Road, start_m: float, cruise_m_s: float, times_s: Array, start_moving: bool, rng: np.random.Generator
+    road: Road,
+    start_m: float,
+    cruise_m_s: float,
+    times_s: Array,
+    start_moving: bool,
+    rng: np.random.Generator,
+    manner: Manner = MANNERS["calm"],
 ) -> Array:
     """Metres driven since ``start_m`` ``(N,)`` at evenly spaced ``times_s``: braking for bends, halting at some.
 
     Not moving at the start means a standstill until two seconds after time zero.
     """
-    limit = speed_limit(road, cruise_m_s, rng)
+    limit = speed_limit(road, cruise_m_s, rng, manner)
     slow = (limit[1:-1] < 0.55 * cruise_m_s) & (limit[1:-1] <= limit[:-2]) & (limit[1:-1] < limit[2:])
     stops = [
         i * STEP_M - 6.0 for i in np.flatnonzero(slow) if rng.random() < _STOP_CHANCE and i * STEP_M > start_m + 40.0
@@ -164,11 +181,11 @@ def drive(
             continue
         goal = limit[min(int(s / STEP_M), len(limit) - 1)]
         if stops:
-            goal = min(goal, np.sqrt(2 * _BRAKE_M_S2 * max(stops[0] - s, 0.0)))
+            goal = min(goal, np.sqrt(2 * manner.brake_m_s2 * max(stops[0] - s, 0.0)))
             if goal < 0.15:
                 stops.pop(0)
                 wait = rng.uniform(1.5, 4.0)
-        speed += np.clip(goal - speed, -2 * _BRAKE_M_S2 * dt, _ACCELERATE_M_S2 * dt)
+        speed += np.clip(goal - speed, -2 * manner.brake_m_s2 * dt, manner.accelerate_m_s2 * dt)
         s += speed * dt
     speeds = np.maximum(gaussian_filter1d(speeds, 0.25 / dt, mode="nearest"), 0.0)
     s_of_t = np.concatenate([[0.0], np.cumsum((speeds[1:] + speeds[:-1]) / 2 * dt)])

@@ -97,8 +97,15 @@ def _require_same(drive: Path, description: dict[str, Any]) -> None:
         found = json.loads(path.read_text())
     except (OSError, ValueError):
         raise DataError(f"{drive} is there already and is no simulated drive; choose another folder") from None
-    if found != description:
+    if _completed(found) != description:
         raise DataError(f"{path} says that another drive of this seed is there; choose another folder or seed")
+
+
+def _completed(found: Any) -> Any:
+    """The description with the defaults of settings that there were not yet when it was written."""
+    if not isinstance(found, dict) or not isinstance(found.get("config"), dict):
+        return found
+    return {**found, "config": json.loads(SimulationConfig().model_dump_json()) | found["config"]}
 
 
 def _write_measurements(folders: DriveFolders, drive: Drive, config: SimulationConfig) -> None:

@@ -1,3 +1,4 @@
+import json
 import shutil
 from pathlib import Path
 
@@ -6,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from hybridlio import se3
-from hybridlio.errors import ConfigError
+from hybridlio.errors import ConfigError, DataError
 from hybridlio.simulation import SimulationConfig, simulate
 from hybridlio.simulation.kitti_writer import DATE
 from hybridlio.simulation.plan import plan
@@ -85,6 +86,16 @@ def test_a_drive_cut_off_while_it_moved_into_place_is_made_whole(tmp_path: Path)
     whole = contents(drive.parent)
     shutil.rmtree(drive)  # the 100 Hz rows arrive first; only they are there
     assert contents(simulate(tmp_path, SMALL).parent) == whole
+
+
+def test_a_drive_written_before_a_setting_existed_is_still_the_same_drive(tmp_path: Path):
+    description = simulate(tmp_path, SMALL) / "simulation.json"
+    older = json.loads(description.read_text())
+    del older["config"]["driving"]
+    description.write_text(json.dumps(older))
+    simulate(tmp_path, SMALL)
+    with pytest.raises(DataError, match="another drive"):
+        simulate(tmp_path, SMALL.model_copy(update={"driving": "hard"}))
 
 
 def test_a_drive_of_a_given_length_is_that_long():

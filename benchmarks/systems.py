@@ -1,0 +1,200 @@
+"""The systems that are compared, each as a function that takes a frame and gives what it makes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridlio import se3
+from hybridlio.config import Config
+from hybridlio.datasets.sequence import Sequence
+from hybridlio.sensors import Frame
+from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A system's answer to one scan.
+
+    Attributes:
+        pose: ``(4, 4)`` lidar pose in a world of the system's own.
+        stamp_ns: when it holds.
+        covariance: ``(6, 6)`` relative to the first pose, rotation first; None of a system that gives none.
+        bridged, degenerate: whether the system says that the scan was of no use, or left a direction open.
+    """
+
+    pose: Array
+    stamp_ns: int
+    covariance: Array | None = None
+    bridged: bool = False
+    degenerate: bool = False
+
+
+Step = Callable[[Frame], Answer]
+Make = Callable[[Sequence, int], Step]  # with the number of threads
+
+
+def ours(config: Config, _: Sequence, threads: int) -> Step:
+    from hybridlio.odometry import Odometry
+
+    odometry = Odometry(config=Config.model_validate(_with_threads(config.model_dump(), threads)))
+
+    def step(frame: Frame) -> Answer:
+        estimate = odometry.step(frame)
+        relative = estimate.relative
+        marks = (False, False) if relative is None else (not relative.ok, len(relative.degenerate) > 0)
+        return Answer(estimate.pose, estimate.stamp_ns, estimate.covariance, *marks)
+
+    return step
+
+
+def _with_threads(tree: dict[str, object], threads: int) -> dict[str, object]:
+    return {
+        key: _with_threads(value, threads) if isinstance(value, dict) else threads if key == "threads" else value
+        for key, value in tree.items()
+    }
+
+
+def kiss_icp(sequence: Sequence, threads: int) -> Step:
+    """Its defaults for a range of 100 m; it compensates motion only where points carry times, to the sweep's end."""
+    from kiss_icp.config import KISSConfig
+    from kiss_icp.kiss_icp import KissICP
+
+    config = KISSConfig()
+    config.data.deskew = sequence[0].scan.time_offsets_ns is not None
+    config.mapping.voxel_size = 1.0
+    config.registration.max_num_threads = threads
+    system = KissICP(config)
+
+    def step(frame: Frame) -> Answer:
+        offsets = frame.scan.time_offsets_ns
+        times = np.empty(0) if offsets is None else (offsets - offsets.min()) / max(np.ptp(offsets), 1)
+        system.register_frame(frame.scan.points.astype(np.float64), times)
+        return Answer(np.array(system.last_pose), _end_of_sweep_ns(frame))
+
+    return step
+
+
+def rko_lio(sequence: Sequence, threads: int) -> Step:
+    """Its defaults; its poses are the IMU's. It wants times that are not all equal, and extrinsics without rounding."""
+    from rko_lio.config import LIOConfig
+    from rko_lio.lio import LIO
+
+    system = LIO(LIOConfig(deskew=sequence[0].scan.time_offsets_ns is not None, max_num_threads=threads))
+    T_imu_lidar = se3.orthonormalise(sequence.calibration.T_imu_lidar)
+    fed_ns = -(2**62)
+
+    def step(frame: Frame) -> Answer:
+        nonlocal fed_ns
+        imu, scan = frame.imu, frame.scan
+        for stamp, accel, gyro in zip(imu.stamps_ns.tolist(), imu.accel_m_s2, imu.gyro_rad_s, strict=True):
+            if stamp > fed_ns:  # frames share the sample on their border
+                system.add_imu_measurement(accel, gyro, stamp)
+                fed_ns = stamp
+        offsets = np.zeros(len(scan), np.int64) if scan.time_offsets_ns is None else scan.time_offsets_ns
+        times = scan.stamp_ns + offsets
+        if scan.time_offsets_ns is None:
+            times[0] -= 1000
+        system.register_scan(scan.points.astype(np.float64), times, T_imu_lidar)
+        return Answer(se3.inverse(T_imu_lidar) @ system.pose() @ T_imu_lidar, _end_of_sweep_ns(frame))
+
+    return step
+
+
+def small_gicp_odometry(_: Sequence, threads: int) -> Step:
+    """GICP of each scan, thinned to 0.25 m, to a growing map of Gaussian voxels of 1 m, from the last step again."""
+    import small_gicp
+
+    voxels: small_gicp.GaussianVoxelMap | None = None
+    pose, last_step = np.eye(4), np.eye(4)
+
+    def step(frame: Frame) -> Answer:
+        nonlocal voxels, pose, last_step
+        points = frame.scan.points.astype(np.float64)
+        cloud, _ = small_gicp.preprocess_points(points, downsampling_resolution=0.25, num_threads=threads)
+        if voxels is None:
+            voxels = small_gicp.GaussianVoxelMap(1.0)
+        else:
+            found = small_gicp.align(voxels, cloud, pose @ last_step, num_threads=threads).T_target_source
+            last_step, pose = se3.between(pose, found), found
+        voxels.insert(cloud, pose)
+        return Answer(pose, frame.scan.stamp_ns)
+
+    return step
+
+
+def open3d_icp(_: Sequence, __: int) -> Step:
+    """Point-to-plane ICP of each scan, thinned to 0.5 m, to the last one, from the last step again.
+
+    Its threads are OpenMP's, which the process is started with.
+    """
+    import open3d as o3d
+
+    icp, search = o3d.pipelines.registration, o3d.geometry.KDTreeSearchParamHybrid(radius=1.5, max_nn=20)
+    target: o3d.geometry.PointCloud | None = None
+    pose, last_step = np.eye(4), np.eye(4)
+
+    def step(frame: Frame) -> Answer:
+        nonlocal target, pose, last_step
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(frame.scan.points.astype(np.float64)))
+        cloud = cloud.voxel_down_sample(0.5)
+        cloud.estimate_normals(search)
+        if target is not None:
+            plane = icp.TransformationEstimationPointToPlane()
+            last_step = np.array(icp.registration_icp(cloud, target, 1.0, last_step, plane).transformation)
+            pose = pose @ last_step
+        target = cloud
+        return Answer(pose, frame.scan.stamp_ns)
+
+    return step
+
+
+def _end_of_sweep_ns(frame: Frame) -> int:
+    offsets = frame.scan.time_offsets_ns
+    return frame.scan.stamp_ns + (int(offsets.max()) if offsets is not None and len(offsets) else 0)
+
+
+PEERS: dict[str, tuple[str, Make]] = {  # with the package that each needs
+    "kiss-icp": ("kiss_icp", kiss_icp),
+    "rko_lio": ("rko_lio", rko_lio),
+    "small_gicp": ("small_gicp", small_gicp_odometry),
+    "open3d-icp": ("open3d", open3d_icp),
+}
+_NEED_IMU = ("rko_lio",)
+
+
+def our_systems(initial_poses: str, residuals: str, backends: str) -> dict[str, Make]:
+    """Every combination of the names, which have commas between; ``each`` of one of the three changes it alone.
+
+    With ``each``, every implementation of that seam is tried with the default of the other two.
+    """
+    default = Config()
+    asked = {"initial_pose": initial_poses, "residual": residuals, "backend": backends}
+    known = {"initial_pose": INITIAL_POSE_SOURCES, "residual": RESIDUAL_SOURCES, "backend": BACKENDS}
+    named = {seam: text.split(",") if text != "each" else [getattr(default, seam)] for seam, text in asked.items()}
+    chosen = [dict(zip(named, names, strict=True)) for names in product(*named.values())]
+    for seam in (seam for seam, text in asked.items() if text == "each"):
+        chosen += [{**chosen[0], seam: name} for name in known[seam] if name not in ("identity", "none")]
+    configs = [default.model_copy(update=names) for names in chosen]
+    return {f"{c.initial_pose} + {c.residual} + {c.backend}": partial(ours, c) for c in configs}
+
+
+def peer_systems(names: str, sequence: Sequence) -> dict[str, Make]:
+    """The peers of these names that can run on the recording; says which are not installed."""
+    from importlib.util import find_spec
+
+    out = {}
+    for name in (name for name in names.split(",") if name):
+        package, make = PEERS[name]
+        if find_spec(package) is None:
+            print(f"{name} is not installed: pip install 'hybridlio[peers]'")
+        elif len(sequence.imu) or name not in _NEED_IMU:
+            out[name] = make
+    return out
