@@ -45,9 +45,9 @@ def simulate(
     from hybridlio.simulation import simulate as write_drive
 
     values = {
-        "seconds": seconds, "length_m": length_m, "seed": seed, "speed_m_s": speed, "driving": driving, "scene": scene, "lidar": lidar,
-        "motion_distortion": distortion, "gps": gps, "loops": loops, "start_moving": not start_at_rest,
-        "poses": poses, "poses_frame": poses_frame,
+        "seconds": seconds, "length_m": length_m, "seed": seed, "speed_m_s": speed, "scene": scene, "lidar": lidar,
+        "driving": driving, "motion_distortion": distortion, "gps": gps, "loops": loops,
+        "start_moving": not start_at_rest, "poses": poses, "poses_frame": poses_frame,
     }  # fmt: skip
     try:
         config = SimulationConfig.model_validate(values)
