@@ -15,6 +15,7 @@ from hybridlio.commands.evaluate import evaluate
 from hybridlio.commands.odometry import odometry
 from hybridlio.commands.simulate import simulate
 from hybridlio.commands.smooth import smooth
+from hybridlio.commands.train import train
 from hybridlio.commands.view import view
 
 app = typer.Typer(
@@ -46,5 +47,5 @@ def main(
     """Lidar-inertial odometry: from a drive to a trajectory with covariances, a pose graph and a report."""
 
 
-for _command in (simulate, odometry, smooth, batch, compare, evaluate, config, view):
+for _command in (simulate, odometry, smooth, batch, compare, evaluate, train, config, view):
     app.command()(_command)

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from hybridlio.errors import ConfigError
 from hybridlio.files import write_whole
+from hybridlio.learned.source_settings import LstmSettings, NetworkResidualSettings
 from hybridlio.scan_matching import ScanMatchingSettings
 from hybridlio.sensors import ImuNoise
 
@@ -22,6 +23,8 @@ class Config(BaseModel):
         backend: a name of :data:`hybridlio.sources.BACKENDS`.
         imu_noise: the IMU's noise; without it the recording's own, where it says so, else an industrial MEMS unit's.
         scan_matching: settings of the classical residual source.
+        lstm: settings of the learned initial-pose source.
+        network: settings of the learned residual source.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -31,6 +34,8 @@ class Config(BaseModel):
     backend: str = "incremental"
     imu_noise: ImuNoise | None = None
     scan_matching: ScanMatchingSettings = Field(default_factory=ScanMatchingSettings)
+    lstm: LstmSettings = Field(default_factory=LstmSettings)
+    network: NetworkResidualSettings = Field(default_factory=NetworkResidualSettings)
 
 
 def config_to_yaml(config: Config) -> str:
@@ -69,3 +74,5 @@ def parse_config(tree: object, where: str) -> Config:
     except ValidationError as error:
         wrong = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg'].lower()}" for e in error.errors())
         raise ConfigError(f"{where}: {wrong}. `hybridlio config` prints all keys with their defaults") from None
+    except ConfigError as error:  # settings that check themselves
+        raise ConfigError(f"{where}: {error}") from None

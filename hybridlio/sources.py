@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 from hybridlio.errors import ConfigError
@@ -50,10 +51,30 @@ def _identity(_: Setup) -> InitialPoseSource:
     return Identity()
 
 
+def _lstm(setup: Setup) -> InitialPoseSource:
+    from hybridlio.learned.lstm_initial_pose import LstmInitialPose
+
+    return LstmInitialPose(setup.config.lstm)
+
+
 def _scan_matching(setup: Setup) -> ResidualSource:
     from hybridlio.scan_matching import ScanMatching
 
     return ScanMatching(setup.config.scan_matching)
+
+
+def _network(setup: Setup) -> ResidualSource:
+    from hybridlio.learned.network_residual import NetworkResidual
+    from hybridlio.preparation import prepare
+    from hybridlio.recipes import preparation_for
+
+    return NetworkResidual(lambda recipe: partial(prepare, options=preparation_for(recipe)), setup.config.network)
+
+
+def _network_then_scan_matching(setup: Setup) -> ResidualSource:
+    from hybridlio.residual_chain import ResidualChain
+
+    return ResidualChain(_network(setup), _scan_matching(setup))
 
 
 def _no_residual(_: Setup) -> ResidualSource:
@@ -76,12 +97,15 @@ def _fixed_lag(setup: Setup) -> Backend:
 
 INITIAL_POSE_SOURCES: dict[str, Callable[[Setup], InitialPoseSource]] = {
     "preintegration": _preintegration,
+    "lstm": _lstm,
     "kalman": _kalman,
     "constant-velocity": _constant_velocity,
     "identity": _identity,
 }
 RESIDUAL_SOURCES: dict[str, Callable[[Setup], ResidualSource]] = {
     "scan-matching": _scan_matching,
+    "network": _network,
+    "network+scan-matching": _network_then_scan_matching,
     "none": _no_residual,
 }
 BACKENDS: dict[str, Callable[[Setup], Backend]] = {

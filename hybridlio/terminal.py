@@ -91,34 +91,52 @@ def _bar(what: str, unit: str) -> Iterator[Tick]:
         TimeRemainingColumn(),
         TextColumn("{task.fields[detail]}"),
     )
-    start = time.perf_counter()
+    pace = _Pace(unit)
     with Progress(*columns, console=_stderr()) as bar:
         task = bar.add_task(what, total=None, rate="", detail="")
 
         def tick(done: int, total: int, detail: str = "") -> None:
-            bar.update(task, completed=done, total=total, rate=_rate(done, start, unit), detail=detail)
+            bar.update(task, completed=done, total=total, rate=pace.text(done), detail=detail)
 
         yield tick
 
 
 @contextmanager
 def _lines(what: str, unit: str) -> Iterator[Tick]:
-    start, shown, last_s = time.perf_counter(), 0, 0.0
+    pace, shown, last_s = _Pace(unit), 0, 0.0
 
     def tick(done: int, total: int, detail: str = "") -> None:
         nonlocal shown, last_s
-        tenth, spent_s = 10 * done // max(total, 1), time.perf_counter() - start
+        rate, tenth, spent_s = pace.text(done), 10 * done // max(total, 1), pace.spent_s
         if (tenth > shown and spent_s > last_s + _LINES_APART_S) or (done == total > 0 and shown < 10):
             shown, last_s = tenth, spent_s
-            left = spent_s * (total - done) / done
-            words = [f"{done}/{total} {unit} ({100 * done // total} %)", _rate(done, start, unit), f"{left:.0f} s left"]
+            left = pace.seconds_for(total - done)
+            words = [f"{done}/{total} {unit} ({100 * done // total} %)", rate, f"{left:.0f} s left"]
             complain(f"{what}: {', '.join([*words, *([detail] if detail else [])])}", "none")
 
     yield tick
 
 
-def _rate(done: int, start: float, unit: str) -> str:
-    return f"{done / max(time.perf_counter() - start, 1e-9):.1f} {unit}/s"
+class _Pace:
+    """How quickly a loop goes. One that goes on where an earlier one stopped is not credited with what that did."""
+
+    def __init__(self, unit: str) -> None:
+        self._unit, self._start = unit, time.perf_counter()
+        self._before: int | None = None
+        self._per_s = 0.0
+
+    @property
+    def spent_s(self) -> float:
+        return max(time.perf_counter() - self._start, 1e-9)
+
+    def text(self, done: int) -> str:
+        if self._before is None:
+            self._before = max(done - 1, 0)
+        self._per_s = (done - self._before) / self.spent_s
+        return f"{self._per_s:.1f} {self._unit}/s"
+
+    def seconds_for(self, more: int) -> float:
+        return more / max(self._per_s, 1e-9)
 
 
 @functools.cache

@@ -65,13 +65,15 @@ def prepare_shard(
     geometry: MapGeometry,
     imu_samples: int = 15,
     initial: Initial | None = None,
+    step: Initial | None = None,
     made_by: str = "",
     progress: Progress | None = None,
 ) -> ShardInfo:
     """Prepare every scan of a recording once and write the shard.
 
     A scan that cannot be read is kept as one that is not usable. The velocity at each scan comes from the step before,
-    as it would at run time: by the reference where there is one, else by ``initial``.
+    as it would at run time: by ``step`` where that is given, else by the reference where there is one, else by
+    ``initial``.
 
     Args:
         sequence: the recording.
@@ -80,13 +82,14 @@ def prepare_shard(
         geometry: the cells that ``prepare`` gives.
         imu_samples: S.
         initial: gives the initial pose ``T_k_k1`` of a frame, or None where there is none.
+        step: gives the step ``T_k_k1`` to a frame as odometry found it, or None where it did not.
         made_by: kept in the shard's description.
         progress: called with scans done and scans in all.
 
     Raises:
         DataError: the recording has fewer than two scans.
     """
-    records = _records(sequence, prepare, geometry, imu_samples, initial, progress)
+    records = _records(sequence, prepare, geometry, imu_samples, initial, step, progress)
     return write_shard(folder, records, sequence.name, geometry, imu_samples, made_by)
 
 
@@ -96,6 +99,7 @@ def _records(
     geometry: MapGeometry,
     imu_samples: int,
     initial: Initial | None,
+    step: Initial | None,
     progress: Progress | None,
 ) -> Iterator[ScanRecord]:
     before: NDArray[np.float64] | None = None  # the step that led to scan k-1
@@ -121,7 +125,7 @@ def _records(
             initial=guess,
             reference=reference,
         )
-        before = guess if reference is None else reference
+        before = step(frame) if step is not None and k else guess if reference is None else reference
         if progress is not None:
             progress(k + 1, len(sequence))
 

@@ -11,12 +11,11 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,10 +27,11 @@ from hybridlio.learned.objective import objective
 from hybridlio.learned.odometry_network import OdometryNetwork
 from hybridlio.learned.pairs import PairBatch, Pairs, shaken
 from hybridlio.learned.processes import Processes, processes
-from hybridlio.learned.settings import OptimiserSettings, Recipe, to_dict
+from hybridlio.learned.schedule import epoch_order, learning_rate
+from hybridlio.learned.settings import Recipe, to_dict
 from hybridlio.learned.training_log import TrainingLog
-from hybridlio.learned.validation import validate
-from hybridlio.learned.weights import save_weights
+from hybridlio.learned.validation import Validation, validate
+from hybridlio.learned.weights import put_weights, save_weights
 
 CHECKPOINT = "checkpoint.pt"
 WEIGHTS = "weights.safetensors"
@@ -69,7 +69,7 @@ class RunOptions:
         device: where to compute; by default a GPU where there is one.
         checkpoint_every: steps between checkpoints; there is one at the end of each epoch too.
         validate_every: epochs between validations.
-        max_steps: stop after so many steps in all, with a checkpoint.
+        max_steps: end after so many steps in all.
         max_seconds: stop after so long, with a checkpoint.
     """
 
@@ -80,27 +80,16 @@ class RunOptions:
     max_seconds: float | None = None
 
 
-def learning_rate(settings: OptimiserSettings, epoch: float) -> float:
-    """The rate at a time, in epochs."""
-    if settings.schedule == "cosine":
-        return settings.learning_rate * 0.5 * (1 + math.cos(math.pi * min(epoch / settings.epochs, 1.0)))
-    return settings.learning_rate * settings.step_factor ** int(epoch / settings.step_epochs)
-
-
-def epoch_order(settings: OptimiserSettings, epoch: int, pairs: int) -> list[list[int]]:
-    """The pairs of each step of an epoch: a shuffle that depends on the seed and the epoch alone."""
-    order = np.random.default_rng([settings.seed, epoch]).permutation(pairs).tolist()
-    return [order[start : start + settings.batch] for start in range(0, pairs, settings.batch)]
-
-
 def train(
     recipe: Recipe,
     pairs: Pairs,
     out: str | os.PathLike[str],
     validation: Pairs | None = None,
-    start: dict[str, Tensor] | None = None,
+    start: Mapping[str, Tensor] | None = None,
     options: RunOptions | None = None,
     progress: Callable[[TrainingProgress], None] | None = None,
+    validated: Callable[[int, Validation], None] | None = None,
+    about: Mapping[str, str] | None = None,
 ) -> OdometryNetwork:
     """Train a network, or go on training it, and return it.
 
@@ -109,20 +98,24 @@ def train(
         pairs: to train on.
         out: the run's folder.
         validation: pairs on which the error left and the drift are measured as training goes.
-        start: weights to start from, such as shipped ones; not looked at when resuming.
+        start: weights to start from, such as shipped ones, as :func:`hybridlio.learned.weights.own_tensors` names
+            them; not looked at when resuming.
         options: how to carry it out.
         progress: called after every step, in the first process only.
+        validated: called after every validation with the steps done and what was found, in the first process only.
+        about: more to say in the weights' metadata.
 
     Raises:
-        ConfigError: the folder holds a run of another recipe or on other data; names what differs.
+        ConfigError: the folder holds a run of another recipe or on other data, or the weights to start from do not fit;
+            names what differs.
         EstimationError: the loss or its gradient is not finite any more; the last good checkpoint is kept.
         DataError: the folder's checkpoint cannot be read.
     """
     options = options or RunOptions()
     with processes(options.device) as place:
-        run = _Run(recipe, pairs, Path(out), place, options, start)
+        run = _Run(recipe, pairs, Path(out), place, options, start, about or {})
         try:
-            run.train(validation, progress)
+            run.train(validation, progress, validated)
         finally:
             run.log.close() if run.log else None
         return run.network
@@ -138,9 +131,11 @@ class _Run:
         out: Path,
         place: Processes,
         options: RunOptions,
-        start: dict[str, Tensor] | None,
+        start: Mapping[str, Tensor] | None,
+        about: Mapping[str, str],
     ) -> None:
         self.recipe, self.pairs, self.out, self.place, self.options = recipe, pairs, out, place, options
+        self.about = about
         settings = recipe.optimiser
         torch.manual_seed(settings.seed)
         self.network = OdometryNetwork(recipe.network).to(place.device)
@@ -154,7 +149,7 @@ class _Run:
             checkpoints.restore(found, self.network, self.optimiser)
             self.step = found.step
         elif start is not None:
-            self.network.load_state_dict(start)
+            put_weights(self.network, start, "the weights to start from")
         place.wait()  # before the first process writes where the others look
         self.log = TrainingLog(out, self.step) if place.leads else None
         if place.leads:
@@ -163,7 +158,12 @@ class _Run:
         self.steps_an_epoch = math.ceil(len(pairs) / settings.batch)
         self.steps = self.steps_an_epoch * settings.epochs
 
-    def train(self, validation: Pairs | None, progress: Callable[[TrainingProgress], None] | None) -> None:
+    def train(
+        self,
+        validation: Pairs | None,
+        progress: Callable[[TrainingProgress], None] | None,
+        validated: Callable[[int, Validation], None] | None,
+    ) -> None:
         began, first = time.monotonic(), self.step
         last = min(self.steps, self.options.max_steps or self.steps)
         self.network.train()
@@ -173,7 +173,7 @@ class _Run:
                 seconds = time.monotonic() - began
                 self._after_step(loss, po2pl, (self.step - first) / seconds, progress)
                 if self.step % self.steps_an_epoch == 0:
-                    self._after_epoch(validation)
+                    self._after_epoch(validation, validated)
                 if self.options.max_seconds is not None and self._agreed(seconds > self.options.max_seconds):
                     break
         except KeyboardInterrupt:
@@ -181,8 +181,8 @@ class _Run:
                 self._save()
             raise
         self._save()
-        if self.step == self.steps and self.place.leads:
-            save_weights(self.out / WEIGHTS, self.network, self.recipe, self._about())
+        if self.step >= last and self.place.leads:
+            save_weights(self.out / WEIGHTS, self.network, self.recipe, self._told())
 
     def _batches(self, last: int) -> Iterator[tuple[list[int], PairBatch]]:
         """The pairs of each remaining step and this process's share of them, read one step ahead."""
@@ -259,16 +259,18 @@ class _Run:
         if self.step % self.options.checkpoint_every == 0:
             self._save()
 
-    def _after_epoch(self, validation: Pairs | None) -> None:
+    def _after_epoch(self, validation: Pairs | None, validated: Callable[[int, Validation], None] | None) -> None:
         due = self.step // self.steps_an_epoch % self.options.validate_every == 0
         if validation is not None and due and self.log is not None:
             found = validate(self.network, validation, self.recipe, self.place.device)
             self.log.write(self.step, **{f"validation/{name}": value for name, value in asdict(found).items()})
+            if validated is not None:
+                validated(self.step, found)
         self._save()
 
-    def _about(self) -> dict[str, str]:
+    def _told(self) -> dict[str, str]:
         data = ", ".join(f"{shard.info.name} ({len(shard)} scans)" for shard in self.pairs.shards)
-        return {"data": data, "pairs": str(len(self.pairs)), "steps": str(self.step)}
+        return {"data": data, "pairs": str(len(self.pairs)), "steps": str(self.step), **self.about}
 
     def _agreed(self, mine: bool) -> bool:
         """Whether any process says so: all stop at the same step."""

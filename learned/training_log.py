@@ -1,4 +1,4 @@
-"""The log of a training run: one JSON object a line, and the same for TensorBoard where that is installed."""
+"""The log of a training run: one JSON object a line, and the same as event files, which TensorBoard reads."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from hybridlio.files import write_whole
 
 
 class TrainingLog:
-    """Rows of numbers by step, in ``log.jsonl`` and, with TensorBoard, in ``tensorboard/``.
+    """Rows of numbers by step, in ``log.jsonl`` and in ``tensorboard/``.
+
+    Event files are written by tensorboardX, which needs no TensorBoard; a bare training machine may do without either.
 
     Args:
         folder: of the run.
@@ -49,8 +51,8 @@ def read_log(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
 
 
 def _tensorboard(folder: Path, step: int) -> Any:
-    if importlib.util.find_spec("tensorboard") is None:
+    if importlib.util.find_spec("tensorboardX") is None:
         return None
-    from torch.utils.tensorboard import SummaryWriter
+    from tensorboardX import SummaryWriter
 
-    return SummaryWriter(str(folder), purge_step=step + 1)
+    return SummaryWriter(str(folder), purge_step=step + 1 if step else None, write_to_disk=True)

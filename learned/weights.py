@@ -18,7 +18,8 @@ from hybridlio import __version__
 from hybridlio.errors import ConfigError, DataError
 from hybridlio.files import write_whole
 from hybridlio.learned.odometry_network import OdometryNetwork
-from hybridlio.learned.settings import Recipe, from_dict, to_dict
+from hybridlio.learned.settings import NetworkSettings, Recipe, from_dict, to_dict
+from hybridlio.learned.source_settings import SHIPPED
 
 _LISTED = 6  # mismatches that a message names
 
@@ -50,6 +51,12 @@ class Weights:
     recipe: Recipe
     about: Mapping[str, str]
     tensors: Mapping[str, Tensor]
+
+    def fitting(self, network: NetworkSettings) -> Mapping[str, Tensor]:
+        """Those tensors that a network of these settings starts from: where initial poses are given, no LSTMs'."""
+        if self.recipe.network.imu == "initial-pose" and network.imu == "given":
+            return {name: tensor for name, tensor in self.tensors.items() if not name.startswith("imu_network.")}
+        return self.tensors
 
     def network(self, device: torch.device | str = "cpu") -> OdometryNetwork:
         """The trained network, ready for inference."""
@@ -103,6 +110,15 @@ def save_weights(
     }
     tensors = {name: tensor.cpu().contiguous() for name, tensor in own_tensors(network).items()}
     write_whole(path, save(tensors, metadata))
+
+
+def weights_path(name: str | os.PathLike[str]) -> Path:
+    """The file of a name as settings have it: a path, or ``shipped``.
+
+    Raises:
+        ConfigError: no weights are shipped.
+    """
+    return shipped() if str(name) == SHIPPED else Path(name).expanduser()
 
 
 def load_weights(path: str | os.PathLike[str]) -> Weights:

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -78,3 +79,40 @@ def tiny_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from hybridlio.simulation import SimulationConfig, simulate
 
     return simulate(tmp_path_factory.mktemp("drive"), SimulationConfig(seconds=2.5, seed=3, lidar="16-beam"))
+
+
+@pytest.fixture(scope="session")
+def untrained_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights for the 16-beam lidar that know nothing yet.
+
+    Their LSTMs go on at the last velocity without turning, and their residual is that of the untrained projective steps
+    alone, which suffices for a decimetre.
+    """
+    import torch
+
+    from hybridlio.learned.odometry_network import OdometryNetwork
+    from hybridlio.learned.settings import NetworkSettings, Recipe
+    from hybridlio.learned.weights import save_weights
+    from hybridlio.projection import MAP_GEOMETRIES
+
+    small: dict[str, Any] = {
+        "imu_hidden": 8,
+        "imu_layers": 1,
+        "stem": 8,
+        "stages": (8, 16),
+        "blocks": 1,
+        "features": 16,
+    }
+    settings = NetworkSettings(
+        geometry=MAP_GEOMETRIES["16-beam"], siamese="twins", normalisation="group", velocity=True, projective_steps=4,
+        residual_scale=1e-9, **small,
+    )  # fmt: skip
+    torch.manual_seed(0)
+    network = OdometryNetwork(settings)
+    assert network.imu_network is not None
+    for layer in (network.imu_network.translation, network.imu_network.rotation):
+        torch.nn.init.zeros_(layer.weight)
+        torch.nn.init.zeros_(layer.bias)
+    path = tmp_path_factory.mktemp("weights") / "untrained.safetensors"
+    save_weights(path, network, Recipe("untrained", settings), {"data": "none"})
+    return path

@@ -13,7 +13,20 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = {"torch", "gtsam", "open3d", "matplotlib", "small_gicp", "scipy", "pydantic", "typer", "joblib"}
 # the only modules of hybridlio that may know that graph and learned exist
-JOINING = ("__main__", "batch", "cli", "compare", "odometry", "run", "run_folder", "run_outputs", "sources")
+JOINING = (
+    "__main__",
+    "batch",
+    "cli",
+    "compare",
+    "config",
+    "odometry",
+    "recipes",
+    "run",
+    "run_folder",
+    "run_outputs",
+    "sources",
+    "training_data",
+)
 MAX_MODULE_LINES, MAX_TEST_LINES, MAX_FUNCTION_LINES, MAX_IMPORT_S = 300, 400, 60, 0.3
 
 
@@ -161,3 +174,9 @@ def test_importing_hybridlio_is_quick_and_loads_no_heavy_library():
     runs = [import_in_a_new_process() for _ in range(5)]
     assert min(spent for spent, _ in runs) < MAX_IMPORT_S
     assert not HEAVY & runs[0][1]
+
+
+def test_the_configuration_loads_no_pytorch():
+    code = "import sys; from hybridlio.config import Config; Config(); print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False"]

@@ -62,7 +62,7 @@ def shipped_files(root: Path) -> set[str]:
     for package in PACKAGES:
         for path in (root / package).rglob("*"):
             inside = path.relative_to(root).as_posix()
-            if path.suffix in {".py", ".typed", ".jinja", ".safetensors"} and not inside.startswith(LINKS):
+            if path.suffix in {".py", ".typed", ".jinja", ".safetensors", ".csv"} and not inside.startswith(LINKS):
                 found.add(inside if package == "hybridlio" else f"hybridlio/{inside}")
     return found
 

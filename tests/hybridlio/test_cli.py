@@ -315,7 +315,9 @@ def test_progress_goes_to_stderr_so_that_results_can_be_piped(tiny_drive, tmp_pa
     assert "(100 %)" not in result.stdout
 
 
-@pytest.mark.parametrize("words", [["--version"], ["--help"], ["odometry", "--help"], ["compare", "--help"]])
+@pytest.mark.parametrize(
+    "words", [["--version"], ["--help"], ["odometry", "--help"], ["compare", "--help"], ["train", "--help"]]
+)
 def test_help_and_version_load_no_heavy_library(words, project_root):
     code = (
         f"import sys; from hybridlio.cli import app; sys.argv[1:] = {words!r}\n"

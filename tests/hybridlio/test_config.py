@@ -24,6 +24,8 @@ def test_changed_settings_round_trip_through_yaml(tmp_path: Path):
                 "registration": {"kernel_m": 0.2},
                 "local_map": {"voxel_m": 0.5},
             },
+            "lstm": {"weights": "mine.safetensors"},
+            "network": {"refine_steps": 3, "start_speeds_m_s": [0.0]},
         },
         "here",
     )
@@ -32,6 +34,7 @@ def test_changed_settings_round_trip_through_yaml(tmp_path: Path):
     assert again == changed
     assert again.imu_noise == ImuNoise(gyro_rad_s_sqrt_hz=1e-4)
     assert again.scan_matching.start_speeds_m_s == (0.0, 12.5)
+    assert (again.lstm.weights, again.network.refine_steps) == ("mine.safetensors", 3)
     assert again != Config()
 
 
@@ -64,6 +67,8 @@ def test_an_empty_file_is_the_defaults(tmp_path: Path):
         ({"scan_matching": {"voxel_m": 1.0}}, "scan_matching.voxel_m"),
         ({"scan_matching": {"registration": {"kernel": 1.0}}}, "scan_matching.registration.kernel"),
         ({"scan_matching": {"local_map": {"voxel": 1.0}}}, "scan_matching.local_map.voxel"),
+        ({"network": {"steps": 1}}, "network.steps"),
+        ({"lstm": {"weight": "a"}}, "lstm.weight"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -83,6 +88,8 @@ def test_an_unknown_key_at_any_level_is_an_error_that_gives_its_path(tmp_path: P
         ({"scan_matching": {"min_points": "many"}}, "scan_matching.min_points"),
         ({"scan_matching": 3}, "scan_matching"),
         ({"backend": 7}, "backend"),
+        ({"network": {"min_cells": 0}}, "network"),
+        ({"network": {"refine_steps": "some"}}, "network.refine_steps"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

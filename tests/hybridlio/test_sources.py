@@ -17,6 +17,7 @@ from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.errors import ConfigError
 from hybridlio.estimates import Backend, InitialPoseSource, RelativePose, ResidualSource, State
+from hybridlio.learned.source_settings import LstmSettings, NetworkResidualSettings
 from hybridlio.odometry import Odometry
 from hybridlio.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples, Scan
 from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES, Setup, check_names
@@ -36,8 +37,15 @@ def frames(sequence: Sequence) -> list[Frame]:
 
 
 @pytest.fixture(scope="module")
-def setup(sequence: Sequence) -> Setup:
-    return Setup(Config(), sequence.calibration, ImuNoise())
+def config(untrained_weights: Path) -> Config:
+    """What the learned sources need for the drive's lidar: the shipped weights are for another one."""
+    path = str(untrained_weights)
+    return Config(lstm=LstmSettings(path, "cpu"), network=NetworkResidualSettings(path, "cpu", min_cells=200))
+
+
+@pytest.fixture(scope="module")
+def setup(sequence: Sequence, config: Config) -> Setup:
+    return Setup(config, sequence.calibration, ImuNoise())
 
 
 def true_step(sequence: Sequence, i: int, j: int) -> RelativePose:
@@ -281,8 +289,8 @@ def test_a_backend_survives_failed_steps_and_missing_samples(
 
 @pytest.mark.parametrize("residual", RESIDUAL)
 @pytest.mark.parametrize("initial", INITIAL)
-def test_any_initial_pose_goes_with_any_residual(initial: str, residual: str, frames: list[Frame]):
-    odometry = Odometry(initial, residual)
+def test_any_initial_pose_goes_with_any_residual(initial: str, residual: str, frames: list[Frame], config: Config):
+    odometry = Odometry(initial, residual, config=config)
     for frame in frames[:4]:
         estimate = odometry.step(frame)
         assert np.isfinite(estimate.pose).all()

@@ -11,8 +11,9 @@ from hybridlio.errors import ConfigError, DataError
 from hybridlio.estimates import RelativePose, State
 from hybridlio.information import covariance_of, degenerate_directions, newton_step
 from hybridlio.learned.lstm_initial_pose import LstmInitialPose
-from hybridlio.learned.network_residual import NetworkResidual, NetworkResidualSettings
+from hybridlio.learned.network_residual import NetworkResidual
 from hybridlio.learned.odometry_network import OdometryNetwork
+from hybridlio.learned.source_settings import LstmSettings, NetworkResidualSettings
 from hybridlio.learned.weights import save_weights
 from hybridlio.preparation import PreparationOptions, prepare
 from hybridlio.projection import MapGeometry
@@ -46,7 +47,8 @@ def frame(k: int, imu: bool = True) -> Frame:
 
 
 def source(weights_path, scans, settings=FEW) -> NetworkResidual:
-    residual = NetworkResidual(weights_path, lambda scan: scans[scan.stamp_ns // 10**8], settings)
+    settings = replace(settings, weights=str(weights_path))
+    residual = NetworkResidual(lambda _: lambda scan: scans[scan.stamp_ns // 10**8], settings)
     residual.start(frame(0))
     return residual
 
@@ -135,14 +137,17 @@ def test_any_networks_residual_serves_any_initial_pose(weights, seen, changes):
 
 
 def test_both_run_in_the_odometry_as_objects_of_ones_own(weights, tiny_drive):
-    options = PreparationOptions(geometry=GEOMETRY, loss_points=2000, threads=1)
-    residual = NetworkResidual(
-        weights(geometry=GEOMETRY), partial(prepare, options=options), replace(FEW, refine_steps=10)
-    )
+    path = str(weights(geometry=GEOMETRY))
+
+    def prepare_for(recipe):
+        assert recipe.network.geometry == GEOMETRY
+        return partial(prepare, options=PreparationOptions(geometry=GEOMETRY, loss_points=2000, threads=1))
+
+    residual = NetworkResidual(prepare_for, replace(FEW, weights=path, refine_steps=10))
     sequence = hl.open_sequence(tiny_drive).part(0, 8)
     true = se3.between(sequence.reference.poses[:-1], sequence.reference.poses[1:])
     steps = {}
-    for initial_pose in (LstmInitialPose(weights(geometry=GEOMETRY)), "preintegration"):
+    for initial_pose in (LstmInitialPose(LstmSettings(path)), "preintegration"):
         odometry = hl.Odometry(initial_pose=initial_pose, residual=residual)
         steps[initial_pose] = [odometry.step(frame).relative for frame in sequence][1:]
     untrained, found = steps.values()
@@ -159,10 +164,10 @@ def state() -> State:
 
 
 def test_the_lstms_predict_and_learn_how_sure_they_are(weights):
-    lstm = LstmInitialPose(weights())
+    lstm = LstmInitialPose(LstmSettings(str(weights())))
     first = lstm.predict(frame(1), state())
     assert first.from_imu
-    assert np.array_equal(first.pose, LstmInitialPose(weights()).predict(frame(1), state()).pose)
+    assert np.array_equal(first.pose, LstmInitialPose(LstmSettings(str(weights()))).predict(frame(1), state()).pose)
     for _ in range(200):
         predicted = lstm.predict(frame(1), state())
         lstm.correct(frame(1), RelativePose(predicted.pose @ se3.exp([0, 0, 0, 0.05, 0, 0]), WIDE, source="truth"))
@@ -172,13 +177,13 @@ def test_the_lstms_predict_and_learn_how_sure_they_are(weights):
 
 
 def test_without_samples_the_lstms_say_that_they_do_not_know(weights):
-    found = LstmInitialPose(weights()).predict(frame(1, imu=False), state())
+    found = LstmInitialPose(LstmSettings(str(weights()))).predict(frame(1, imu=False), state())
     assert not found.ok
     assert found.covariance[3, 3] > 1.0
 
 
 def test_a_velocity_conditioned_lstm_goes_on_at_the_last_steps_velocity(weights):
-    lstm = LstmInitialPose(weights(velocity=True))
+    lstm = LstmInitialPose(LstmSettings(str(weights(velocity=True))))
     still = lstm.predict(frame(1), state()).pose
     lstm.correct(frame(1), RelativePose(se3.exp([0, 0, 0, 1.0, 0, 0]), WIDE, source="truth"))
     assert lstm.predict(frame(1), state()).pose[0, 3] - still[0, 3] == pytest.approx(1.0, abs=0.3)
@@ -186,7 +191,7 @@ def test_a_velocity_conditioned_lstm_goes_on_at_the_last_steps_velocity(weights)
 
 def test_weights_that_predict_no_initial_pose_are_refused(weights):
     with pytest.raises(ConfigError, match="none"):
-        LstmInitialPose(weights(imu="none"))
+        LstmInitialPose(LstmSettings(str(weights(imu="none"))))
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,9 @@ from hybridlio.errors import ConfigError, DataError, EstimationError
 from hybridlio.learned import checkpoints
 from hybridlio.learned.odometry_network import OdometryNetwork
 from hybridlio.learned.pairs import Pairs
+from hybridlio.learned.schedule import epoch_order, learning_rate
 from hybridlio.learned.settings import OptimiserSettings, to_dict
-from hybridlio.learned.training import RunOptions, epoch_order, learning_rate, train
+from hybridlio.learned.training import RunOptions, train
 from hybridlio.learned.training_log import TrainingLog, read_log
 from hybridlio.learned.validation import validate
 from hybridlio.learned.weights import load_weights

@@ -1,0 +1,64 @@
+"""Settings of the learned sources at run time. Importing them loads no PyTorch: the configuration holds them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hybridlio.errors import ConfigError
+
+SHIPPED = "shipped"
+"""In place of a path: the weights that come with the package."""
+
+
+@dataclass(frozen=True)
+class LstmSettings:
+    """How the LSTMs' initial poses are made.
+
+    Attributes:
+        weights: path of a weights file whose network has ``imu="initial-pose"``, or ``shipped``.
+        device: where it computes, as PyTorch names it; ``auto`` is a GPU where there is one.
+    """
+
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
+
+    weights: str = SHIPPED
+    device: str = "auto"
+
+
+@dataclass(frozen=True)
+class NetworkResidualSettings:
+    """How the residual network's answer is made and weighed.
+
+    Attributes:
+        weights: path of a weights file, or ``shipped``.
+        device: where it computes, as PyTorch names it; ``auto`` is a GPU where there is one.
+        min_cells: with fewer cells that have a normal in either map a scan is bridged by the initial pose.
+        min_matched: with a smaller share of points matched, too.
+        covariance_scale: how much larger the covariance is than independent residuals would make it.
+        refine_steps: Gauss-Newton steps down the loss after the network; 0 leaves its answer.
+        kernel_m, max_distance_m: of the robust loss that weighs the answer.
+        start_speeds_m_s: forward speeds tried, by the loss, where the initial pose is unsure of the translation.
+    """
+
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
+
+    weights: str = SHIPPED
+    device: str = "auto"
+    min_cells: int = 500
+    min_matched: float = 0.3
+    covariance_scale: float = 6.0
+    refine_steps: int = 0
+    kernel_m: float = 0.1
+    max_distance_m: float = 1.0
+    start_speeds_m_s: tuple[float, ...] = (0.0, -5.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0)
+
+    def __post_init__(self) -> None:
+        if self.min_cells < 1 or not 0 <= self.min_matched <= 1 or self.refine_steps < 0:
+            raise ConfigError(
+                "network: need min_cells >= 1, min_matched within 0 and 1, refine_steps >= 0, got "
+                f"{self.min_cells}, {self.min_matched}, {self.refine_steps}"
+            )
+        positive = ("covariance_scale", "kernel_m", "max_distance_m")
+        wrong = [f"{name} {getattr(self, name)}" for name in positive if not getattr(self, name) > 0]
+        if wrong or not self.start_speeds_m_s:
+            raise ConfigError(f"network: {', '.join(wrong) or 'start_speeds_m_s'} must be positive or not empty")

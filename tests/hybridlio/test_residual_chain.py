@@ -1,0 +1,81 @@
+"""Two residual sources in a row: who starts where, whose answer counts, and what is left when one fails."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybridlio import se3
+from hybridlio.estimates import RelativePose
+from hybridlio.residual_chain import ResidualChain
+from hybridlio.sensors import Frame, Scan
+
+FRAME = Frame(3, Scan(0, np.ones((1, 3), np.float32)))
+INITIAL = RelativePose(se3.exp([0, 0, 0.01, 1, 0, 0]), np.eye(6) * 0.04, "guess", from_imu=True)
+
+
+class Moved:
+    """Moves the initial pose ahead and remembers what it was given."""
+
+    def __init__(self, name, metres, sigma=0.01, ok=True):
+        self.name, self._metres, self._covariance, self._ok = name, metres, np.eye(6) * sigma**2, ok
+        self.started, self.given = [], []
+
+    def start(self, frame):
+        self.started.append(frame.index)
+
+    def refine(self, _, initial):
+        self.given.append(initial)
+        if not self._ok:
+            return replace(initial, ok=False, details={"points": 7.0})
+        pose = initial.pose @ se3.exp([0, 0, 0, self._metres, 0, 0])
+        return RelativePose(pose, self._covariance, self.name, details={"cost": self._metres})
+
+
+def ahead_m(relative):
+    return se3.log(se3.between(INITIAL.pose, relative.pose))[3]
+
+
+def test_the_second_starts_where_the_first_has_got_to_and_has_the_last_word():
+    first, second = Moved("coarse", 0.2), Moved("fine", 0.03)
+    chain = ResidualChain(first, second)
+    chain.start(FRAME)
+    found = chain.refine(FRAME, INITIAL)
+    assert first.started == second.started == [3]
+    assert chain.name == found.source == "coarse+fine"
+    assert ahead_m(second.given[0]) == pytest.approx(0.2)
+    assert ahead_m(found) == pytest.approx(0.23)
+    assert np.array_equal(found.covariance, np.eye(6) * 0.01**2)
+    assert found.details == {"coarse ok": 1, "coarse cost": 0.2, "fine ok": 1, "fine cost": 0.03}
+
+
+def test_where_the_first_fails_the_second_starts_at_the_initial_pose():
+    second = Moved("fine", 0.03)
+    found = ResidualChain(Moved("coarse", 0.2, ok=False), second).refine(FRAME, INITIAL)
+    assert second.given == [INITIAL]
+    assert found.ok
+    assert found.details["coarse ok"] == 0
+    assert ahead_m(found) == pytest.approx(0.03)
+
+
+def test_where_the_second_fails_the_firsts_answer_stands():
+    found = ResidualChain(Moved("coarse", 0.2), Moved("fine", 0.0, ok=False)).refine(FRAME, INITIAL)
+    assert found.ok
+    assert ahead_m(found) == pytest.approx(0.2)
+    assert np.array_equal(found.covariance, np.eye(6) * 0.01**2)
+    assert found.details["fine ok"] == 0
+
+
+def test_where_both_fail_the_initial_pose_bridges_and_the_details_say_so():
+    found = ResidualChain(Moved("coarse", 0.2, ok=False), Moved("fine", 0.0, ok=False)).refine(FRAME, INITIAL)
+    assert not found.ok
+    assert (found.source, found.from_imu) == ("guess", True)
+    assert np.allclose(found.pose, INITIAL.pose, atol=1e-15)
+    assert np.array_equal(found.covariance, INITIAL.covariance)
+    assert (found.details["coarse ok"], found.details["fine ok"]) == (0, 0)
+
+
+def test_a_direction_that_the_first_leaves_loose_is_not_less_sure_than_the_initial_pose_had_it():
+    second = Moved("fine", 0.0)
+    ResidualChain(Moved("coarse", 0.0, sigma=10.0), second).refine(FRAME, INITIAL)
+    assert np.sqrt(np.diag(second.given[0].covariance)).max() <= 0.2
