@@ -55,10 +55,11 @@ class ImuNetwork(nn.Module):
     def forward(self, imu: Tensor, velocity_m_s: Tensor | None = None, dt_s: Tensor | None = None) -> Tensor:
         """Initial poses ``T_k_k1`` ``(B, 4, 4)``; arguments as :meth:`features`, ``dt_s`` ``(B,)`` between scans."""
         of_accel, of_gyro = self.features(imu, velocity_m_s)
-        t = self.translation(of_accel)
+        scale = self.settings.output_scale
+        t = scale * self.translation(of_accel)
         if self.settings.velocity and velocity_m_s is not None and dt_s is not None:
             t = t + velocity_m_s * dt_s[:, None]
-        turned = self.rotation(of_gyro)
+        turned = scale * self.rotation(of_gyro)
         if self.settings.mean_rate and dt_s is not None:
             gyro = imu[..., :3]
             mean = ((gyro[:, 1:] + gyro[:, :-1]) / 2).mean(dim=1)

@@ -95,7 +95,7 @@ def normal_map(vertices: Tensor) -> Tensor:
         valid = valid & (its_depth > 0)
         arms.append(torch.exp(-0.5 * (its_depth - depth).abs())[..., None, :, :] * (neighbour - vertices))
     up, right_, below, left = arms
-    total = torch.linalg.cross(up - below, right_ - left, dim=-3)  # the four cyclic products in one
+    total = cross(up - below, right_ - left, dim=-3)  # the four cyclic products in one
     length = total.square().sum(-3).sqrt()
     valid = valid & (length > 0)
     sign = torch.where((total * vertices).sum(-3) > 0, -1.0, 1.0)
@@ -110,6 +110,12 @@ def _shifted(values: Tensor, down: int, right: int) -> Tensor:
         edge = 0 if down > 0 else -1
         moved[..., edge, :] = 0.0
     return moved
+
+
+def cross(a: Tensor, b: Tensor, dim: int) -> Tensor:
+    """Cross products along a dimension of size 3: on a CPU several times as fast as PyTorch's own."""
+    (ax, ay, az), (bx, by, bz) = a.unbind(dim), b.unbind(dim)
+    return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], dim=dim)
 
 
 def remap(vertices: Tensor, normals: Tensor, T_a_b: Tensor, geometry: MapGeometry) -> tuple[Tensor, Tensor]:

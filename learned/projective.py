@@ -4,7 +4,8 @@ Not in the paper. Cells are the matches: each point of the current scan, moved b
 plane of the last scan in the cell that it falls into, and one weighted Gauss-Newton step of the point-to-plane loss is
 solved in closed form. The steps are differentiable, so the unsupervised loss teaches the weights which points to trust
 (moving cars, edges, leaves): both scans go through the same convolutions once, and a point's weight is a small network
-of the features of both its cells and of its distance. Untrained, all points count alike but for a robust kernel.
+of the features of both its cells, of how rough they are and of its distance. Untrained, all points count alike but for
+a robust kernel.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import math
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from hybridlio.learned import maps, se3
 from hybridlio.learned.residual_network import CircularConv
@@ -73,38 +75,61 @@ class PointWeights(nn.Module):
         self.scale_m, self.geometry = settings.vertex_scale_m, settings.geometry
         channels = settings.weight_channels
         self.features = nn.Sequential(
-            CircularConv(6, channels, 3, (_COARSE, _COARSE), bias=True),
+            CircularConv(8, channels, 3, (_COARSE, _COARSE), bias=True),
+            nn.ReLU(),
+            CircularConv(channels, channels, 3, (1, 1), bias=True),
             nn.ReLU(),
             CircularConv(channels, channels, 3, (1, 1), bias=True),
             nn.ReLU(),
         )
         self.of_last = nn.Conv2d(channels, channels, 1)
         self.of_current = nn.Conv2d(channels, channels, 1, bias=False)
-        self.of_distance = nn.Conv1d(1, channels, 1, bias=False)
+        self.of_point = nn.Conv1d(3, channels, 1, bias=False)
         self.logit = nn.Conv1d(channels, 1, 1)
         for parameter in self.logit.parameters():
             nn.init.zeros_(parameter)
 
     def forward(self, last: Maps, current: Maps) -> _Logits:
         """The weights' logits, as a function of the cells that points fall into and their distances there."""
-        both = [torch.cat([vertices / self.scale_m, normals], dim=1) for vertices, normals in (last, current)]
-        of_last, of_current = self.features(torch.cat(both)).chunk(2)
+        rough = [_roughness(*both) for both in (last, current)]
+        seen = [
+            torch.cat([v / self.scale_m, n, r, (v != 0).any(1, keepdim=True)], dim=1)
+            for (v, n), r in zip((last, current), rough, strict=True)
+        ]
+        of_last, of_current = self.features(torch.cat(seen)).chunk(2)
         coarse = _coarse_cells(self.geometry, of_last.device)
         own = self.of_current(of_current).flatten(2)[..., coarse]
-        return _Logits(self, self.of_last(of_last).flatten(2), own, coarse)
+        return _Logits(self, self.of_last(of_last).flatten(2), own, coarse, rough[0].flatten(2), rough[1].flatten(2))
 
 
 class _Logits:
     """Logits ``(B, 1, N)`` of points by the flat cells ``(B, N)`` they fall into and their distances ``(B, 1, N)``."""
 
-    def __init__(self, net: PointWeights, of_last: Tensor, own: Tensor, coarse: Tensor) -> None:
+    def __init__(
+        self, net: PointWeights, of_last: Tensor, own: Tensor, coarse: Tensor, rough_last: Tensor, rough_own: Tensor
+    ) -> None:
         self.net, self.of_last, self.own, self.coarse = net, of_last, own, coarse
+        self.rough_last, self.rough_own = rough_last, rough_own
 
     def __call__(self, cell: Tensor, distance: Tensor) -> Tensor:
         there = self.coarse[cell][:, None].expand(-1, self.of_last.shape[1], -1)
         size = distance.abs().detach() / _DISTANCE_M
-        hidden = torch.relu(self.of_last.gather(2, there) + self.own + self.net.of_distance(size))
+        point = torch.cat([size, self.rough_last.gather(2, cell[:, None]), self.rough_own], dim=1)
+        hidden = torch.relu(self.of_last.gather(2, there) + self.own + self.net.of_point(point))
         return self.net.logit(hidden)  # type: ignore[no-any-return]
+
+
+def _roughness(vertices: Tensor, normals: Tensor) -> Tensor:
+    """``(B, 1, H, W)`` how far cells lie from between their neighbours along their normals, in units of 0.1 m, up to 5.
+
+    0 where there is no normal. On a plane it is the noise of the range.
+    """
+    around = functional.pad(vertices, (1, 1, 0, 0), mode="circular")
+    beside = (around[..., 2:] + around[..., :-2]) / 2 - vertices
+    above = torch.zeros_like(vertices)
+    above[..., 1:-1, :] = (vertices[..., 2:, :] + vertices[..., :-2, :]) / 2 - vertices[..., 1:-1, :]
+    off = [(normals * offset).sum(dim=1, keepdim=True).abs() for offset in (beside, above)]
+    return (torch.maximum(*off) / _DISTANCE_M).clamp(max=5.0)
 
 
 def _coarse_cells(geometry: MapGeometry, device: torch.device) -> Tensor:
@@ -143,7 +168,7 @@ def weighted_step(normals: Tensor, points: Tensor, distance: Tensor, weights: Te
         distance, weights: ``(B, 1, N)``.
     """
     # d of Exp(ξ)·p is n·(ω × p + v) = (p × n)·ω + n·v
-    J = torch.cat([torch.linalg.cross(points, normals, dim=1) / _LEVER_M, normals], dim=1)
+    J = torch.cat([maps.cross(points, normals, dim=1) / _LEVER_M, normals], dim=1)
     weighted = J * weights
     total = weights.sum(-1, keepdim=True).clamp(min=1e-6)
     H = weighted @ J.transpose(1, 2) / total

@@ -136,7 +136,8 @@ class ResidualNetwork(nn.Module):
             rotation_parts = [*parts, of_gyro] if separate else [*parts, of_accel, of_gyro]
         t = self.translation(self.translation_head(torch.cat(translation_parts, dim=1)).float())
         angles = self.rotation(self.rotation_head(torch.cat(rotation_parts, dim=1)).float())
-        return se3.make(rotation_matrix(angles.float(), self.settings), t.float())
+        scale = self.settings.output_scale
+        return se3.make(rotation_matrix(scale * angles.float(), self.settings), scale * t.float())
 
     def _vertex_pair(self, last: tuple[Tensor, Tensor], current: tuple[Tensor, Tensor]) -> Tensor:
         channels = [last[0] / self.settings.vertex_scale_m, current[0] / self.settings.vertex_scale_m]

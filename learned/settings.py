@@ -53,6 +53,8 @@ class NetworkSettings:
         weight_channels: of the network that gives their weights; 0 takes the robust kernel's weights alone.
         vertex_scale_m: vertices are divided by it.
         residual_scale: the last layers' weights start smaller by it, so that training starts near δT = 1.
+        output_scale: what the last layers give is multiplied by it, since Adam's steps are as large however small a
+            layer's outputs should be; not in the paper.
     """
 
     imu: Literal["initial-pose", "feature", "none", "given"] = "initial-pose"
@@ -80,11 +82,12 @@ class NetworkSettings:
     weight_channels: int = 8
     vertex_scale_m: float = 1.0
     residual_scale: float = 0.1
+    output_scale: float = 1.0
 
     def __post_init__(self) -> None:
         _check_choices(self)
         positive = ("imu_samples", "imu_hidden", "imu_layers", "stem", "blocks", "features", "pooled_columns")
-        _check_positive(self, *positive, "iterations", "vertex_scale_m", "residual_scale")
+        _check_positive(self, *positive, "iterations", "vertex_scale_m", "residual_scale", "output_scale")
         if (
             min(self.projective_steps, self.weight_channels) < 0
             or len(self.stem_stride) != 2

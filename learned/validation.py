@@ -10,12 +10,11 @@ import torch
 from numpy.typing import NDArray
 
 from hybridlio import se3
-from hybridlio.drift import kitti_drift, lengths_for
+from hybridlio.learned.driving import drift_of
 from hybridlio.learned.objective import objective
 from hybridlio.learned.odometry_network import OdometryNetwork
 from hybridlio.learned.pairs import Pairs, shaken
 from hybridlio.learned.settings import Recipe
-from hybridlio.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
@@ -110,21 +109,12 @@ def _drift(pairs: Pairs, steps: Steps) -> tuple[float | None, float | None]:
     for shard in pairs.shards:
         rows = [i for i, (its_shard, _) in enumerate(places) if its_shard is shard]
         gaps = np.diff([places[i][1] for i in rows]) != 1
-        if not rows or gaps.any() or not np.isfinite(steps.reference[rows]).all():
+        if gaps.any():
             continue
-        reference, estimate = _chained(steps.reference[rows]), _chained(steps.poses[rows])
-        path_m = float(np.linalg.norm(steps.reference[rows][:, :3, 3], axis=1).sum())
-        drift = kitti_drift(reference, estimate, lengths_for(path_m), step=1)
-        if len(drift):
-            found.append((drift.t_rel_percent, drift.r_rel_deg_per_100m))
+        drift = drift_of(steps.poses[rows], steps.reference[rows])
+        if drift is not None:
+            found.append(drift)
     if not found:
         return None, None
     means = np.array(found, np.float64).mean(axis=0)
     return float(means[0]), float(means[1])
-
-
-def _chained(steps: Array) -> Trajectory:
-    poses = [np.eye(4)]
-    for step in steps:
-        poses.append(se3.orthonormalise(poses[-1] @ step))
-    return Trajectory(np.arange(len(poses)) * 100_000_000, np.array(poses))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +99,20 @@ def room_shards(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def rooms(room_shards: tuple[Path, Path]) -> tuple[Shard, Shard]:
     """The two shards, opened."""
     return Shard(room_shards[0]), Shard(room_shards[1])
+
+
+@pytest.fixture
+def winding(tmp_path: Path) -> Shard:
+    """A drive of 12 scans without gaps, with a velocity at each but the first; its steps are made up."""
+    rng = np.random.default_rng(5)
+    records = []
+    for k, record in enumerate(room_records(12, 3)):
+        step = se3.exp(rng.normal(size=6) * [0, 0, 0.02, 0.1, 0.05, 0]) @ se3.exp([0, 0, 0, 0.5, 0, 0])
+        velocity = np.array([5.0, 0, 0]) if k else None
+        imu = np.zeros((15, 6), np.float32)
+        records.append(replace(record, reference=step, imu=imu, velocity_m_s=velocity))
+    write_shard(tmp_path / "winding", records, "winding", GEOMETRY, 15)
+    return Shard(tmp_path / "winding")
 
 
 @dataclass(frozen=True, eq=False)
