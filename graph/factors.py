@@ -16,10 +16,13 @@ from gtsam.symbol_shorthand import B, G, M, V, X
 from hybridlio import se3
 from hybridlio.estimates import Array, RelativePose, State
 from hybridlio.graph import noise
+from hybridlio.graph.scans import Scans
 from hybridlio.sensors import NS_PER_S
 from hybridlio.startup import GRAVITY_M_S2, GRAVITY_MAGNITUDE_SIGMA_M_S2
 
 Factors = list[gtsam.NonlinearFactor]
+
+VARIABLES = (X, V, B, G, M)  # what a scan may have
 
 _GAUGE_SIGMA = 1e-6  # the first pose defines world
 _GRAVITY_CHAIN_SIGMA_M_S2 = 1e-6  # per scan; 0.1 mm/s² after 10,000 scans
@@ -87,11 +90,37 @@ def map_factors(i: int, relative: RelativePose, drift: Array, T_imu_lidar: Array
     return graph
 
 
-def insert_map_pose(values: gtsam.Values, i: int, before: Array, after: Array, fresh: bool) -> None:
-    """Put the poses of :func:`map_factors` beside those of the IMU, ``before`` and ``after`` the step."""
-    if fresh:
-        values.insert(M(i), gtsam.Pose3(before))
-    values.insert(M(i + 1), gtsam.Pose3(after))
+def keyframe_factors(k: int, relative: RelativePose, scans: Scans, T_imu_lidar: Array) -> Factors:
+    """Scan ``k`` relative to earlier scans than the last, as far as they are still in the graph.
+
+    All of a scan's relative poses share its noise, be it the newer one or the keyframe. Where the step says how much
+    of its covariance is such scatter (``drift`` is the rest), they join the poses on the source's own path, beside
+    which the scan's pose lies by the scatter: it is then counted once (:func:`map_factors`). Else they are taken for
+    independent of each other.
+    """
+    on_path = relative.drift is not None and relative.ok
+    graph: Factors = []
+    for keyframe in relative.keyframes:
+        j = scans.number(keyframe.stamp_ns)
+        if j is not None:
+            before = M(j) if on_path and scans.is_on_path(j) else X(j)
+            pose = RelativePose(keyframe.pose, keyframe.covariance, relative.source)
+            graph.append(between_factor(before, M(k) if on_path else X(k), pose, pose.covariance, T_imu_lidar))
+    return graph
+
+
+def insert_step(
+    values: gtsam.Values, i: int, before: State, after: State, relative: RelativePose, scans: Scans
+) -> None:
+    """Put the variables of the scan after ``i`` in; ``before`` and ``after`` are the states that the two start from.
+
+    The poses of :func:`map_factors` start beside the IMU's.
+    """
+    insert_state(values, i + 1, after)
+    if relative.drift is not None:
+        if not scans.is_on_path(i):
+            values.insert(M(i), gtsam.Pose3(before.T_world_imu))
+        values.insert(M(i + 1), gtsam.Pose3(after.T_world_imu))
 
 
 def imu_factors(i: int, j: int, pim: gtsam.PreintegratedCombinedMeasurements) -> Factors:
@@ -129,12 +158,12 @@ def step_factors(
     pim: gtsam.PreintegratedCombinedMeasurements | None,
     stamp_ns: int,
     T_imu_lidar: Array,
-    fresh: bool,
+    scans: Scans,
 ) -> gtsam.NonlinearFactorGraph:
     """All factors of the step from scan ``i`` (at ``state``) to the next, at ``stamp_ns``.
 
     A relative pose that failed, or that comes from the same IMU samples, is left out where the IMU factor bridges.
-    ``fresh`` is said of :func:`map_factors`.
+    ``scans`` are those in the graph, up to ``i``.
     """
     graph = gtsam.NonlinearFactorGraph()
     if state.has_imu:
@@ -142,8 +171,10 @@ def step_factors(
         for factor in imu_factors(i, i + 1, pim) if pim else bridge_factors(i, i + 1, dt_s):
             graph.add(factor)
     if relative.drift is not None:
-        for factor in map_factors(i, relative, relative.drift, T_imu_lidar, fresh):
+        for factor in map_factors(i, relative, relative.drift, T_imu_lidar, fresh=not scans.is_on_path(i)):
             graph.add(factor)
+    for factor in keyframe_factors(i + 1, relative, scans, T_imu_lidar):
+        graph.add(factor)
     usable = relative.ok and not relative.from_imu and relative.drift is None
     if usable or (pim is None and not (relative.ok and relative.drift is not None)):
         graph.add(between_factor(X(i), X(i + 1), relative, relative.covariance, T_imu_lidar))

@@ -18,6 +18,7 @@ from hybridlio.graph import factors
 from hybridlio.graph.factor_groups import FactorGroup
 from hybridlio.graph.preintegration import covers, preintegrate
 from hybridlio.graph.robust import Added, check_treatment
+from hybridlio.graph.scans import Scans
 from hybridlio.graph.solver import incremental_solver, reason
 from hybridlio.record import Record
 from hybridlio.trajectory import Trajectory
@@ -115,18 +116,16 @@ def _build(record: Record, states: list[State]) -> tuple[gtsam.NonlinearFactorGr
     graph, _ = factors.start_factors(record.start)
     values = gtsam.Values()
     factors.insert_state(values, 0, states[0])
-    on_map = False
+    scans = Scans(states[0].stamp_ns)
     for i, relative in enumerate(record.relative):
         state, stamp_ns = states[i], states[i + 1].stamp_ns
         imu = record.imu.between(state.stamp_ns, stamp_ns)
         usable = state.has_imu and covers(imu, state.stamp_ns, stamp_ns)
         pim = preintegrate(imu, state, record.imu_noise) if usable else None
-        T_imu_lidar, fresh = record.calibration.T_imu_lidar, not on_map
-        graph.push_back(factors.step_factors(i, state, relative, pim, stamp_ns, T_imu_lidar, fresh))
-        factors.insert_state(values, i + 1, states[i + 1])
-        on_map = relative.drift is not None
-        if on_map:
-            factors.insert_map_pose(values, i, state.T_world_imu, states[i + 1].T_world_imu, fresh)
+        T_imu_lidar = record.calibration.T_imu_lidar
+        graph.push_back(factors.step_factors(i, state, relative, pim, stamp_ns, T_imu_lidar, scans))
+        factors.insert_step(values, i, state, states[i + 1], relative, scans)
+        scans.add(stamp_ns, on_path=relative.drift is not None)
     return graph, values
 
 

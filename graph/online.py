@@ -11,6 +11,7 @@ from hybridlio.errors import GraphError
 from hybridlio.estimates import RelativePose, State
 from hybridlio.graph import factors
 from hybridlio.graph.preintegration import bias_of, covers, preintegrate
+from hybridlio.graph.scans import Scans
 from hybridlio.graph.solver import incremental_solver, reason
 from hybridlio.sensors import NS_PER_S, Calibration, Frame, ImuNoise
 
@@ -28,12 +29,11 @@ class IncrementalBackend:
         self._T_lidar_imu = se3.inverse(calibration.T_imu_lidar)
         self._noise = noise
         self._k = 0
-        self._on_map = False  # whether the residual source's own path has a pose at the last scan
 
     def start(self, state: State) -> None:
         """Put the first scan's pose at the origin, the rest at ``state`` with its covariance."""
         self._k = 0
-        self._on_map = False
+        self._scans = Scans(state.stamp_ns)
         self._state = state
         self._graph, self._values = factors.start_factors(state)
         self._isam = incremental_solver()
@@ -44,22 +44,20 @@ class IncrementalBackend:
 
         Raises:
             GraphError: the graph cannot be solved; names the variable.
+            DataError: a pose relative to a keyframe names a scan that there is not.
         """
         state, stamp_ns = self._state, frame.scan.stamp_ns
         usable = state.has_imu and covers(frame.imu, state.stamp_ns, stamp_ns)
         pim = preintegrate(frame.imu, state, self._noise) if usable else None
-        fresh = not self._on_map
-        graph = factors.step_factors(self._k, state, relative, pim, stamp_ns, self._T_imu_lidar, fresh)
+        graph = factors.step_factors(self._k, state, relative, pim, stamp_ns, self._T_imu_lidar, self._scans)
         values, guess = gtsam.Values(), self._guess(frame, relative, pim)
-        factors.insert_state(values, self._k + 1, guess)
-        if relative.drift is not None:
-            factors.insert_map_pose(values, self._k, state.T_world_imu, guess.T_world_imu, fresh)
+        factors.insert_step(values, self._k, state, guess, relative, self._scans)
         try:
-            self._solve(graph, values)
+            self._solve(graph, values, self._order(relative, values))
         except RuntimeError as error:
             raise GraphError(f"frame {frame.index}: the graph cannot be solved: {reason(error)}") from error
         self._k += 1
-        self._on_map = relative.drift is not None
+        self._scans.add(stamp_ns, on_path=relative.drift is not None)
         self._state = self._read(stamp_ns)
         return self._state
 
@@ -91,9 +89,9 @@ class IncrementalBackend:
             state.covariance, state.gravity_covariance, state.has_imu,
         )  # fmt: skip
 
-    def _solve(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+    def _solve(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, order: gtsam.KeyGroupMap | None) -> None:
         if self._k >= WARM_UP_STEPS:
-            self._isam.update(graph, values)
+            self._isam.update(graph, values, [], order)
             return
         self._graph.push_back(graph)
         self._values.insert(values)
@@ -102,6 +100,22 @@ class IncrementalBackend:
         self._values = gtsam.LevenbergMarquardtOptimizer(self._graph, self._values, params).optimize()
         self._isam = incremental_solver()
         self._isam.update(self._graph, self._values)
+
+    def _order(self, relative: RelativePose, new: gtsam.Values) -> gtsam.KeyGroupMap | None:
+        """Scan by scan from the oldest that a step reaches back to; None for one that reaches to the last scan only.
+
+        By default iSAM2 eliminates all variables of the new factors last, old keyframes too; within a hundred scans
+        each update would then reach far back (fifty times as slow).
+        """
+        found = [j for k in relative.keyframes if (j := self._scans.number(k.stamp_ns)) is not None]
+        if not found or min(found) >= self._k:
+            return None
+        order = gtsam.KeyGroupMap()
+        for place, k in enumerate(range(min(found), self._k + 2)):
+            for key in (variable(k) for variable in factors.VARIABLES):
+                if self._isam.valueExists(key) or new.exists(key):
+                    order.insert2(key, place)
+        return order
 
     def _read(self, stamp_ns: int) -> State:
         k, isam = self._k, self._isam

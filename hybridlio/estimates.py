@@ -7,8 +7,8 @@ with a :class:`State`. Nothing else crosses, so any implementation of a seam goe
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,27 @@ def check_covariance(covariance: Array, name: str, size: int = 6) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
+class KeyframePose:
+    """Where a scan is relative to an earlier scan than the last one.
+
+    Attributes:
+        stamp_ns: the earlier scan's.
+        pose: ``T_j_k`` ``(4, 4)``, lidar frames.
+        covariance: ``(6, 6)``, rad² and m², rotation first, of a right perturbation. Beside a step with ``drift`` it is
+            of the pair's own error: the scans' scatter, which all their relative poses share, comes from their steps.
+    """
+
+    stamp_ns: int
+    pose: Array
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        name = f"pose relative to the scan at {self.stamp_ns} ns"
+        object.__setattr__(self, "pose", se3.check_pose(self.pose, name))
+        object.__setattr__(self, "covariance", check_covariance(self.covariance, name))
+
+
+@dataclass(frozen=True, eq=False)
 class RelativePose:
     """Where scan k+1 is relative to scan k, and how sure that is.
 
@@ -51,7 +72,8 @@ class RelativePose:
         ok: False where the source failed and only bridges (the covariance is then wide).
         drift: ``(6, 6)``, what of the covariance adds up over consecutive steps; the rest is scatter about a map that
             the next step takes back. None where the steps' errors are independent, so that all of it adds up.
-        from_imu: whether inertial data went into the pose; a graph that has the IMU itself must not count it twice.
+        from_imu: whether the pose is the inertial data's; a graph that has the IMU itself must not count it twice.
+        keyframes: the same scan k+1 relative to earlier scans than k, from a source that looks at several.
         details: the source's own diagnostics by name (inliers, iterations, error …).
     """
 
@@ -62,6 +84,7 @@ class RelativePose:
     ok: bool = True
     from_imu: bool = False
     drift: Array | None = None
+    keyframes: tuple[KeyframePose, ...] = ()
     details: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -71,6 +94,25 @@ class RelativePose:
             object.__setattr__(self, "drift", check_covariance(self.drift, f"{self.source}: drift"))
             if self.ok:  # else the pose bridges, and its covariance is no part of the path's
                 check_covariance(self.covariance - self.drift, f"{self.source}: covariance less drift")
+
+    def wider(self, times: float = 1.0, added: Array | None = None) -> RelativePose:
+        """The same poses, less sure.
+
+        Args:
+            times: by which every covariance grows.
+            added: ``(6, 6)`` to add to the step's covariance; it does not add up over steps. To those of ``keyframes``
+                too, where they do not share the step's scatter.
+        """
+        extra: Array = np.zeros((6, 6)) if added is None else added
+        shared = self.drift is not None
+        return replace(
+            self,
+            covariance=times * self.covariance + extra,
+            drift=None if self.drift is None else times * self.drift,
+            keyframes=tuple(
+                replace(k, covariance=times * k.covariance + (0 if shared else extra)) for k in self.keyframes
+            ),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +167,15 @@ class ResidualSource(Protocol):
 
     def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:
         """The refined ``T = δT·T̂`` with its covariance; ``δT`` is ``T @ inverse(T̂)``."""
+        ...
+
+
+@runtime_checkable
+class TakesBack(Protocol):
+    """A residual source that can be told that its last answer was not believed; to be so is each source's choice."""
+
+    def take_back(self, initial: RelativePose) -> None:
+        """Go on as if the last scan had failed and ``initial`` bridged it."""
         ...
 
 

@@ -18,13 +18,22 @@ FLOOR_SIGMAS = np.r_[np.full(3, 5e-5), np.full(3, 1e-3)]  # rad, m: no single st
 _UNKNOWN_SIGMA_M = 10.0
 
 
-def scaled_spectrum(information: Array) -> tuple[Array, Array, Array]:
+def lever_arms(points: Array) -> Array:
+    """``(3,)`` metres: root mean square distance of points ``(N, 3)`` from each of the sensor's axes."""
+    squares = (points**2).mean(axis=0) if len(points) else np.zeros(3)
+    return np.asarray(np.sqrt(np.maximum(squares.sum() - squares, 1e-6)))
+
+
+def scaled_spectrum(information: Array, levers_m: Array | None = None) -> tuple[Array, Array, Array]:
     """Eigenvalues ``(6,)``, eigenvectors as columns ``(6, 6)``, and the scaling ``(6,)`` that gives them one unit.
 
-    Rotations are measured in metres at the points' mean lever arm.
+    Rotations are measured in metres at the points' lever arm about each axis (:func:`lever_arms`): in a corridor that
+    of yaw is its length, that of roll its width. Without it, at the mean lever arm of what the matches constrain.
     """
-    lever = np.sqrt(max(np.trace(information[:3, :3]), 1e-12) / max(np.trace(information[3:, 3:]), 1e-12))
-    scale = np.r_[np.full(3, 1 / lever), np.ones(3)]
+    if levers_m is None:
+        mean = np.sqrt(max(np.trace(information[:3, :3]), 1e-12) / max(np.trace(information[3:, 3:]), 1e-12))
+        levers_m = np.full(3, mean)
+    scale = np.r_[1 / levers_m, np.ones(3)]
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     return values, vectors, scale
 
@@ -35,34 +44,35 @@ def strong_directions(information: Array, values: Array) -> NDArray[np.bool_]:
     return strong
 
 
-def degenerate_directions(information: Array) -> Array:
+def degenerate_directions(information: Array, levers_m: Array | None = None) -> Array:
     """``(D, 6)`` unit tangent directions along which the matches say no more than the noise of their normals."""
-    values, vectors, scale = scaled_spectrum(information)
+    values, vectors, scale = scaled_spectrum(information, levers_m)
     directions = (vectors[:, ~strong_directions(information, values)] * scale[:, None]).T
     return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
 
-def covariance_of(information: Array, sigma_m: float, scale: float) -> Array:
+def covariance_of(information: Array, sigma_m: float, scale: float, levers_m: Array | None = None) -> Array:
     """``scale·σ²·H⁻¹`` ``(6, 6)``, rad² and m², rotation first; 10 m where the matches say nothing.
 
     Args:
         information: the Hessian.
         sigma_m: standard deviation of the distances to the planes.
         scale: how much larger it is than independent residuals would make it: points on one surface share its error.
+        levers_m: of :func:`lever_arms`.
     """
-    values, vectors, to_tangent = scaled_spectrum(information)
+    values, vectors, to_tangent = scaled_spectrum(information, levers_m)
     known = values - NORMAL_NOISE * np.trace(information[3:, 3:])
     variance = np.minimum(scale * sigma_m**2 / np.maximum(known, 1e-9), _UNKNOWN_SIGMA_M**2)
     root = vectors * np.sqrt(variance) * to_tangent[:, None]
     return np.asarray(root @ root.T + np.diag(FLOOR_SIGMAS**2))
 
 
-def newton_step(information: Array, gradient: Array, limit_m: float = np.inf) -> Array:
+def newton_step(information: Array, gradient: Array, limit_m: float = np.inf, levers_m: Array | None = None) -> Array:
     """The step ``(6,)`` to the minimum of the quadratic, at most ``limit_m``, and none along degenerate directions.
 
     (Zhang, Kaess, Singh, "On degeneracy of optimization-based state estimation problems", ICRA 2016.)
     """
-    values, vectors, scale = scaled_spectrum(information)
+    values, vectors, scale = scaled_spectrum(information, levers_m)
     inverse = np.where(strong_directions(information, values), 1 / np.maximum(values, 1e-12), 0.0)
     reduced = -(vectors @ (inverse * (vectors.T @ (scale * gradient))))
     return np.asarray(scale * reduced * min(1.0, limit_m / max(float(np.linalg.norm(reduced)), 1e-12)))

@@ -10,10 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hybridlio import se3
+from hybridlio.agreement import UNTESTED, Agreement, Witness
 from hybridlio.config import Config
 from hybridlio.deskew import constant_twist, deskew
 from hybridlio.errors import ConfigError, DataError, EstimationError
-from hybridlio.estimates import Array, Backend, InitialPoseSource, RelativePose, ResidualSource, State
+from hybridlio.estimates import Array, Backend, InitialPoseSource, RelativePose, ResidualSource, State, TakesBack
 from hybridlio.record import Record
 from hybridlio.sensors import Calibration, Frame, GpsFix, ImuNoise, ImuSamples
 from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES, Setup, check_names
@@ -34,6 +35,7 @@ class Estimate:
         relative: the relative pose ``T = δT·T̂`` after the residual source; None at the first frame.
         step: the relative pose as the backend sees it after all; None at the first frame.
         seconds: time spent, by stage.
+        agreement: whether the residual source and the IMU agree; ``relative`` is what became of it.
     """
 
     index: int
@@ -44,6 +46,7 @@ class Estimate:
     relative: RelativePose | None
     step: RelativePose | None
     seconds: dict[str, float]
+    agreement: Agreement = UNTESTED
 
     @property
     def residual(self) -> Array:
@@ -108,13 +111,14 @@ class Odometry:
         if self._state is None and relative.ok and self._first.scan.time_offsets_ns is not None:
             relative = self._restart(self._first, frame, relative, state)
         with _timed(seconds, "graph"):
+            relative, agreement = self._compare(frame, initial, relative, state)
             self._state = self._backend.update(frame, relative)
             step = self._backend.last_step()
         if relative.ok and relative.source != initial.source:  # its own guess is nothing to learn from
             self._initial_pose.correct(frame, step)
         pose, covariance = self._lidar_pose(self._state)
         return self._keep(
-            Estimate(frame.index, frame.scan.stamp_ns, pose, covariance, initial, relative, step, seconds)
+            Estimate(frame.index, frame.scan.stamp_ns, pose, covariance, initial, relative, step, seconds, agreement)
         )  # fmt: skip
 
     def record(self) -> Record:
@@ -152,6 +156,8 @@ class Odometry:
         )
         self._residual = RESIDUAL_SOURCES[residual](setup) if isinstance(residual, str) else residual
         self._backend = BACKENDS[backend](setup) if isinstance(backend, str) else backend
+        self._preintegration = INITIAL_POSE_SOURCES["preintegration"](setup)
+        self._witness = Witness()
         self._residual.start(frame)
         self._first = frame
         covariance = np.eye(6) * 1e-12  # it defines the frame; GTSAM and files want it positive definite
@@ -179,7 +185,19 @@ class Odometry:
                 frame = replace(frame, scan=deskew(frame.scan, motion))
         with _timed(seconds, "residual"):
             relative = self._residual.refine(frame, initial)
-        return replace(relative, covariance=relative.covariance + turned) if relative.ok else relative
+        return relative.wider(added=turned) if relative.ok else relative
+
+    def _compare(
+        self, frame: Frame, initial: RelativePose, measured: RelativePose, state: State
+    ) -> tuple[RelativePose, Agreement]:
+        """Down-weight or reject what the IMU contradicts."""
+        predicted: RelativePose | None = initial
+        if initial.source != self._preintegration.name:
+            predicted = self._preintegration.predict(frame, state) if state.has_imu else None
+        relative, agreement = self._witness.judge(measured, predicted, initial)
+        if agreement.verdict == "rejected" and isinstance(self._residual, TakesBack):
+            self._residual.take_back(initial)
+        return relative, agreement
 
     def _restart(self, first: Frame, frame: Frame, found: RelativePose, state: State) -> RelativePose:
         """Do the first step again: only now is it known how fast the first two scans moved."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -13,14 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.errors import DataError
-from hybridlio.estimates import RelativePose, State
+from hybridlio.estimates import KeyframePose, RelativePose, State
 from hybridlio.files import writing_whole
 from hybridlio.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+_READABLE = (1, 2)  # the first had no poses relative to keyframes
 # what NumPy, zip and the checks of the parts raise at a file that is cut off, damaged or something else
 _UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, BadZipFile, zlib.error, DataError)
 
@@ -48,6 +49,23 @@ class Record:
     start: State
     calibration: Calibration
     imu_noise: ImuNoise
+
+    @property
+    def edges(self) -> list[tuple[int, int, RelativePose]]:
+        """Every relative pose measured, from the scan and to the scan by number, with all of its covariance.
+
+        As edges of a pose graph they are taken for independent of each other; :func:`hybridlio.graph.offline.smooth`
+        knows better.
+        """
+        number = {int(stamp): k for k, stamp in enumerate(self.online.stamps_ns)}
+        out = []
+        for k, step in enumerate(self.relative):
+            out.append((k, k + 1, step))
+            scatter = 0 if step.drift is None or not step.ok else step.covariance - step.drift
+            for near in step.keyframes:
+                edge = RelativePose(near.pose, near.covariance + scatter, step.source)
+                out.append((number[near.stamp_ns], k + 1, edge))
+        return out
 
     def save(self, path: Path) -> None:
         """Write everything to one ``.npz`` file of plain arrays."""
@@ -85,6 +103,27 @@ def _relative_arrays(prefix: str, steps: tuple[RelativePose, ...]) -> dict[str, 
     }
 
 
+def _keyframe_arrays(steps: tuple[RelativePose, ...]) -> dict[str, Any]:
+    found = [(row, keyframe) for row, step in enumerate(steps) for keyframe in step.keyframes]
+    return {
+        "keyframe_step": np.array([row for row, _ in found], dtype=np.int64),
+        "keyframe_stamps_ns": np.array([keyframe.stamp_ns for _, keyframe in found], dtype=np.int64),
+        "keyframe_poses": np.array([keyframe.pose for _, keyframe in found]).reshape(-1, 4, 4),
+        "keyframe_covariances": np.array([keyframe.covariance for _, keyframe in found]).reshape(-1, 6, 6),
+    }
+
+
+def _with_keyframes(steps: tuple[RelativePose, ...], arrays: Mapping[str, Any]) -> tuple[RelativePose, ...]:
+    """The steps with what :func:`_keyframe_arrays` holds; the first version had none."""
+    if int(arrays["version"]) == 1:
+        return steps
+    columns = (arrays[f"keyframe_{name}"] for name in ("step", "stamps_ns", "poses", "covariances"))
+    found: dict[int, list[KeyframePose]] = {}
+    for row, stamp, pose, covariance in zip(*columns, strict=True):
+        found.setdefault(int(row), []).append(KeyframePose(int(stamp), pose, covariance))
+    return tuple(replace(step, keyframes=tuple(found.get(row, ()))) for row, step in enumerate(steps))
+
+
 def _relatives(prefix: str, arrays: Mapping[str, Any]) -> tuple[RelativePose, ...]:
     at, directions = arrays[f"{prefix}_degenerate_step"], arrays[f"{prefix}_degenerate"]
     columns = (arrays[f"{prefix}_{name}"] for name in ("poses", "covariances", "sources", "ok", "from_imu", "drifts"))
@@ -120,19 +159,20 @@ def _to_arrays(record: Record) -> dict[str, Any]:
     if record.calibration.T_camera_lidar is not None:
         arrays["T_camera_lidar"] = record.calibration.T_camera_lidar
     arrays |= {f"start_{f.name}": getattr(record.start, f.name) for f in fields(State)}
-    return arrays | _relative_arrays("initial", record.initial) | _relative_arrays("relative", record.relative)
+    steps = _relative_arrays("initial", record.initial) | _relative_arrays("relative", record.relative)
+    return arrays | steps | _keyframe_arrays(record.relative)
 
 
 def _from_arrays(arrays: Mapping[str, Any]) -> Record:
-    if int(arrays["version"]) != FORMAT_VERSION:
-        raise ValueError(f"format version {int(arrays['version'])}, this release reads {FORMAT_VERSION}")
+    if int(arrays["version"]) not in _READABLE:
+        raise ValueError(f"format version {int(arrays['version'])}, this release reads {FORMAT_VERSION} and older")
     start = {f.name: arrays[f"start_{f.name}"] for f in fields(State)}
     start |= {"stamp_ns": int(start["stamp_ns"]), "has_imu": bool(start["has_imu"])}
     gps = zip(arrays["gps_stamps_ns"], arrays["gps_positions_m"], arrays["gps_covariances_m2"], strict=True)
     return Record(
         online=Trajectory(arrays["stamps_ns"], arrays["online_poses"], arrays["online_covariances"]),
         initial=_relatives("initial", arrays),
-        relative=_relatives("relative", arrays),
+        relative=_with_keyframes(_relatives("relative", arrays), arrays),
         imu=ImuSamples(arrays["imu_stamps_ns"], arrays["gyro_rad_s"], arrays["accel_m_s2"]),
         gps=tuple(GpsFix(int(stamp), position, covariance) for stamp, position, covariance in gps),
         start=State(**start),

@@ -13,7 +13,7 @@ import small_gicp
 
 from hybridlio import se3
 from hybridlio.estimates import Array
-from hybridlio.information import newton_step
+from hybridlio.information import lever_arms, newton_step
 
 _ROTATION_CONVERGED_RAD = 2e-5
 _TRANSLATION_CONVERGED_M = 3e-4
@@ -69,6 +69,7 @@ class Registration:
         pose: ``(4, 4)``; maps the scan's points to the surface's frame.
         hessian: ``(6, 6)`` of half the weighted squared residuals at the answer, right perturbation, 1/m² units removed
             (multiply by 1/σ² for information).
+        levers_m: ``(3,)`` of the matched points about the scan's axes.
         sigma_m: robust standard deviation of the residuals.
         matched: share of points with a neighbour near enough.
         cost: mean robust cost over all points, between 0 and 1; unmatched points cost 1.
@@ -78,6 +79,7 @@ class Registration:
 
     pose: Array
     hessian: Array
+    levers_m: Array
     sigma_m: float
     matched: float
     cost: float
@@ -101,6 +103,7 @@ class _Linearisation:
     gradient: Array
     residuals: Array
     weights: Array
+    levers_m: Array
 
 
 def _match(surface: Surface, source: Array, pose: Array, reach_m: float, threads: int) -> _Matches:
@@ -117,7 +120,8 @@ def _linearise(matches: _Matches, pose: Array, kernel_m: float) -> _Linearisatio
     normals_in_scan = matches.normals @ pose[:3, :3]
     J = np.hstack([np.cross(matches.source, normals_in_scan), normals_in_scan])
     weighted = J * weights[:, None]
-    return _Linearisation(weighted.T @ J, weighted.T @ residuals, residuals, weights)
+    levers_m = lever_arms(matches.source)
+    return _Linearisation(weighted.T @ J, weighted.T @ residuals, residuals, weights, levers_m)
 
 
 def _moved(matches: _Matches, pose: Array) -> bool:
@@ -148,7 +152,9 @@ def register(
         if iterations <= _REMATCH_STEPS and _moved(matches, pose):
             matches = _match(surface, source, pose, max(settings.max_distance_m, 3 * kernel), settings.threads)
         system = _linearise(matches, pose, kernel)
-        step = newton_step(system.hessian, system.gradient) if len(system.residuals) >= 6 else np.zeros(6)
+        step = np.zeros(6)
+        if len(system.residuals) >= 6:
+            step = newton_step(system.hessian, system.gradient, levers_m=system.levers_m)
         pose = pose @ se3.exp(step)
         small = np.abs(step[:3]).max() < _ROTATION_CONVERGED_RAD and np.abs(step[3:]).max() < _TRANSLATION_CONVERGED_M
         converged = bool(small and kernel == settings.kernel_m)
@@ -174,4 +180,5 @@ def _summary(
     cost = _cost(system.residuals, points, settings.kernel_m)
     weight = max(float(system.weights.sum()), 1e-12)
     sigma = float(np.sqrt((system.weights * r2).sum() / weight))
-    return Registration(pose, system.hessian, sigma, len(r2) / max(points, 1), cost, iterations, converged)
+    matched = len(r2) / max(points, 1)
+    return Registration(pose, system.hessian, system.levers_m, sigma, matched, cost, iterations, converged)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridlio.agreement import GATE, Verdict
 from hybridlio.config import Config
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.errors import DataError
@@ -101,6 +102,10 @@ class Run:
         """The frames of which :attr:`ok` is False."""
         return (np.flatnonzero(~self.ok) + self.skipped + 1).tolist()
 
+    def judged(self, verdict: Verdict) -> list[int]:
+        """The frames whose relative pose came off so in the comparison with the IMU."""
+        return [self.skipped + k for k, e in enumerate(self.estimates) if e.agreement.verdict == verdict]
+
     @property
     def timings_s(self) -> dict[str, Array]:
         """Seconds by stage, one for each estimate after the first; reading the scan is a stage."""
@@ -165,6 +170,9 @@ def _advance(run: Run, k: int) -> None:
         return
     run.reading_s.append(read)
     run.estimates.append(estimate)
+    if estimate.agreement.verdict in ("down-weighted", "rejected"):
+        chi2, verdict = estimate.agreement.chi2, estimate.agreement.verdict
+        _log.info("frame %d: %s: it and the IMU differ by χ² = %.0f (%.0f is the limit)", k, verdict, chi2, GATE)
     _log.debug("frame %d: %s", k, _described(estimate))
 
 

@@ -136,11 +136,13 @@ def _filled_before(trajectory: Trajectory, stamps_ns: NDArray[np.int64]) -> Traj
     )
 
 
-def write_graph(folder: Path, poses: NDArray[np.float64], relative: Items[RelativePose], first: int = 0) -> None:
-    """Write ``N`` poses, numbered from ``first``, and the ``N-1`` relative poses between them as ``graph.g2o``."""
+def write_graph(
+    folder: Path, poses: NDArray[np.float64], edges: Items[tuple[int, int, RelativePose]], first: int = 0
+) -> None:
+    """Write poses, numbered from ``first``, and the relative poses between them (by row) as ``graph.g2o``."""
     from hybridlio.graph.g2o import write_g2o
 
-    write_g2o(folder / GRAPH, poses, [(k, k + 1, step) for k, step in enumerate(relative, first)], first)
+    write_g2o(folder / GRAPH, poses, [(i + first, j + first, edge) for i, j, edge in edges], first)
 
 
 def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from hybridlio.run import Run
 from hybridlio.trajectory_files import write_tum
 
 if TYPE_CHECKING:
+    from hybridlio.agreement import Verdict
     from hybridlio.graph.offline import Smoothed
 
 _ONLINE, _SMOOTHED = "odometry", "smoothed"
@@ -41,7 +42,7 @@ def write_run(folder: Path, run: Run, config: Config) -> Findings:
     sequence, trajectory, record = run.sequence, run.trajectory, run.record
     if record is not None:
         record.save(folder / run_folder.RECORD)
-        run_folder.write_graph(folder, trajectory.poses, record.relative, run.skipped)
+        run_folder.write_graph(folder, trajectory.poses, record.edges, run.skipped)
     run_folder.write_trajectory(folder, trajectory, T_pose_files(run), run.steps, run.stamps_before)
     if sequence.reference is not None:
         write_tum(folder / run_folder.REFERENCE, sequence.reference)
@@ -78,8 +79,20 @@ def notes(run: Run) -> list[str]:
         out.append(f"the first {run.skipped} scans could not be used: the run starts at scan {run.skipped}")
     if run.bridged:
         out.append(f"{len(run.bridged)} scans could not be used and are bridged by the initial pose")
+    out += disagreements(run)
     told = [f"frame {k}: {why}" for k, why in run.unreadable.items()]
     return out + told[:_TOLD] + ([f"and {len(told) - _TOLD} more"] if len(told) > _TOLD else [])
+
+
+def disagreements(run: Run) -> list[str]:
+    """What was done with scans that contradict the IMU, in a line each; often none."""
+    said = {
+        "rejected": "contradict the IMU and are left out",
+        "down-weighted": "disagree with the IMU beyond their covariances and count for less",
+        "trusted again": "contradict the IMU for longer than it is to be believed and are taken as they are",
+    }
+    counts = {what: len(run.judged(cast("Verdict", verdict))) for verdict, what in said.items()}
+    return [f"{count} {'scans' if count > 1 else 'scan'} {what}" for what, count in counts.items() if count]
 
 
 def report_data(run: Run, config: Config, config_text: str) -> ReportData:
@@ -115,6 +128,9 @@ def metrics(run: Run, config: Config, evaluation: Evaluation | None) -> dict[str
         "interrupted": run.stopped is not None,
         "skipped": run.skipped,
         "bridged": run.bridged,
+        "rejected": run.judged("rejected"),
+        "down_weighted": run.judged("down-weighted"),
+        "trusted_again": run.judged("trusted again"),
         "degenerate": (np.flatnonzero(run.degenerate) + run.skipped + 1).tolist(),
         "unreadable": {str(k): why for k, why in run.unreadable.items()},
         "notes": notes(run),
@@ -159,7 +175,7 @@ def write_smoothed(folder: Path, stored: run_folder.StoredRun, record: Record, s
     run_folder.clear(folder)
     trajectory, T = smoothed.trajectory, stored.T_camera_lidar
     run_folder.write_trajectory(folder, trajectory, T, stamps_before=stored.stamps_before)
-    run_folder.write_graph(folder, trajectory.poses, record.relative, len(stored.stamps_before))
+    run_folder.write_graph(folder, trajectory.poses, record.edges, len(stored.stamps_before))
     if stored.reference is not None:
         write_tum(folder / run_folder.REFERENCE, stored.reference)
     data = ReportData(

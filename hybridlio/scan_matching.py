@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import product
 from typing import Literal
 
@@ -60,9 +61,50 @@ _SPARSE = 8  # one in so many points is enough to tell a metre from another
 _COARSE_ITERATIONS = 6
 _LIKELY = 12
 _COARSE_KERNEL_M = 0.5
+_LOST_COST = 0.6  # of the points' cost between 0 and 1: well above any that lie where they should
 _SHARE_OF_SAME_MAP = 1e-3
 _YOUNG_MAP = 5.0  # a map of one keyframe has ground only along that scan's rings, and guesses what lies between
 _FLOOR_COVARIANCE = np.diag(FLOOR_SIGMAS**2)
+
+
+@dataclass(eq=False)
+class _Path:
+    """Where the source's own path has come to.
+
+    Attributes:
+        T_map_lidar: ``(4, 4)`` the last scan's pose.
+        twist: ``(6,)`` a second, of the last step; None where it is not known.
+        bridged: whether the last scan's pose is a guess.
+        unsure: ``(6, 6)`` of the steps since the last scan that was matched.
+        map_changed: whether the map has taken in a keyframe since that one.
+    """
+
+    T_map_lidar: Array
+    twist: Array | None = None
+    bridged: bool = False
+    unsure: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    map_changed: bool = False
+
+    def carried_on(self, initial: RelativePose) -> _Path:
+        """One step farther, as ``initial`` guesses it."""
+        unsure = se3.compose_covariance(self.unsure, initial.pose, initial.covariance)
+        return _Path(self.T_map_lidar @ initial.pose, None, True, unsure, self.map_changed)
+
+
+@dataclass(eq=False)
+class SeenScan:
+    """A scan as it is matched: ``points`` ``(N, 3)`` thinned for the map, ``source`` ``(M, 3)`` for registration."""
+
+    points: Array
+    source: Array
+    settings: LocalMapSettings
+
+    @cached_property
+    def surface(self) -> Surface | None:
+        """The scan alone as something to register to, in its own frame."""
+        alone = LocalMap(self.settings)
+        alone.insert(self.points, np.eye(4))
+        return alone.surface
 
 
 class ScanMatching:
@@ -73,9 +115,11 @@ class ScanMatching:
     def __init__(self, settings: ScanMatchingSettings | None = None) -> None:
         self._settings = settings or ScanMatchingSettings()
         self._map = LocalMap(self._settings.local_map)
-        self._T_map_lidar: Array = np.eye(4)
+        self._path = _Path(np.eye(4))
+        self._before = self._path
+        self._waiting: Array | None = None  # points of a keyframe that goes into the map before the next scan
         self._stamp_ns = 0
-        self._map_changed = False  # since the last scan was matched
+        self.seen: SeenScan | None = None
 
     def start(self, frame: Frame) -> None:
         """Make the first scan the map.
@@ -83,70 +127,113 @@ class ScanMatching:
         Raises:
             DataError: it has too few points.
         """
-        points = self._thin(frame.scan)
-        if len(points) < self._settings.min_points:
+        seen = self._look(frame.scan)
+        if len(seen.points) < self._settings.min_points:
             raise DataError(
-                f"frame {frame.index}: only {len(points)} points between {self._settings.min_range_m} and "
+                f"frame {frame.index}: only {len(seen.points)} points between {self._settings.min_range_m} and "
                 f"{self._settings.max_range_m} m; start at a scan with at least {self._settings.min_points}"
             )
         self._map = LocalMap(self._settings.local_map)
-        self._T_map_lidar = np.eye(4)
-        self._keep(points)
+        self._path = self._before = _Path(np.eye(4), map_changed=True)
+        self._waiting, self.seen = seen.points, seen
         self._stamp_ns = frame.scan.stamp_ns
 
     def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:
         """Register the scan; where that fails, return the initial pose marked as not ok."""
-        points = self._thin(frame.scan)
+        self._take_in_keyframe()
+        self.seen = seen = self._look(frame.scan)
         dt_s = (frame.scan.stamp_ns - self._stamp_ns) / NS_PER_S
         self._stamp_ns = frame.scan.stamp_ns
-        found = self._register(points, initial, dt_s) if len(points) >= self._settings.min_points else None
+        usable = len(seen.points) >= self._settings.min_points and self._map.surface is not None
+        found = self._register(seen.source, initial, dt_s) if usable else None
         if found is None or found.matched < self._settings.min_matched:
-            return self._bridge(initial, len(points), found)
-        before, self._T_map_lidar = self._T_map_lidar, found.pose
-        map_changed, self._map_changed = self._map_changed, False
+            return self._bridge(initial, len(seen.points), found)
+        before, self._before = self._path, self._path
+        step = se3.between(before.T_map_lidar, found.pose)
+        self._path = _Path(found.pose, None if before.bridged else se3.log(step) / dt_s)
         if self._settings.target == "last-scan" or self._map.wants(found.pose):
-            self._keep(points)
-        scale = self._settings.covariance_scale * (1 + _YOUNG_MAP / self._map.keyframes)
-        covariance = covariance_of(found.hessian, found.sigma_m, scale)
+            self._waiting, self._path.map_changed = seen.points, True
+        return self._answer(step, found, before, len(seen.points))
+
+    def take_back(self, initial: RelativePose) -> None:
+        """Leave the last scan out: the path goes on by ``initial``, and the map stays as it was."""
+        self._waiting = None
+        self._path = self._before.carried_on(initial)
+
+    def pair(self, earlier: SeenScan, current: SeenScan, initial: RelativePose) -> RelativePose:
+        """A scan relative to an earlier one alone, ``T_j_k``, from about ``initial``; that, not ok, where it fails."""
+        few = min(len(earlier.points), len(current.points)) < self._settings.min_points
+        if few or earlier.surface is None:
+            return replace(initial, ok=False)
+        settings, sigma_m = self._settings.registration, float(np.sqrt(initial.covariance[3:, 3:].trace()))
+        wide = min(max(settings.kernel_m, sigma_m), 1.0)
+        found = register(earlier.surface, current.source, initial.pose, settings, wide)
+        if found.matched < self._settings.min_matched:
+            return replace(initial, ok=False)
+        return RelativePose(found.pose, self._covariance(found, 1), self.name, degenerate=_degenerate(found))
+
+    def _answer(self, step: Array, found: Registration, before: _Path, points: int) -> RelativePose:
+        covariance = self._covariance(found, self._keyframes)
+        drift = self._drift(covariance, before.map_changed)
+        if drift is None:
+            covariance = covariance + before.unsure  # the scan it is matched to lies before those that were bridged
         return RelativePose(
-            se3.between(before, found.pose),
+            step,
             covariance,
             source=self.name,
-            drift=self._drift(covariance, map_changed),
-            degenerate=degenerate_directions(found.hessian),
-            details=_details(found, len(points)),
+            drift=drift,
+            degenerate=_degenerate(found),
+            details=_details(found, points),
         )
+
+    @property
+    def _keyframes(self) -> int:
+        """Those of the map, with the one that waits."""
+        if self._settings.target == "last-scan":
+            return 1
+        return self._map.keyframes + (self._waiting is not None)
+
+    def _covariance(self, found: Registration, keyframes: int) -> Array:
+        scale = self._settings.covariance_scale * (1 + _YOUNG_MAP / keyframes)
+        return covariance_of(found.hessian, found.sigma_m, scale, found.levers_m)
 
     def _drift(self, covariance: Array, map_changed: bool) -> Array | None:
         """What of a step's covariance adds up: at first much, for a map of few keyframes is as wrong as they are."""
         if self._settings.target == "last-scan":
             return None
-        share = max(self._settings.drift_share, 0.5 / self._map.keyframes) if map_changed else _SHARE_OF_SAME_MAP
+        share = max(self._settings.drift_share, 0.5 / self._keyframes) if map_changed else _SHARE_OF_SAME_MAP
         return share * covariance
 
-    def _thin(self, scan: Scan) -> Array:
-        """``(M, 3)``: one point a voxel, of those within range."""
+    def _look(self, scan: Scan) -> SeenScan:
+        """The scan's points within range, one a voxel."""
         points = voxel_average(scan.points, None, self._settings.map_voxel_m)[0].astype(np.float64)
         range2 = np.einsum("ij,ij->i", points, points)
         near, far = self._settings.min_range_m, self._settings.max_range_m
-        return np.asarray(points[(range2 > near**2) & (range2 < far**2)])
+        points = np.asarray(points[(range2 > near**2) & (range2 < far**2)])
+        source = voxel_average(points, None, self._settings.source_voxel_m)[0].astype(np.float64)
+        return SeenScan(points, source, self._settings.local_map)
 
-    def _keep(self, points: Array) -> None:
+    def _take_in_keyframe(self) -> None:
+        """Put a keyframe that was not taken back into the map."""
+        if self._waiting is None:
+            return
         if self._settings.target == "last-scan":
             self._map = LocalMap(self._settings.local_map)
-        self._map.insert(points, self._T_map_lidar)
-        self._map_changed = True
+        self._map.insert(self._waiting, self._path.T_map_lidar)
+        self._waiting = None
 
-    def _register(self, points: Array, initial: RelativePose, dt_s: float) -> Registration | None:
-        surface = self._map.surface
-        if surface is None:
-            return None
-        source = voxel_average(points, None, self._settings.source_voxel_m)[0].astype(np.float64)
-        settings = self._settings.registration
+    def _register(self, source: Array, initial: RelativePose, dt_s: float) -> Registration:
+        surface, settings = self._map.surface, self._settings.registration
+        assert surface is not None
         sigma_m = float(np.sqrt(initial.covariance[3:, 3:].trace()))
         kernel_start_m = min(max(settings.kernel_m, sigma_m), 1.0)
-        start = self._T_map_lidar @ initial.pose
+        start = self._path.T_map_lidar @ initial.pose
         if sigma_m > _UNSURE_TRANSLATION_M:
+            if self._path.twist is not None:  # who guesses no motion leaves it to this source to know the last one
+                moving = self._path.T_map_lidar @ se3.exp(self._path.twist * dt_s)
+                found = register(surface, source, moving, settings, _COARSE_KERNEL_M)
+                if found.matched >= self._settings.min_matched and found.cost < _LOST_COST:
+                    return found
             turns = initial.covariance[:3, :3].trace() > _UNSURE_ROTATION_RAD**2
             start = self._search(surface, source, start, dt_s, self._settings.start_rates_deg_s if turns else (0.0,))
         return register(surface, source, start, settings, kernel_start_m)
@@ -164,7 +251,7 @@ class ScanMatching:
         return min(tries, key=lambda found: found.cost).pose
 
     def _bridge(self, initial: RelativePose, points: int, found: Registration | None) -> RelativePose:
-        self._T_map_lidar = self._T_map_lidar @ initial.pose
+        self._before, self._path = self._path, self._path.carried_on(initial)
         return RelativePose(
             initial.pose,
             initial.covariance,
@@ -174,6 +261,10 @@ class ScanMatching:
             from_imu=initial.from_imu,
             details=_details(found, points) if found else {"points": float(points)},
         )
+
+
+def _degenerate(found: Registration) -> Array:
+    return degenerate_directions(found.hessian, found.levers_m)
 
 
 def _details(found: Registration, points: int) -> dict[str, float]:

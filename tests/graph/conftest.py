@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hybridlio import se3
-from hybridlio.estimates import RelativePose, State
+from hybridlio.estimates import KeyframePose, RelativePose, State
 from hybridlio.record import Record
 from hybridlio.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples, Scan
 from hybridlio.simulation.imu import ideal_imu
@@ -91,20 +91,36 @@ def _frames(stamps: np.ndarray, imu: ImuSamples, calibration: Calibration, noise
 
 
 def _relative(
-    lidar: np.ndarray, sigmas: np.ndarray, error: float, drift_share: float | None, rng: np.random.Generator
+    lidar: np.ndarray,
+    stamps: np.ndarray,
+    sigmas: np.ndarray,
+    error: float,
+    drift_share: float | None,
+    back: tuple[int, ...],
+    rng: np.random.Generator,
 ) -> list[RelativePose]:
-    """Steps between lidar poses, each with an error of its own, or those of a path beside them that only drifts."""
+    """Steps between lidar poses, each with an error of its own, or those of a path beside them that only drifts.
+
+    ``back`` adds poses relative to the scans so far before; beside the path if there is one.
+    """
     covariance = np.diag(sigmas**2)
-    true = se3.between(lidar[:-1], lidar[1:])
-    if drift_share is None:
-        steps = true @ se3.exp(error * sigmas * rng.standard_normal((len(true), 6)))
-        return [RelativePose(step, covariance, "test") for step in steps]
-    scatter = sigmas * np.sqrt((1 - drift_share) / 2) * rng.standard_normal((len(lidar), 6))
-    scatter[0] = 0.0  # the map is made of the first scan
+    own, scatter = 1.0, np.zeros((len(lidar), 6))
+    if drift_share is not None:
+        own = drift_share
+        scatter = sigmas * np.sqrt((1 - drift_share) / 2) * rng.standard_normal((len(lidar), 6))
+        scatter[0] = 0.0  # the map is made of the first scan
     beside = lidar @ se3.inverse(se3.exp(error * scatter))
-    drift = error * sigmas * np.sqrt(drift_share) * rng.standard_normal((len(true), 6))
-    steps = se3.between(beside[:-1], beside[1:]) @ se3.exp(drift)
-    return [RelativePose(step, covariance, "test", drift=drift_share * covariance) for step in steps]
+
+    def measured(i: int, j: int) -> np.ndarray:
+        noise = error * sigmas * np.sqrt(own) * rng.standard_normal(6)
+        return np.asarray(se3.between(beside[i], beside[j]) @ se3.exp(noise))
+
+    out = []
+    for k in range(1, len(lidar)):
+        near = [KeyframePose(int(stamps[k - b]), measured(k - b, k), own * covariance) for b in back if b <= k]
+        drift = None if drift_share is None else own * covariance
+        out.append(RelativePose(measured(k - 1, k), covariance, "test", drift=drift, keyframes=tuple(near)))
+    return out
 
 
 def make_chain(
@@ -116,6 +132,7 @@ def make_chain(
     step_sigmas: np.ndarray = STEP_SIGMAS,
     step_error: float = 1.0,
     drift_share: float | None = None,
+    back: tuple[int, ...] = (),
     imu_hz: float = 100.0,
     path: SmoothPath | None = None,
     T_imu_lidar: np.ndarray = T_IMU_LIDAR,
@@ -131,6 +148,7 @@ def make_chain(
         step_sigmas: of a relative pose, as claimed.
         step_error: the true error in units of the claimed one.
         drift_share: of a relative pose's covariance that adds up, where the poses are of matching to a map.
+        back: also give every scan's pose relative to the scans so far before it.
         imu_hz: samples per second.
         path: of the IMU, in place of a random one.
         T_imu_lidar: the mount.
@@ -157,7 +175,7 @@ def make_chain(
     stamps = START_NS + np.round(scan_s * NS_PER_S).astype(np.int64)
     calibration = Calibration(T_imu_lidar)
     frames = _frames(stamps, imu, calibration, imu_noise)
-    relative = _relative(lidar, step_sigmas, step_error, drift_share, rng)
+    relative = _relative(lidar, stamps, step_sigmas, step_error, drift_share, back, rng)
     at = np.searchsorted(imu.stamps_ns, stamps)
     return Chain(
         frames,

@@ -11,6 +11,7 @@ from hybridlio.errors import DataError
 from hybridlio.estimates import RelativePose, State
 from hybridlio.graph import factors
 from hybridlio.graph.preintegration import preintegrate
+from hybridlio.graph.scans import Scans
 from hybridlio.sensors import ImuNoise, ImuSamples
 from hybridlio.startup import start_state
 
@@ -92,10 +93,20 @@ def test_a_covariance_that_is_none_is_named_with_its_step():
         between(3, 4, step)
 
 
+def scans(newest: int, on_path: bool = False) -> Scans:
+    """Scans 0 to ``newest``, stamped by their numbers; on the path all of them or none."""
+    out = Scans(0)
+    for k in range(1, newest + 1):
+        out.add(k, on_path)
+    if on_path and not newest:  # as after a step before scan 0
+        out._on_path.add(0)
+    return out
+
+
 def step_keys(pim: bool, has_imu: bool = True, fresh: bool = False, **changes: object) -> list[list[str]]:
     state = replace(start(), has_imu=has_imu)
     summed = preintegrate(at_rest(0.1), state, ImuNoise()) if pim else None
-    return keys(factors.step_factors(0, state, relative(**changes), summed, 10**8, MOUNT, fresh))
+    return keys(factors.step_factors(0, state, relative(**changes), summed, 10**8, MOUNT, scans(0, not fresh)))
 
 
 IMU = ["x0", "v0", "x1", "v1", "b0", "b1", "g0"]
@@ -138,13 +149,13 @@ def test_a_failed_step_on_a_map_carries_the_path_on_and_says_nothing_of_the_scan
 
 def test_a_step_on_a_map_is_as_unsure_as_its_covariance_says_and_two_are_hardly_less_sure():
     graph, values = factors.start_factors(start_state(0, ImuSamples.empty(), ImuNoise()))
-    marginals = []
+    states = [replace(start(), has_imu=False, T_world_imu=np.linalg.matrix_power(STEP, k)) for k in range(4)]
+    marginals, so_far = [], Scans(0)
     for k in range(3):
         step = relative(drift=0.02 * relative().covariance)
-        graph.push_back(factors.step_factors(k, replace(start(), has_imu=False), step, None, 0, np.eye(4), k == 0))
-        pose = np.linalg.matrix_power(STEP, k + 1)
-        factors.insert_state(values, k + 1, replace(start(), has_imu=False, T_world_imu=pose))
-        factors.insert_map_pose(values, k, np.linalg.matrix_power(STEP, k), pose, k == 0)
+        graph.push_back(factors.step_factors(k, states[k], step, None, 0, np.eye(4), so_far))
+        factors.insert_step(values, k, states[k], states[k + 1], step, so_far)
+        so_far.add(k + 1, on_path=True)
         marginals.append(gtsam.Marginals(graph, values).marginalCovariance(X(k + 1)))
     joint = gtsam.Marginals(graph, values).jointMarginalCovariance([X(2), X(3)]).fullMatrix()
     J = np.hstack([-se3.adjoint(se3.inverse(STEP)), np.eye(6)])

@@ -21,6 +21,7 @@ from hybridlio.graph import factors
 from hybridlio.graph.offline import smooth
 from hybridlio.graph.online import IncrementalBackend
 from hybridlio.graph.preintegration import Preintegration
+from hybridlio.graph.scans import Scans
 from hybridlio.sensors import Calibration, Frame, ImuNoise, ImuSamples, Scan
 from hybridlio.simulation.path import SmoothPath
 from hybridlio.startup import start_state
@@ -179,7 +180,7 @@ def test_a_straight_road_of_five_thousand_poses_is_solved():
     for k in range(5000):
         values = gtsam.Values()
         factors.insert_state(values, k + 1, replace(start, T_world_imu=se3.make(np.eye(3), [k + 1.0, 0.0, 0.0])))
-        solver.update(factors.step_factors(k, start, STRAIGHT, None, 0, np.eye(4), fresh=False), values)
+        solver.update(factors.step_factors(k, start, STRAIGHT, None, 0, np.eye(4), Scans(0)), values)
         if k % 500 == 499:
             spread.append(np.sqrt(np.diag(solver.marginalCovariance(X(k + 1)))))
     end = solver.calculateEstimatePose3(X(5000)).matrix()

@@ -1,4 +1,5 @@
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -6,7 +7,7 @@ import pytest
 
 from hybridlio import se3
 from hybridlio.errors import DataError
-from hybridlio.estimates import RelativePose, State
+from hybridlio.estimates import KeyframePose, RelativePose, State
 from hybridlio.record import Record
 from hybridlio.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.trajectory import Trajectory
@@ -26,6 +27,15 @@ def step(rng: np.random.Generator, k: int, source: str) -> RelativePose:
     )
 
 
+def with_keyframes(relative: tuple[RelativePose, ...], stamps: np.ndarray) -> tuple[RelativePose, ...]:
+    """The steps, the third and fifth with poses relative to earlier scans."""
+    near = {
+        2: (KeyframePose(int(stamps[0]), se3.exp(np.full(6, 0.1)), 2 * np.eye(6)),),
+        4: tuple(KeyframePose(int(stamps[k]), se3.exp(np.full(6, 0.2)), k * np.eye(6)) for k in (3, 1)),
+    }
+    return tuple(replace(step, keyframes=near.get(k, ())) for k, step in enumerate(relative))
+
+
 def example(rng: np.random.Generator, imu: bool = True, camera: bool = True) -> Record:
     stamps = 1_700_000_000_123_456_789 + np.arange(6) * 100_000_001
     samples = ImuSamples(stamps[0] + np.arange(50) * 10_000_000, rng.normal(size=(50, 3)), rng.normal(size=(50, 3)))
@@ -35,7 +45,7 @@ def example(rng: np.random.Generator, imu: bool = True, camera: bool = True) -> 
     return Record(
         online=Trajectory(stamps, se3.exp(rng.normal(size=(6, 6))), np.tile(np.eye(6), (6, 1, 1)) * 0.1),
         initial=tuple(step(rng, k, "preintegration") for k in range(5)),
-        relative=tuple(step(rng, k + 1, "scan-matching") for k in range(5)),
+        relative=with_keyframes(tuple(step(rng, k + 1, "scan-matching") for k in range(5)), stamps),
         imu=samples if imu else ImuSamples.empty(),
         gps=tuple(GpsFix(int(t), rng.normal(size=3), np.eye(3) * 2) for t in stamps[:2]) if imu else (),
         start=state,
@@ -80,6 +90,10 @@ def test_a_record_comes_back_as_it_was_saved(rng: np.random.Generator, tmp_path:
         np.testing.assert_allclose(theirs.pose, mine.pose, atol=1e-14)
         for name in ("covariance", "source", "degenerate", "ok", "from_imu", "drift"):
             same(getattr(theirs, name), getattr(mine, name))
+        for near, read in zip(mine.keyframes, theirs.keyframes, strict=True):
+            assert read.stamp_ns == near.stamp_ns
+            np.testing.assert_allclose(read.pose, near.pose, atol=1e-14)
+            same(read.covariance, near.covariance)
     assert (loaded.calibration.T_camera_lidar is None) == (not camera)
 
 
@@ -111,7 +125,27 @@ def test_another_versions_file_is_refused_and_both_versions_named(saved: Path):
         Record.load(saved)
 
 
-@pytest.mark.parametrize("missing", ["version", "relative_poses", "start_velocity_m_s", "imu_noise"])
+def test_a_file_of_the_first_version_is_read_and_has_no_keyframes(saved: Path):
+    rewritten(saved, version=1, **{f"keyframe_{n}": None for n in ("step", "stamps_ns", "poses", "covariances")})
+    old = Record.load(saved)
+    assert [step.keyframes for step in old.relative] == [()] * 5
+
+
+def test_edges_hold_every_relative_pose_with_all_of_its_covariance(rng: np.random.Generator):
+    record = example(rng)
+    assert [(i, j) for i, j, _ in record.edges] == [(0, 1), (1, 2), (2, 3), (0, 3), (3, 4), (4, 5), (3, 5), (1, 5)]
+    for i, j, edge in record.edges:
+        step = record.relative[j - 1]
+        if j == i + 1:
+            assert edge is step
+            continue
+        (near,) = (k for k in step.keyframes if k.stamp_ns == record.online.stamps_ns[i])
+        np.testing.assert_allclose(edge.pose, near.pose, atol=1e-14)
+        shared = step.covariance - step.drift if step.drift is not None and step.ok else np.zeros((6, 6))
+        np.testing.assert_allclose(edge.covariance, near.covariance + shared)
+
+
+@pytest.mark.parametrize("missing", ["version", "relative_poses", "start_velocity_m_s", "imu_noise", "keyframe_poses"])
 def test_a_file_that_lacks_something_is_refused(saved: Path, missing: str):
     rewritten(saved, **{missing: None})
     with pytest.raises(DataError, match=rf"odometry\.npz: not a record.*{missing}"):

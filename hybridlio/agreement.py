@@ -1,0 +1,111 @@
+"""Whether a relative pose and the IMU agree within their covariances, and what becomes of one that does not.
+
+The test is the normalised innovation squared (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking
+and Navigation" (2001), §5.4.2): the difference of the two under the sum of their covariances, χ² with six degrees of
+freedom where both tell the truth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from hybridlio import se3
+from hybridlio.estimates import RelativePose
+
+Verdict = Literal["untested", "agrees", "down-weighted", "rejected", "trusted again"]
+
+GATE = 27.86  # χ², six degrees of freedom: one in ten thousand lies above
+GROSS = 10 * GATE  # no covariance that is only somewhat too small explains this
+MOST_REJECTED = 5  # in a row; then it may be the IMU that is wrong
+START_STEPS = 10  # speed, tilt and biases are still being found from the scans
+_UNSURE_TRANSLATION_M = 0.5  # an IMU of unknown speed is no witness
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What came of the comparison at one step.
+
+    Attributes:
+        verdict: ``untested`` where there is nothing to compare, or the IMU does not know its speed and tilt yet;
+            ``agrees``; ``down-weighted``, with a covariance just large enough to agree; ``rejected``, so that the IMU
+            bridges; ``trusted again``, taken as it is after too many rejections.
+        chi2: the difference under both covariances; None where untested.
+    """
+
+    verdict: Verdict
+    chi2: float | None = None
+
+
+UNTESTED = Agreement("untested")
+
+
+def chi2_of(measured: RelativePose, predicted: RelativePose, times: float = 1.0) -> float:
+    """The squared difference under the sum of the covariances, the measured one's taken ``times`` as large.
+
+    The difference is ``Log(measured⁻¹·predicted)``; so small that both covariances hold in one tangent space.
+    """
+    error = se3.log(se3.between(measured.pose, predicted.pose))
+    return float(error @ np.linalg.solve(times * measured.covariance + predicted.covariance, error))
+
+
+def widening(measured: RelativePose, predicted: RelativePose, chi2: float = GATE) -> float:
+    """By how much the measured covariance must grow for the two to differ by ``chi2`` only; 1 where they do already.
+
+    Solved by bisection in its logarithm: the difference falls as the covariance grows, towards zero.
+    """
+    low, high = 0.0, 1.0
+    if chi2_of(measured, predicted) <= chi2:
+        return 1.0
+    while chi2_of(measured, predicted, np.exp(high)) > chi2:
+        low, high = high, 2 * high
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (middle, high) if chi2_of(measured, predicted, np.exp(middle)) > chi2 else (low, middle)
+    return float(np.exp(high))
+
+
+class Witness:
+    """Compares each step's relative pose with what the IMU predicted, and remembers how often it was rejected.
+
+    After :data:`MOST_REJECTED` rejections in a row, scans are taken as they are until one agrees: the IMU may be what
+    is wrong, and the graph can then learn its bias or speed from them.
+    """
+
+    def __init__(self) -> None:
+        self._steps = 0
+        self._rejected = 0
+
+    def judge(
+        self, measured: RelativePose, predicted: RelativePose | None, bridge: RelativePose
+    ) -> tuple[RelativePose, Agreement]:
+        """The relative pose for the graph, and how it compares.
+
+        Args:
+            measured: of the residual source.
+            predicted: by the IMU; None where it cannot say.
+            bridge: what stands in for a rejected one.
+        """
+        self._steps += 1
+        if self._steps <= START_STEPS or not _comparable(measured, predicted):
+            return measured, UNTESTED
+        assert predicted is not None
+        chi2 = chi2_of(measured, predicted)
+        if chi2 <= GATE:
+            self._rejected = 0
+            return measured, Agreement("agrees", chi2)
+        if self._rejected >= MOST_REJECTED:
+            return measured, Agreement("trusted again", chi2)
+        if chi2 <= GROSS:
+            return measured.wider(widening(measured, predicted)), Agreement("down-weighted", chi2)
+        self._rejected += 1
+        details = {**measured.details, "chi2": chi2}
+        return replace(bridge, ok=False, drift=None, keyframes=(), details=details), Agreement("rejected", chi2)
+
+
+def _comparable(measured: RelativePose, predicted: RelativePose | None) -> bool:
+    if predicted is None or not predicted.ok or not measured.ok or measured.from_imu:
+        return False
+    return bool(np.sqrt(predicted.covariance[3:, 3:].trace()) <= _UNSURE_TRANSLATION_M)
