@@ -32,6 +32,7 @@ class Pass:
     Attributes:
         answers: one a scan, up to where it failed.
         ms: what each took.
+        cpu_ms: processor time of all its threads, which a busy machine does not lengthen by waiting.
         start_s: from the start of its process to the first answer; reading is part of it.
         resident_mb: after each scan.
         peak_mb: the most that it had resident.
@@ -40,6 +41,7 @@ class Pass:
 
     answers: list[Answer] = field(default_factory=list)
     ms: list[float] = field(default_factory=list)
+    cpu_ms: list[float] = field(default_factory=list)
     start_s: float = float("nan")
     resident_mb: list[float] = field(default_factory=list)
     peak_mb: float = 0.0
@@ -72,9 +74,10 @@ def _turn(talk: Connection, k: int, kept: Pass) -> None:
     if isinstance(said, str):
         kept.error = f"scan {k}: {said}"
         return
-    answer, ms, kept.peak_mb, resident_mb, kept.start_s = said
+    answer, ms, cpu_ms, kept.peak_mb, resident_mb, kept.start_s = said
     kept.answers.append(answer)
     kept.ms.append(ms)
+    kept.cpu_ms.append(cpu_ms)
     kept.resident_mb.append(resident_mb)
 
 
@@ -114,14 +117,14 @@ def _serve(talk: Connection, make: Make, opened: Open, threads: int, spawned_s: 
         try:
             frame = sequence[k]
             step = step or make(sequence, threads)
-            begin = time.perf_counter()
+            begin, begin_cpu = time.perf_counter(), time.process_time()
             answer = step(frame)
-            ms = 1e3 * (time.perf_counter() - begin)
+            ms, cpu_ms = 1e3 * (time.perf_counter() - begin), 1e3 * (time.process_time() - begin_cpu)
         except Exception as error:
             talk.send(f"{type(error).__name__}: {error}")
             continue
         start_s = ready_s + time.time() - asked_s if k == 0 else start_s
-        talk.send((answer, ms, *_memory_mb(), start_s))
+        talk.send((answer, ms, cpu_ms, *_memory_mb(), start_s))
 
 
 def _next(talk: Connection) -> int | None:
