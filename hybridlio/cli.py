@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from hybridlio import __version__
+from hybridlio.commands.ablate import ablate
 from hybridlio.commands.batch import batch
 from hybridlio.commands.common import start_quietly
 from hybridlio.commands.compare import compare
@@ -47,5 +48,5 @@ def main(
     """Lidar-inertial odometry: from a drive to a trajectory with covariances, a pose graph and a report."""
 
 
-for _command in (simulate, odometry, smooth, batch, compare, evaluate, train, config, view):
+for _command in (simulate, odometry, smooth, batch, compare, evaluate, train, ablate, config, view):
     app.command()(_command)

@@ -119,13 +119,25 @@ def training_pairs(
     Raises:
         DataError, ConfigError: see :func:`shards_of`; or there is no such split.
     """
-    tests = replace(options, sequences=None)
-    if split is not None:
-        chosen, tested = sequences_of(split, recipe.network)
-        options = replace(options, sequences=options.sequences or chosen)
-        validate, tests = validate or data, tests if validate else replace(tests, sequences=tested)
-    pairs = Pairs(shards_of(data, recipe, options, progress), recipe.network)
+    train, tests = split_options(options, split, recipe)
+    if split is not None and not validate:
+        validate = data
+    elif validate:
+        tests = replace(options, sequences=None)
+    pairs = Pairs(shards_of(data, recipe, train, progress), recipe.network)
     return pairs, Pairs(shards_of(validate, recipe, tests, progress), recipe.network) if validate else None
+
+
+def split_options(options: DataOptions, split: str | None, recipe: Recipe) -> tuple[DataOptions, DataOptions]:
+    """Options that find what to train on and what to test on: a split's sequences, or without one, those asked for.
+
+    Raises:
+        ConfigError: there is no such split.
+    """
+    if split is None:
+        return options, replace(options, sequences=None)
+    train, test = sequences_of(split, recipe.network)
+    return replace(options, sequences=options.sequences or train), replace(options, sequences=test)
 
 
 def needs_odometry(network: NetworkSettings) -> bool:

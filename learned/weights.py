@@ -46,11 +46,13 @@ class Weights:
         recipe: how they were trained; its network settings are the structure that they fit.
         about: data, steps, version and commit, as text.
         tensors: by name.
+        where: the file, for messages.
     """
 
     recipe: Recipe
     about: Mapping[str, str]
     tensors: Mapping[str, Tensor]
+    where: str = "weights"
 
     def fitting(self, network: NetworkSettings) -> Mapping[str, Tensor]:
         """Those tensors that a network of these settings starts from: where initial poses are given, no LSTMs'."""
@@ -61,7 +63,7 @@ class Weights:
     def network(self, device: torch.device | str = "cpu") -> OdometryNetwork:
         """The trained network, ready for inference."""
         network = OdometryNetwork(self.recipe.network)
-        put_weights(network, self.tensors, "weights")
+        put_weights(network, self.tensors, self.where)
         return network.to(device).eval()
 
 
@@ -138,7 +140,7 @@ def load_weights(path: str | os.PathLike[str]) -> Weights:
         recipe = from_dict(Recipe, json.loads(metadata.pop("recipe")), "recipe")
     except (KeyError, ValueError, ConfigError) as error:
         raise DataError(f"{path}: carries no recipe of this version ({error}); train again") from error
-    return Weights(recipe, metadata, tensors)
+    return Weights(recipe, metadata, tensors, str(path))
 
 
 def _commit() -> str:

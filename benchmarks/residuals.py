@@ -1,0 +1,153 @@
+"""How good and how honest residual sources are, step by step: error left, consistency of covariances, failures, time.
+
+    python benchmarks/residuals.py DATA… [--residual network,scan-matching] [--refine-steps 0,3] [--noise-m 0.083]
+        [--noise-deg 0.24] [--reference small_gicp] [--weights FILE] [--scale S] [--frames 0:100] [-o FILE.json]
+
+Every source refines the same initial poses: the reference's steps, each shaken by a draw of its own, of the given
+standard deviation by axis. ANEES is the mean of eᵀΣ⁻¹e / n over the steps that did not fail: 1 is honest, more is too
+sure. `--reference small_gicp` registers consecutive scans by that library, for recordings whose own reference is too
+coarse for single steps. Times are medians; sources are interleaved scan by scan.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import small_gicp
+from numpy.typing import NDArray
+
+from hybridlio import se3
+from hybridlio.config import Config
+from hybridlio.datasets.registry import open_sequence, sequence_names
+from hybridlio.datasets.sequence import Sequence, part_of
+from hybridlio.estimates import RelativePose, ResidualSource
+from hybridlio.files import write_whole
+from hybridlio.sensors import ImuNoise
+from hybridlio.sources import RESIDUAL_SOURCES, Setup
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Found:
+    """A source's answers over some recordings."""
+
+    name: str
+    errors: list[Array] = field(default_factory=list)
+    normalised: list[Array] = field(default_factory=list)
+    loose: int = 0
+    failed: int = 0
+    seconds: list[float] = field(default_factory=list)
+
+    def take(self, answer: RelativePose, truth: Array, seconds: float) -> None:
+        """Add an answer to the step whose truth is given."""
+        error = se3.log(se3.between(answer.pose, truth))
+        self.errors.append(error)
+        self.seconds.append(seconds)
+        self.failed += not answer.ok
+        self.loose += len(answer.degenerate) > 0
+        if answer.ok:
+            C = answer.covariance
+            parts = (slice(None), slice(0, 3), slice(3, 6))
+            self.normalised.append(
+                np.array([error[p] @ np.linalg.solve(C[p, p], error[p]) / len(error[p]) for p in parts])
+            )
+
+    def row(self) -> dict[str, float | str]:
+        """The figures."""
+        errors = np.array(self.errors)
+        size_m, size_deg = np.linalg.norm(errors[:, 3:], axis=1), np.rad2deg(np.linalg.norm(errors[:, :3], axis=1))
+        anees = np.mean(self.normalised, axis=0) if self.normalised else np.full(3, np.nan)
+        return {
+            "residual": self.name,
+            "steps": len(errors),
+            "rms [mm]": 1e3 * float(np.sqrt((size_m**2).mean())),
+            "rms [°]": float(np.sqrt((size_deg**2).mean())),
+            "median [mm]": 1e3 * float(np.median(size_m)),
+            "ANEES": float(anees[0]),
+            "ANEES rot.": float(anees[1]),
+            "ANEES trans.": float(anees[2]),
+            "failed": self.failed,
+            "loose": self.loose,
+            "ms": 1e3 * float(np.median(self.seconds)),
+        }
+
+
+def sources(options: argparse.Namespace, sequence: Sequence) -> dict[str, ResidualSource]:
+    config = Config()
+    made: dict[str, ResidualSource] = {}
+    network = replace(config.network, **({"weights": options.weights} if options.weights else {}))
+    if options.scale:
+        network = replace(network, covariance_scale=options.scale)
+    for name in options.residual.split(","):
+        for steps in [int(n) for n in options.refine_steps.split(",")] if "network" in name else [None]:
+            chosen = network if steps is None else replace(network, refine_steps=steps)
+            setup = Setup(config.model_copy(update={"network": chosen}), sequence.calibration, ImuNoise())
+            made[name if steps is None else f"{name}, {steps} refined"] = RESIDUAL_SOURCES[name](setup)
+    return made
+
+
+def true_steps(sequence: Sequence, how: str | None) -> Array:
+    if how is None and sequence.reference is not None:
+        return se3.between(sequence.reference.poses[:-1], sequence.reference.poses[1:])
+    steps, guess = [], np.eye(4)
+    for k in range(1, len(sequence)):
+        last, current = (sequence[i].scan.points.astype(np.float64) for i in (k - 1, k))
+        found = small_gicp.align(
+            last, current, init_T_target_source=guess, downsampling_resolution=0.25, max_correspondence_distance=2.0
+        )
+        guess = se3.orthonormalise(found.T_target_source)
+        steps.append(guess)
+    return np.array(steps)
+
+
+def recordings(options: argparse.Namespace) -> Iterator[Sequence]:
+    for path in options.data:
+        for name in sequence_names(path):
+            yield part_of(open_sequence(path, sequence=name), options.frames)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", nargs="+", type=Path)
+    parser.add_argument("--residual", default="network,network+scan-matching,scan-matching")
+    parser.add_argument("--refine-steps", default="0,3")
+    parser.add_argument("--noise-m", type=float, default=0.083)
+    parser.add_argument("--noise-deg", type=float, default=0.24)
+    parser.add_argument("--reference", choices=["small_gicp"])
+    parser.add_argument("--weights")
+    parser.add_argument("--scale", type=float)
+    parser.add_argument("--frames")
+    parser.add_argument("-o", "--out", type=Path)
+    options = parser.parse_args()
+    sigmas = np.r_[np.full(3, np.deg2rad(options.noise_deg)), np.full(3, options.noise_m)]
+    rng, found = np.random.default_rng(0), {"(initial poses)": Found("(initial poses)")}
+    for sequence in recordings(options):
+        steps, made = true_steps(sequence, options.reference), sources(options, sequence)
+        for source in made.values():
+            source.start(sequence[0])
+        for k in range(1, len(sequence)):
+            frame, truth = sequence[k], steps[k - 1]
+            pose = truth @ se3.exp(rng.normal(size=6) * sigmas)
+            initial = RelativePose(pose, np.diag(sigmas**2 + 1e-10), "shaken")
+            found["(initial poses)"].take(initial, truth, 0.0)
+            for name, source in made.items():
+                start = time.perf_counter()
+                answer = source.refine(frame, initial)
+                found.setdefault(name, Found(name)).take(answer, truth, time.perf_counter() - start)
+    rows = [result.row() for result in found.values()]
+    print(" | ".join(rows[0]))
+    for row in rows:
+        print(" | ".join(f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()))
+    if options.out:
+        write_whole(options.out, json.dumps(rows, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,188 @@
+"""``hybridlio ablate``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hybridlio.commands import common
+from hybridlio.commands.common import INTERRUPTED, guarded
+from hybridlio.commands.train import Device, Recordings, leads, names, shown
+from hybridlio.errors import ConfigError, HybridLioError
+from hybridlio.terminal import complain, say, say_table
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from hybridlio.learned.ablation import RowData, RowResult
+    from hybridlio.learned.comparison import Line
+    from hybridlio.learned.presets import TableRow
+    from hybridlio.learned.settings import Recipe
+    from hybridlio.training_data import DataOptions
+
+Rows = Callable[["TableRow"], "RowResult"]
+
+Number = Annotated[int, typer.Option("--table", metavar="N", help="Of the paper's tables, 1 to 5.", show_default=False)]
+Tests = Annotated[
+    list[Path] | None, typer.Option("--test", metavar="DATA", help="Recordings to test on; may be repeated.")
+]
+Split = Annotated[str | None, typer.Option(metavar="NAME", help="Of KITTI odometry: easy or hard, in place of --test.")]
+Steps = Annotated[int, typer.Option(min=1, help="Of the optimiser, the same for every row.")]
+Out = Annotated[Path | None, typer.Option("-o", "--out", metavar="DIR", help="By default ablation/table-N.")]
+Cache = Annotated[
+    Path | None, typer.Option(metavar="DIR", help="Where prepared recordings are kept; by default beside -o.")
+]
+Reduced = Annotated[
+    bool, typer.Option("--reduced", help="Coarser maps and smaller encoders, which a CPU trains in minutes.")
+]
+Only = Annotated[str | None, typer.Option("--rows", metavar="A,B,…", help="These presets' rows alone.")]
+
+
+@guarded
+def ablate(
+    data: Recordings,
+    table: Number,
+    test: Tests = None,
+    split: Split = None,
+    steps: Steps = 2000,
+    reduced: Reduced = False,
+    rows: Only = None,
+    reader: common.ReaderName = None,
+    raw_root: common.RawRoot = None,
+    out: Out = None,
+    cache: Cache = None,
+    device: Device = "auto",
+    _verbose: common.Verbose = 0,
+) -> None:
+    """Train and evaluate the rows of one of the paper's tables at one budget, and print it in the paper's form.
+
+    Published figures stand beside, marked as such. Given again, the same command does not repeat finished rows. A row
+    that fails does not stop the others.
+    """
+    from hybridlio.learned.devices import pick_device
+    from hybridlio.training_data import DataOptions
+
+    pick_device(device)
+    if (test is None) == (split is None):
+        raise ConfigError("give --test DATA with recordings to test on, or --split easy or hard on KITTI odometry")
+    chosen = _chosen(table, names(rows), split)
+    folder = out or Path("ablation") / f"table-{table}"
+    options = DataOptions(cache or folder.parent / "shards", None, None, reader, raw_root)
+    budget = f"{steps} steps a row{', at reduced size' if reduced else ''}"
+    lines = _measured(table, chosen, _trainer(data, test, options, folder, steps, reduced, device))
+    _finish(folder, table, lines, budget)
+
+
+def _chosen(number: int, presets: tuple[str, ...] | None, split: str | None) -> list[TableRow]:
+    """The rows to train: those of other splits only where recordings are split, each preset once where they are not."""
+    from hybridlio.learned.presets import preset, table
+    from hybridlio.learned.presets import split as sequences_of
+
+    rows = [row for row in table(number) if presets is None or row.preset in presets]
+    if not rows:
+        known = ", ".join(dict.fromkeys(row.preset for row in table(number)))
+        raise ConfigError(f"--rows: none of table {number}'s; there are {known}")
+    if split is not None:
+        sequences_of(split, preset(rows[0].preset).network)
+        return [row if row.split else replace(row, split=split) for row in rows]
+    return [replace(row, split=None) for k, row in enumerate(rows) if row.preset not in {r.preset for r in rows[:k]}]
+
+
+def _trainer(
+    data: list[Path],
+    test: list[Path] | None,
+    options: DataOptions,
+    folder: Path,
+    steps: int,
+    small: bool,
+    device: str,
+) -> Rows:
+    """Trains and evaluates a row."""
+    from hybridlio.learned.ablation import RowData, run_rows
+    from hybridlio.learned.ablation import reduced as smaller
+    from hybridlio.learned.presets import preset
+    from hybridlio.learned.training import RunOptions
+    from hybridlio.training_data import shards_of, split_options
+
+    run_options = RunOptions(device=None if device == "auto" else device)
+
+    def prepared(recipe: Recipe, split: str | None) -> RowData:
+        train, tests = split_options(options, split, recipe)
+        with shown("preparing", "scans") as tick:
+            parts = [
+                shards_of(paths, recipe, where, lambda name, done, total: tick(done, total, name))
+                for paths, where in ((data, train), (test or data, tests))
+            ]
+        return RowData(*parts)
+
+    def run(row: TableRow) -> RowResult:
+        recipe = replace(preset(row.preset), name=row.name)
+        recipe = smaller(recipe) if small else recipe
+        with shown(row.name, "steps") as tick:
+            (result,) = run_rows(
+                [recipe],
+                lambda recipe: prepared(recipe, row.split),
+                folder,
+                steps,
+                run_options,
+                lambda _, p: tick(p.step, steps, f"loss {p.loss:.4g}, {p.pairs_per_s:.1f} pairs/s"),
+            )
+        return result
+
+    return run
+
+
+def _measured(number: int, chosen: list[TableRow], run: Rows) -> list[Line]:
+    """Every line of the table, those of chosen rows with what was measured."""
+    from hybridlio.learned.comparison import Line
+    from hybridlio.learned.published import published
+
+    wanted, lines = {row.published: row for row in chosen}, []
+    for figures in published(number):
+        row = wanted.get(figures.method)
+        if row is None:
+            lines.append(Line(figures.method, None, None, figures))
+            continue
+        try:
+            lines.append(Line(figures.method, row.preset, run(row), figures))
+        except KeyboardInterrupt:
+            complain("interrupted; the same command goes on where this one stopped")
+            raise typer.Exit(INTERRUPTED) from None
+        except HybridLioError as error:
+            complain(f"error: {row.name}: {error}")
+            lines.append(Line(figures.method, row.preset, None, figures, str(error)))
+    return lines
+
+
+def _finish(folder: Path, number: int, lines: list[Line], budget: str) -> None:
+    from hybridlio.files import write_whole
+    from hybridlio.learned.comparison import LEGEND, tables, to_json_dict, to_markdown
+
+    if not leads():
+        return
+    text = json.dumps(to_json_dict(number, lines, budget), indent=2, ensure_ascii=False)
+    write_whole(folder / f"table-{number}.json", text + "\n")
+    write_whole(folder / f"table-{number}.md", to_markdown(number, lines, budget))
+    for title, rows in tables(lines).items():
+        say_table(_table(f"table {number}, {title}: {budget}", rows, LEGEND))
+    say(f"written to {folder / f'table-{number}.md'} and {folder / f'table-{number}.json'}")
+    if any(line.error for line in lines):
+        raise typer.Exit(common.FAILED)
+
+
+def _table(title: str, rows: list[dict[str, str]], legend: str) -> Table:
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    out = Table(title=Text(title), caption=Text(legend), box=box.SIMPLE_HEAD, padding=0)
+    for name in rows[0]:
+        out.add_column(Text(name), justify="left" if name in ("method", "figures") else "right")
+    for row in rows:
+        out.add_row(*map(Text, row.values()))
+    return out
