@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from hybridlio.errors import ConfigError
 from hybridlio.files import write_whole
+from hybridlio.keyframes import KeyframeSettings
 from hybridlio.learned.source_settings import LstmSettings, NetworkResidualSettings
 from hybridlio.scan_matching import ScanMatchingSettings
 from hybridlio.sensors import ImuNoise
@@ -25,6 +26,7 @@ class Config(BaseModel):
         scan_matching: settings of the classical residual source.
         lstm: settings of the learned initial-pose source.
         network: settings of the learned residual source.
+        keyframes: which clouds are kept for closing loops.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -36,6 +38,7 @@ class Config(BaseModel):
     scan_matching: ScanMatchingSettings = Field(default_factory=ScanMatchingSettings)
     lstm: LstmSettings = Field(default_factory=LstmSettings)
     network: NetworkResidualSettings = Field(default_factory=NetworkResidualSettings)
+    keyframes: KeyframeSettings = Field(default_factory=KeyframeSettings)
 
 
 def config_to_yaml(config: Config) -> str:

@@ -15,6 +15,7 @@ from hybridlio.config import Config
 from hybridlio.deskew import constant_twist, deskew
 from hybridlio.errors import ConfigError, DataError, EstimationError
 from hybridlio.estimates import Array, Backend, InitialPoseSource, RelativePose, ResidualSource, State, TakesBack
+from hybridlio.keyframes import KeyframeMaker
 from hybridlio.record import Record
 from hybridlio.sensors import Calibration, Frame, GpsFix, ImuNoise, ImuSamples
 from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES, Setup, check_names
@@ -85,6 +86,7 @@ class Odometry:
         self._estimates: list[Estimate] = []
         self._imu: list[ImuSamples] = []
         self._gps: list[GpsFix] = []
+        self._keyframes = KeyframeMaker(config.keyframes)
 
     def step(self, frame: Frame) -> Estimate:
         """Estimate the frame's pose.
@@ -117,6 +119,8 @@ class Odometry:
         if relative.ok and relative.source != initial.source:  # its own guess is nothing to learn from
             self._initial_pose.correct(frame, step)
         pose, covariance = self._lidar_pose(self._state)
+        with _timed(seconds, "keyframes"):
+            self._keyframes.offer(len(self._estimates), self._compensated, pose)
         return self._keep(
             Estimate(frame.index, frame.scan.stamp_ns, pose, covariance, initial, relative, step, seconds, agreement)
         )  # fmt: skip
@@ -144,6 +148,7 @@ class Odometry:
             start=self._start_state,
             calibration=self._setup.calibration,
             imu_noise=self._setup.imu_noise,
+            keyframes=self._keyframes.keyframes(),
         )
 
     def _begin(self, frame: Frame) -> Estimate:
@@ -183,6 +188,7 @@ class Odometry:
                 step = constant_twist(initial.pose, state.stamp_ns, frame.scan.stamp_ns)
                 motion = sweep_motion(frame, step, state, self._setup.calibration)
                 frame = replace(frame, scan=deskew(frame.scan, motion))
+        self._compensated = frame.scan
         with _timed(seconds, "residual"):
             relative = self._residual.refine(frame, initial)
         return relative.wider(added=turned) if relative.ok else relative

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from hybridlio.errors import DataError
 from hybridlio.estimates import KeyframePose, RelativePose, State
 from hybridlio.files import writing_whole
+from hybridlio.keyframes import Keyframes
 from hybridlio.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.trajectory import Trajectory
 
@@ -39,6 +40,7 @@ class Record:
         start: the prior state at the first scan.
         calibration: the extrinsics.
         imu_noise: what the IMU was taken to be worth.
+        keyframes: clouds for closing loops, or None; they have a file of their own.
     """
 
     online: Trajectory
@@ -49,6 +51,7 @@ class Record:
     start: State
     calibration: Calibration
     imu_noise: ImuNoise
+    keyframes: Keyframes | None = None
 
     @property
     def edges(self) -> list[tuple[int, int, RelativePose]]:
@@ -68,7 +71,7 @@ class Record:
         return out
 
     def save(self, path: Path) -> None:
-        """Write everything to one ``.npz`` file of plain arrays."""
+        """Write everything but the keyframes to one ``.npz`` file of plain arrays."""
         with writing_whole(path) as part, part.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **_to_arrays(self))
 

@@ -29,8 +29,8 @@ from hybridlio.trajectory_files import read_tum, write_kitti, write_tum
 
 POSES, KITTI, COVARIANCES, GRAPH = "poses_tum.txt", "poses_kitti.txt", "covariances.npz", "graph.g2o"
 RECORD, CONFIG, METRICS, REFERENCE = "odometry.npz", "config.yaml", "metrics.json", "reference_tum.txt"
-REPORT, PICTURE, SMOOTHED = "report.html", "trajectory.png", "smoothed"
-FILES = (POSES, KITTI, COVARIANCES, GRAPH, RECORD, CONFIG, METRICS, REFERENCE, REPORT, PICTURE)
+REPORT, PICTURE, SMOOTHED, KEYFRAMES = "report.html", "trajectory.png", "smoothed", "keyframes.npz"
+FILES = (POSES, KITTI, COVARIANCES, GRAPH, RECORD, KEYFRAMES, CONFIG, METRICS, REFERENCE, REPORT, PICTURE)
 
 
 @dataclass(frozen=True, eq=False)

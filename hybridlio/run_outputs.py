@@ -20,6 +20,7 @@ from hybridlio.trajectory_files import write_tum
 
 if TYPE_CHECKING:
     from hybridlio.agreement import Verdict
+    from hybridlio.graph.loops import ClosedLoops
     from hybridlio.graph.offline import Smoothed
 
 _ONLINE, _SMOOTHED = "odometry", "smoothed"
@@ -42,6 +43,8 @@ def write_run(folder: Path, run: Run, config: Config) -> Findings:
     sequence, trajectory, record = run.sequence, run.trajectory, run.record
     if record is not None:
         record.save(folder / run_folder.RECORD)
+        if record.keyframes is not None:
+            record.keyframes.save(folder / run_folder.KEYFRAMES)
         run_folder.write_graph(folder, trajectory.poses, record.edges, run.skipped)
     run_folder.write_trajectory(folder, trajectory, T_pose_files(run), run.steps, run.stamps_before)
     if sequence.reference is not None:
@@ -175,7 +178,10 @@ def write_smoothed(folder: Path, stored: run_folder.StoredRun, record: Record, s
     run_folder.clear(folder)
     trajectory, T = smoothed.trajectory, stored.T_camera_lidar
     run_folder.write_trajectory(folder, trajectory, T, stamps_before=stored.stamps_before)
-    run_folder.write_graph(folder, trajectory.poses, record.edges, len(stored.stamps_before))
+    closed: ClosedLoops | None = smoothed.found.get("loops")
+    loops = () if closed is None else closed.kept
+    edges = [*record.edges, *((loop.earlier, loop.later, loop.as_relative_pose()) for loop in loops)]
+    run_folder.write_graph(folder, trajectory.poses, edges, len(stored.stamps_before))
     if stored.reference is not None:
         write_tum(folder / run_folder.REFERENCE, stored.reference)
     data = ReportData(
@@ -186,7 +192,9 @@ def write_smoothed(folder: Path, stored: run_folder.StoredRun, record: Record, s
         others={_ONLINE: stored.trajectory},
         ok=np.array([step.ok for step in record.relative]),
         degenerate=np.array([len(step.degenerate) > 0 for step in record.relative]),
-        facts={"smoothed": f"{smoothed.iterations} iterations", "run": stored.path.name},
+        loops=np.array([(loop.earlier, loop.later) for loop in loops], np.int64).reshape(-1, 2),
+        facts={"smoothed": f"{smoothed.iterations} iterations", "run": stored.path.name}
+        | ({} if closed is None else {"loops": closed.summary()}),
         warnings=stored.metrics["notes"],
     )
     findings = find(data)
@@ -195,6 +203,8 @@ def write_smoothed(folder: Path, stored: run_folder.StoredRun, record: Record, s
     figures = {name: stored.metrics[name] for name in kept if name in stored.metrics}
     figures |= {name: getattr(smoothed, name) for name in ("error_before", "error_after", "iterations", "converged")}
     figures |= {"path_length_m": trajectory.length_m}
+    if closed is not None:
+        figures |= {"loops": closed.to_json_dict(len(stored.stamps_before))}
     judged = findings.evaluations.get(_SMOOTHED)
     run_folder.write_metrics(folder, figures | (judged.to_json_dict() if judged is not None else {}))
     return findings
