@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gtsam
 import numpy as np
@@ -22,6 +22,9 @@ from hybridlio.graph.scans import Scans
 from hybridlio.graph.solver import incremental_solver, reason
 from hybridlio.record import Record
 from hybridlio.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from hybridlio.loop_closure import LoopSettings
 
 Progress = Callable[[str, int, int], None]
 
@@ -61,6 +64,7 @@ def smooth(
     record: Record,
     progress: Progress | None = None,
     *,
+    loops: bool | LoopSettings = False,
     groups: Sequence[FactorGroup] = (),
     robust: str | None = None,
 ) -> Smoothed:
@@ -69,6 +73,8 @@ def smooth(
     Args:
         record: of the run, from :meth:`hybridlio.odometry.Odometry.record` or a run folder's ``odometry.npz``.
         progress: called with the stage, what is done of it and what there is in all.
+        loops: find where the run comes back to a place, and close the loops; settings of how, or True. What became of
+            them is ``found["loops"]``, a :class:`hybridlio.graph.loops.ClosedLoops`.
         groups: more measurements.
         robust: how to treat those of the groups' measurements that may be wrong: ``huber``, ``cauchy``,
             ``geman-mcclure``, ``dcs`` or ``gnc``; by default as each group prefers.
@@ -76,9 +82,10 @@ def smooth(
     Raises:
         GraphError: the graph cannot be solved.
         ConfigError: an unknown treatment.
+        DataError: loops are asked for, and the record has no keyframes.
     """
     report = progress or _silent
-    added = Added(groups, check_treatment(robust))
+    added = Added(_with_loops(groups, record, loops, report), check_treatment(robust))
     states = _online_states(record)
     error_before: float | None = None
     for number in range(_ROUNDS):
@@ -94,6 +101,16 @@ def smooth(
     covariances = _covariances(isam, len(states), report)
     found = added.found(values, states, isam)
     return _smoothed(record, states, covariances, error_before or 0.0, optimiser, found)
+
+
+def _with_loops(
+    groups: Sequence[FactorGroup], record: Record, loops: bool | LoopSettings, report: Progress
+) -> Sequence[FactorGroup]:
+    if loops is False:
+        return groups
+    from hybridlio.graph.loops import LoopClosures  # late: registration is of no use to those without loops
+
+    return (*groups, LoopClosures.of(record, None if loops is True else loops, report))
 
 
 def _silent(stage: str, done: int, total: int) -> None:

@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 REFERENCE = "#444444"
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#000000")
 BAD = "#D55E00"
+LOOP = "#009E73"
 _WIDTH_IN = 11.0
 _STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
@@ -57,7 +58,10 @@ def to_png(figure: Figure, dpi: int = 160) -> bytes:
 
 
 def trajectory_figure(
-    paths: Mapping[str, DrawnPath], reference_m: Array | None = None, bridged_m: Array | None = None
+    paths: Mapping[str, DrawnPath],
+    reference_m: Array | None = None,
+    bridged_m: Array | None = None,
+    loops_m: Array | None = None,
 ) -> Figure:
     """The paths from above, their heights along the way, and with a reference their distances from it.
 
@@ -65,12 +69,13 @@ def trajectory_figure(
         paths: by name, the main one first, in the reference's frame.
         reference_m: ``(R, 3)`` positions of the truth.
         bridged_m: ``(B, 3)`` positions where a scan could not be used, to be marked.
+        loops_m: ``(L, 2, 3)`` positions of the two ends of each loop closure, to be joined.
     """
     with rc_context(_STYLE):
         figure = Figure(figsize=(_WIDTH_IN, 5.4), layout="constrained")
         right = ["height", "error"] if reference_m is not None else ["height", "height"]
         axes = figure.subplot_mosaic([["above", right[0]], ["above", right[1]]], width_ratios=[1.2, 1])
-        _above(axes["above"], paths, reference_m, bridged_m)
+        _above(axes["above"], paths, reference_m, bridged_m, loops_m)
         if reference_m is not None:
             axes["height"].plot(_travelled(reference_m), reference_m[:, 2], color=REFERENCE, lw=4, alpha=0.45)
             axes["error"].set(title="Distance from the reference", xlabel="distance travelled [m]", ylabel="[m]")
@@ -191,7 +196,13 @@ def sigma_figure(times_s: Array, consistency: PoseConsistency) -> Figure:
     return figure
 
 
-def _above(ax: Axes, paths: Mapping[str, DrawnPath], reference_m: Array | None, bridged_m: Array | None) -> None:
+def _above(
+    ax: Axes,
+    paths: Mapping[str, DrawnPath],
+    reference_m: Array | None,
+    bridged_m: Array | None,
+    loops_m: Array | None,
+) -> None:
     if reference_m is not None:
         ax.plot(*reference_m[:, :2].T, color=REFERENCE, lw=4, alpha=0.45, label="reference")
     for k, (name, path) in enumerate(paths.items()):
@@ -202,10 +213,18 @@ def _above(ax: Axes, paths: Mapping[str, DrawnPath], reference_m: Array | None, 
     ax.plot(*main[-1, :2], "s", color="black", ms=7, zorder=4, label="end")
     if bridged_m is not None and len(bridged_m):
         ax.plot(*bridged_m[:, :2].T, "x", color=BAD, ms=7, mew=2, zorder=5, label="scan bridged")
+    if loops_m is not None and len(loops_m):
+        _draw_loops(ax, loops_m)
     ax.set(title="From above", xlabel="x [m]", ylabel="y [m]")
     _at_least(ax, 1.0)
     ax.set_aspect("equal", adjustable="datalim")
     ax.legend(loc="best")
+
+
+def _draw_loops(ax: Axes, loops_m: Array) -> None:
+    """Dots at both ends, which may lie on each other, and a line between them."""
+    joined = np.concatenate([loops_m[:, :, :2], np.full((len(loops_m), 1, 2), np.nan)], axis=1).reshape(-1, 2)
+    ax.plot(*joined.T, "-o", color=LOOP, ms=3.5, lw=1.2, zorder=3.5, label="loop closed")
 
 
 def _line(k: int) -> dict[str, Any]:

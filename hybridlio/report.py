@@ -17,7 +17,7 @@ from hybridlio.drift import Drift
 from hybridlio.files import write_whole
 from hybridlio.metrics import Evaluation
 from hybridlio.metrics_table import figures
-from hybridlio.report_data import Findings, ReportData, find
+from hybridlio.report_data import DrawnPath, Findings, ReportData, find
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -70,7 +70,8 @@ def pictures(data: ReportData, findings: Findings) -> dict[str, Figure]:
 
     reference = None if data.reference is None or not findings.evaluations else data.reference.poses[:, :3, 3]
     bridged = None if data.ok is None else _bridged_m(data, findings)
-    out = {"trajectory": plots.trajectory_figure(findings.paths, reference, bridged)}
+    loops = None if data.loops is None else _loops_m(data.loops, findings.paths[data.estimate_name])
+    out = {"trajectory": plots.trajectory_figure(findings.paths, reference, bridged, loops)}
     drifts = {name: _drift(evaluation) for name, evaluation in findings.evaluations.items()}
     drifts = {name: drift for name, drift in drifts.items() if len(drift)}
     if drifts:
@@ -216,6 +217,12 @@ def _verdict(result: Anees) -> str:
 def _bridged_m(data: ReportData, findings: Findings) -> Any:
     path = findings.paths[data.estimate_name]
     return path.positions_m[np.isin(path.rows, np.flatnonzero(~np.asarray(data.ok, bool)) + 1)]
+
+
+def _loops_m(loops: Any, path: DrawnPath) -> Any:
+    """``(L, 2, 3)``; of loops whose two ends are drawn."""
+    drawn = loops[np.isin(loops, path.rows).all(axis=1)]
+    return path.positions_m[np.searchsorted(path.rows, drawn)]
 
 
 def _ranges(frames: Any) -> list[str]:

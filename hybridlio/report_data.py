@@ -33,6 +33,7 @@ class ReportData:
         timings_s: stage to ``(M,)`` seconds, one a scan, in the order in which the stages run.
         ok: ``(N-1,)``; False where a step is bridged because its scan could not be used.
         degenerate: ``(N-1,)``; True where the scan left a direction of the step unconstrained.
+        loops: ``(L, 2)`` rows of the estimate that loop closures join.
         facts: short lines for the head by label, such as the sources used.
         config: the configuration as YAML text.
         warnings: what a reader should know before trusting the figures.
@@ -49,6 +50,7 @@ class ReportData:
     timings_s: Mapping[str, Array] = field(default_factory=dict)
     ok: NDArray[np.bool_] | None = None
     degenerate: NDArray[np.bool_] | None = None
+    loops: NDArray[np.int64] | None = None
     facts: Mapping[str, str] = field(default_factory=dict)
     config: str = ""
     warnings: Sequence[str] = ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -25,12 +26,22 @@ def smooth(
         Path | None, typer.Option("-o", "--out", metavar="DIR", help="Where to write; by default RUN/smoothed.")
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run that is in -o.")] = False,
+    loops: Annotated[
+        bool, typer.Option("--loops", help="Find where the run comes back to a place, and close the loops.")
+    ] = False,
+    robust: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME", help="What to do about wrong loops and fixes: gnc, huber, cauchy, geman-mcclure, dcs."
+        ),
+    ] = None,
     _verbose: Verbose = 0,
 ) -> None:
     """Optimise all poses of a finished run at once, and leave the better trajectory with a report of its own."""
+    from hybridlio.keyframes import Keyframes
     from hybridlio.metrics_table import evaluation_table
     from hybridlio.record import Record
-    from hybridlio.run_folder import POSES, RECORD, REPORT, SMOOTHED, is_run_folder, read_run
+    from hybridlio.run_folder import KEYFRAMES, POSES, RECORD, REPORT, SMOOTHED, is_run_folder, read_run
     from hybridlio.run_outputs import write_smoothed
 
     stored = read_run(run)
@@ -40,12 +51,16 @@ def smooth(
     if out is not None and is_run_folder(out) and not overwrite:
         raise ConfigError(f"{out} holds a run already; choose another folder, or --overwrite it")
     record = Record.load(run / RECORD)
-    smoothed = _smooth(record)
+    if loops:
+        record = replace(record, keyframes=Keyframes.load(run / KEYFRAMES))
+    smoothed = _smooth(record, loops, robust)
     findings = write_smoothed(folder, stored, record, smoothed)
     error = (
         f"error {smoothed.error_before:.4g} before, {smoothed.error_after:.4g} after {smoothed.iterations} iterations"
     )
     say(f"{stored.metrics['sequence']}: {len(smoothed.trajectory)} poses, {error}")
+    if (closed := smoothed.found.get("loops")) is not None:
+        say(f"loops: {closed.summary()}")
     if not smoothed.converged:
         complain("warning: the optimiser stopped before the error had stopped falling", "yellow")
     if findings.evaluations:
@@ -54,7 +69,7 @@ def smooth(
     say(f"report  {folder / REPORT}")
 
 
-def _smooth(record: Record) -> Smoothed:
+def _smooth(record: Record, loops: bool, robust: str | None) -> Smoothed:
     from hybridlio.graph.offline import smooth as optimise
 
     with progress("smoothing", "poses") as tick:
@@ -62,7 +77,9 @@ def _smooth(record: Record) -> Smoothed:
         def show(stage: str, done: int, total: int) -> None:
             if stage == "covariances":
                 tick(done + 1, total, stage)
+            elif stage == "loops":
+                tick(done, total, "looking for loops")
             else:
                 tick(0, len(record.online), f"{stage}, round {done + 1} of {total}")
 
-        return optimise(record, show)
+        return optimise(record, show, loops=loops, robust=robust)

@@ -1,0 +1,180 @@
+"""Whether two keyframes are of one place: one's cloud is registered to the surroundings of the other, and the reverse.
+
+A pose counts only if many points of each cloud lie on the other's surfaces, the surfaces hold every direction, and both
+registrations end at the same pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from itertools import product
+
+import numpy as np
+import small_gicp
+
+from hybridlio import se3
+from hybridlio.estimates import Array
+from hybridlio.information import covariance_of, degenerate_directions
+from hybridlio.keyframes import Keyframes
+from hybridlio.odometry_chain import Index, OdometryChain
+from hybridlio.registration import Registration, RegistrationSettings, Surface, cost_at, register
+from hybridlio.voxel import voxel_average
+
+
+def _registration() -> RegistrationSettings:
+    return RegistrationSettings(max_iterations=30, threads=1)  # for so few points threads cost more than they save
+
+
+@dataclass(frozen=True)
+class VerificationSettings:
+    """When a candidate is taken for a loop.
+
+    Attributes:
+        reach_m: keyframes so far along the path on either side are merged to the surroundings.
+        surface_voxel_m, source_voxel_m: sides of the voxels that thin the surroundings, and the cloud laid on them.
+        neighbours: points to fit a plane to for a normal.
+        min_matched: share of points that must lie near a surface.
+        max_cost: of the mean robust cost, between 0 and 1.
+        max_difference_m, max_difference_deg: between the registrations of either cloud to the other's surroundings.
+        covariance_scale: how much larger the covariance is than independent residuals would make it.
+        registration: kernel, distances, limits.
+    """
+
+    reach_m: float = 10.0
+    surface_voxel_m: float = 0.4
+    source_voxel_m: float = 1.0
+    neighbours: int = 10
+    min_matched: float = 0.7
+    max_cost: float = 0.5
+    max_difference_m: float = 0.3
+    max_difference_deg: float = 0.5
+    covariance_scale: float = 6.0
+    registration: RegistrationSettings = field(default_factory=_registration)
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What verification says of a candidate.
+
+    Attributes:
+        reason: why it is no loop; empty for one that is.
+        pose: ``(4, 4)`` ``T_earlier_later``; the best that was found.
+        covariance: ``(6, 6)`` of a right perturbation, rad² and m², rotation first; of a loop only.
+        matched, cost: of the worse of the two registrations.
+    """
+
+    reason: str
+    pose: Array
+    covariance: Array
+    matched: float
+    cost: float
+
+
+_FINE_START_M = 0.5  # the kernel of the last registration begins so wide
+_SPARSE = 4  # one in so many points is enough to tell a metre from another
+_COARSE_ITERATIONS = 8
+_COARSE_KERNEL_M = 1.0
+_AHEAD_M, _LEFT_M = (0.0, -3.0, 3.0), (0.0, -2.0, 2.0)
+_LIKELY = 3
+_SURFACES_KEPT = 64
+
+
+class Verifier:
+    """Registers keyframes to each other's surroundings.
+
+    Args:
+        keyframes: of the run.
+        chain: its odometry, of which only relative poses of neighbours are used.
+        settings: limits.
+    """
+
+    def __init__(self, keyframes: Keyframes, chain: OdometryChain, settings: VerificationSettings) -> None:
+        self._keyframes, self._chain, self._settings = keyframes, chain, settings
+        self._surface = lru_cache(_SURFACES_KEPT)(self._make_surface)
+        self._source = lru_cache(_SURFACES_KEPT)(self._make_source)
+
+    def surroundings(self, k: int) -> Array:
+        """Points ``(N, 3)`` of keyframe ``k`` and its neighbours along the path, in its frame."""
+        near, rows = self._near(k), self._keyframes.rows
+        relative = self._chain.relative(rows[k], rows[near])
+        clouds = [self._keyframes.points(int(j)) for j in near]
+        return np.concatenate([se3.transform(T, points) for T, points in zip(relative, clouds, strict=True)])
+
+    def verify(self, earlier: int, later: int, guesses: Sequence[Array]) -> Verdict:
+        """Find the relative pose of two keyframes from several starts, and judge it.
+
+        Args:
+            earlier, later: numbers of the keyframes.
+            guesses: ``(4, 4)`` poses ``T_earlier_later`` near which to look.
+        """
+        start = self._search(earlier, later, guesses)
+        there = register(self._surface(earlier), self._source(later), start, self._settings.registration, _FINE_START_M)
+        if reason := self._wrong(there):
+            return _rejected(reason, there)
+        back = register(
+            self._surface(later), self._source(earlier), se3.inverse(there.pose), self._settings.registration
+        )
+        if reason := self._wrong(back) or self._differ(there, back):
+            return _rejected(reason, there)
+        return self._accepted(earlier, later, there, back)
+
+    def _near(self, k: int) -> Index:
+        travelled = self._chain.travelled_m[self._keyframes.rows]
+        return np.flatnonzero(np.abs(travelled - travelled[k]) <= self._settings.reach_m)
+
+    def _distortion(self, k: int) -> Array:
+        """By how much odometry may have misplaced the neighbours of a keyframe: their mean covariance ``(6, 6)``."""
+        rows = self._keyframes.rows
+        near = rows[self._near(k)]
+        return np.asarray(self._chain.covariance(near, np.full(len(near), rows[k])).mean(axis=0))
+
+    def _make_surface(self, k: int) -> Surface:
+        thinned = voxel_average(self.surroundings(k), None, self._settings.surface_voxel_m)[0].astype(np.float64)
+        cloud = small_gicp.PointCloud(thinned)
+        threads = self._settings.registration.threads
+        small_gicp.estimate_normals(cloud, None, self._settings.neighbours, threads)
+        points, normals = cloud.points()[:, :3], cloud.normals()[:, :3]
+        known = np.abs(normals).sum(axis=1) > 0.5  # small_gicp leaves a normal zero where there are too few neighbours
+        return Surface(points[known], normals[known], threads)
+
+    def _make_source(self, k: int) -> Array:
+        points = voxel_average(self._keyframes.points(k), None, self._settings.source_voxel_m)[0]
+        return points.astype(np.float64)
+
+    def _search(self, earlier: int, later: int, guesses: Sequence[Array]) -> Array:
+        """The best of the starts around the guesses: judged by few points, the likelier ones after some steps."""
+        surface, sparse = self._surface(earlier), self._source(later)[::_SPARSE]
+        settings = self._settings.registration
+        steps = [se3.exp(np.array([0.0, 0.0, 0.0, x, y, 0.0])) for x, y in product(_AHEAD_M, _LEFT_M)]
+        starts = [guess @ step for guess in guesses for step in steps]
+        starts.sort(key=lambda T: cost_at(surface, sparse, T, _COARSE_KERNEL_M, settings.threads))
+        coarse = replace(settings, max_iterations=_COARSE_ITERATIONS)
+        tries = [register(surface, sparse, T, coarse, _COARSE_KERNEL_M) for T in starts[:_LIKELY]]
+        return min(tries, key=lambda found: found.cost).pose
+
+    def _wrong(self, found: Registration) -> str:
+        if found.matched < self._settings.min_matched:
+            return f"only {found.matched:.0%} of the points match"
+        if found.cost > self._settings.max_cost:
+            return f"the surfaces do not fit (cost {found.cost:.2f})"
+        return "a direction is not held" if len(degenerate_directions(found.hessian)) else ""
+
+    def _differ(self, there: Registration, back: Registration) -> str:
+        gap = se3.log(there.pose @ back.pose)
+        metres, degrees = float(np.linalg.norm(gap[3:])), float(np.rad2deg(np.linalg.norm(gap[:3])))
+        apart = metres > self._settings.max_difference_m or degrees > self._settings.max_difference_deg
+        return f"the two directions differ by {metres:.2f} m and {degrees:.1f}°" if apart else ""
+
+    def _accepted(self, earlier: int, later: int, there: Registration, back: Registration) -> Verdict:
+        """The mean of the two registrations, each of which is as wrong as its surroundings are."""
+        pose = se3.interpolate(there.pose, se3.inverse(back.pose), 0.5)
+        covariance = covariance_of(there.hessian, there.sigma_m, self._settings.covariance_scale) / 2
+        seen_from_later = se3.rotate_covariance(self._distortion(earlier), se3.inverse(pose))
+        covariance = covariance + (seen_from_later + self._distortion(later)) / 4
+        return Verdict("", pose, covariance, min(there.matched, back.matched), max(there.cost, back.cost))
+
+
+def _rejected(reason: str, found: Registration) -> Verdict:
+    return Verdict(reason, found.pose, np.full((6, 6), np.nan), found.matched, found.cost)
