@@ -18,7 +18,7 @@ import numpy as np
 
 from hybridlio.graph import PoseGraph
 from hybridlio.graph.coordinates import to_matrices
-from hybridlio.graph.edges import is_step
+from hybridlio.graph.edges import loops_of
 
 _EQUAL = 1e-5  # relative; errors closer than this are the same answer
 
@@ -93,7 +93,7 @@ def compare(path: Path, runs: int) -> None:
 
 def with_wrong_loops(path: Path, seed: int) -> tuple[PoseGraph, set[int]]:
     graph, rng = PoseGraph.load(path), np.random.default_rng(seed)
-    loops = [factor for factor in graph.factors.values() if not is_step(factor)]
+    loops = [graph.factors[number] for number in loops_of(graph)]
     wrong: set[int] = set()
     while len(wrong) < round(0.1 * len(loops)):
         i, j = (int(k) for k in rng.choice(len(graph), 2, replace=False))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -20,17 +21,26 @@ _MOTIONS = ("rotation about x", "rotation about y", "rotation about z", "x", "y"
 _UP = np.array([0.0, 0.0, 1.0])
 
 
+def labels(data: GraphData, kinds: Iterable[str]) -> tuple[int, NDArray[np.int32]]:
+    """How many groups of poses factors of these kinds make, and each pose's group ``(N,)``."""
+    places = data.places
+    others = [[places[key] for key in f.keys] for f in data.others.values() if f.kind in kinds and len(f.keys) == 2]
+    ends = np.array(others, dtype=np.int64).reshape(-1, 2)
+    if "between" in kinds:
+        ends = np.vstack([data.edges.ends, ends])
+    joined = coo_matrix((np.ones(len(ends)), ends.T), shape=(len(data), len(data)))
+    count, found = connected_components(joined, directed=False)
+    return int(count), found
+
+
 def groups(data: GraphData, kinds: Iterable[str]) -> list[list[Key]]:
     """Poses that factors of these kinds join, in the graph's order, largest group first."""
-    keys = data.keys
-    index = {key: k for k, key in enumerate(keys)}
-    pairs = [[index[key] for key in f.keys] for f in data.factors.values() if f.kind in kinds and len(f.keys) == 2]
-    ends = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-    joined = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(keys), len(keys)))
-    count, labels = connected_components(joined, directed=False)
+    count, label = labels(data, kinds)
+    if count == 1:
+        return [data.keys]
     found: list[list[Key]] = [[] for _ in range(count)]
-    for key, label in zip(keys, labels, strict=True):
-        found[label].append(key)
+    for key, number in zip(data.keys, label.tolist(), strict=True):
+        found[number].append(key)
     return sorted(found, key=len, reverse=True)
 
 
@@ -41,9 +51,9 @@ def components(data: GraphData) -> list[list[Key]]:
 
 def chains_without_bias(data: GraphData) -> list[tuple[Key, ImuNoise]]:
     """First pose and noise of each chain of inertial factors whose biases nothing measures."""
-    measured = {factor.keys[0] for factor in data.factors.values() if factor.kind == "bias"}
+    measured = {factor.keys[0] for factor in data.others.values() if factor.kind == "bias"}
     first: dict[Key, ImuNoise] = {}
-    for factor in data.factors.values():
+    for factor in data.others.values():
         if factor.kind == "imu":
             first.setdefault(factor.keys[0], ImuNoise(*factor.measured))
     found = []
@@ -61,11 +71,14 @@ def check_determined(data: GraphData) -> None:
         GraphError: no poses, a pose that no factor concerns, a part of the graph that may move as a whole, or a chain
             of inertial factors whose speed nothing tells; names the keys.
     """
-    if not data.keys:
+    if not len(data):
         raise GraphError("the graph has no poses")
-    concerned = {key for factor in data.factors.values() for key in factor.keys} | data.fixed
-    alone = [key for key in data.keys if key not in concerned]
-    if alone:
+    concerned = np.zeros(len(data), dtype=bool)
+    concerned[data.edges.ends.ravel()] = True
+    named_by_others = {key for factor in data.others.values() for key in factor.keys} | data.fixed
+    concerned[[data.places[key] for key in named_by_others]] = True
+    if not concerned.all():
+        alone = [key for key, there in zip(data.keys, concerned, strict=True) if not there]
         raise GraphError(f"no factor concerns pose {named(alone)}; add one, or leave the pose out")
     free = [(part, motions) for part in components(data) if (motions := _free_motions(data, part))]
     if free:
@@ -86,9 +99,10 @@ def _free_motions(data: GraphData, part: list[Key]) -> list[str]:
     if inside & data.fixed:
         return []
     names = _MOTIONS if data.dimension == 3 else _MOTIONS[2:5]
-    rows = [_seen(f) for f in data.factors.values() if f.keys[0] in inside and f.kind not in ("between", "bias")]
-    if any(f.kind == "prior" and f.keys[0] in inside for f in data.factors.values()):
+    factors = [f for f in data.others.values() if f.keys[0] in inside and f.kind != "bias"]
+    if any(factor.kind == "prior" for factor in factors):
         return []
+    rows = [_seen(factor) for factor in factors]
     if data.dimension == 2 or not rows:
         return list(names)
     seen = np.vstack(rows)
@@ -116,9 +130,9 @@ def _seen(factor: Factor) -> Array:
 
 def _check_speeds(data: GraphData) -> None:
     """A chain of inertial factors has a free speed unless a velocity or two of its poses are told otherwise."""
-    told = {f.keys[0] for f in data.factors.values() if f.kind == "velocity"}
-    placed = {f.keys[0] for f in data.factors.values() if f.kind in ("prior", "gps")} | data.fixed
-    if not any(factor.kind == "imu" for factor in data.factors.values()):
+    told = {f.keys[0] for f in data.others.values() if f.kind == "velocity"}
+    placed = {f.keys[0] for f in data.others.values() if f.kind in ("prior", "gps")} | data.fixed
+    if not any(factor.kind == "imu" for factor in data.others.values()):
         return
     place: dict[Key, int] = {}
     for number, group in enumerate(groups(data, ("between",)), 1):

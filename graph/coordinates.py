@@ -64,9 +64,11 @@ def to_matrices(coordinates: Array) -> Array:
 
 def gtsam_poses(coordinates: Array) -> list[Any]:
     """The poses as GTSAM has them: ``Pose3``, in the plane ``Pose2``."""
-    if coordinates.shape[1] == 7:
-        return [gtsam.Pose3(T) for T in to_matrices(coordinates)]
-    return [gtsam.Pose2(x, y, theta) for x, y, theta in coordinates.tolist()]
+    if coordinates.shape[1] == 3:
+        return [gtsam.Pose2(x, y, theta) for x, y, theta in coordinates.tolist()]
+    turn, make = gtsam.Rot3.Quaternion, gtsam.Pose3
+    quaternions = coordinates[:, 3:] / np.linalg.norm(coordinates[:, 3:], axis=1, keepdims=True)
+    return [make(turn(w, x, y, z), t) for (x, y, z, w), t in zip(quaternions.tolist(), coordinates[:, :3], strict=True)]
 
 
 def from_matrices(T: Array, dimension: Dimension) -> Array:

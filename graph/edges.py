@@ -11,7 +11,8 @@ from hybridlio import se3
 from hybridlio.estimates import Array
 from hybridlio.graph import coordinates as co
 from hybridlio.graph.graph_data import GraphData
-from hybridlio.graph.measurements import Factor
+from hybridlio.graph.keys import Key
+from hybridlio.graph.measurements import Robust
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,12 +20,14 @@ class Edges:
     """Between-factors as arrays.
 
     Attributes:
+        ids: ``(M,)``.
         i, j: ``(M,)`` places of the poses in the graph's order.
         T: ``(M, 4, 4)``.
         information: ``(M, 6, 6)``, in the plane ``(M, 3, 3)``; rotation first.
         steps: ``(M,)`` whether the edge joins consecutive keys.
     """
 
+    ids: NDArray[np.int64]
     i: NDArray[np.int64]
     j: NDArray[np.int64]
     T: Array
@@ -49,32 +52,35 @@ class Edges:
             residual = residual[:, 2:5]
         return np.asarray(np.einsum("mi,mij,mj->m", residual, self.information, residual))
 
+    def loss(self, poses: Array, robust: dict[int, Robust]) -> float:
+        """Sum of χ² at poses ``(N, 4, 4)``, by the kernels of those ids that have one."""
+        chi2 = self.chi2(poses)
+        for number, kernel in robust.items():
+            row = int(np.searchsorted(self.ids, number))
+            chi2[row] = kernel.loss(float(chi2[row]))
+        return float(chi2.sum())
+
     def where(self, keep: NDArray[np.bool_]) -> Edges:
         """Those to keep."""
-        return Edges(self.i[keep], self.j[keep], self.T[keep], self.information[keep], self.steps[keep])
+        return Edges(self.ids[keep], self.i[keep], self.j[keep], self.T[keep], self.information[keep], self.steps[keep])
 
 
 def edges_of(data: GraphData) -> Edges:
     """All between-factors of a graph, in its order."""
-    factors = [factor for factor in data.factors.values() if factor.kind == "between"]
-    index = {key: k for k, key in enumerate(data.keys)}
-    ends = np.array([(index[f.keys[0]], index[f.keys[1]]) for f in factors], dtype=np.int64).reshape(-1, 2)
-    measured = np.array([factor.measured for factor in factors]).reshape(-1, len(co.IDENTITY[data.dimension]))
-    size = co.TANGENT_SIZE[data.dimension]
-    information = np.array([factor.noise.information for factor in factors if factor.noise is not None])
-    i, j = ends[:, 0], ends[:, 1]
-    robots, numbers = (
-        np.array([(-1, k) if isinstance(k, int) else k for k in data.keys], dtype=np.int64).reshape(-1, 2).T
-    )
-    steps = (robots[i] == robots[j]) & (np.abs(numbers[i] - numbers[j]) == 1)
-    return Edges(i, j, co.to_matrices(measured), information.reshape(-1, size, size), steps)
+    table = data.edges
+    i, j = table.ends.T
+    return Edges(table.ids, i, j, co.to_matrices(table.measured), table.information, steps_of(data.keys, table.ends))
 
 
-def is_step(factor: Factor) -> bool:
-    """Whether the factor joins consecutive keys (of one robot): a step of odometry, not a loop."""
-    if factor.kind != "between":
-        return False
-    i, j = factor.keys
-    if isinstance(i, tuple) and isinstance(j, tuple):
-        return i[0] == j[0] and abs(i[1] - j[1]) == 1
-    return isinstance(i, int) and isinstance(j, int) and abs(i - j) == 1
+def steps_of(keys: list[Key], ends: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which edges ``(M, 2)`` join consecutive keys (of one robot): steps of odometry, not loops."""
+    pairs = [(-1, key) if isinstance(key, int) else key for key in keys]
+    robots, numbers = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    i, j = ends.T
+    return np.asarray((robots[i] == robots[j]) & (np.abs(numbers[i] - numbers[j]) == 1))
+
+
+def loops_of(data: GraphData) -> list[int]:
+    """Ids of the between-factors of keys that are not consecutive."""
+    found: list[int] = data.edges.ids[~steps_of(data.keys, data.edges.ends)].tolist()
+    return found

@@ -26,9 +26,7 @@ def save(data: GraphData, path: str | os.PathLike[str], solution: Solution | Non
     """Write a pose graph, with a solution's poses as initial values if one is given."""
     if solution is not None:
         data = data.without()
-        for key, pose in zip(solution.keys, solution.coordinates, strict=True):
-            if key in data:
-                data.put_pose(key, pose)
+        data.start_from(solution)
     suffix = Path(path).suffix
     if suffix == ".npz":
         write_npz(data, path)

@@ -17,11 +17,10 @@ from hybridlio.estimates import Array
 from hybridlio.graph import coordinates as co
 from hybridlio.graph.build import Builder, noise_model
 from hybridlio.graph.checks import components
-from hybridlio.graph.edges import Edges, edges_of, is_step
+from hybridlio.graph.edges import Edges, edges_of, loops_of
 from hybridlio.graph.graph_data import GraphData
 from hybridlio.graph.initial import find
 from hybridlio.graph.levenberg import Progress, needs_orthogonal, parameters, poses_of
-from hybridlio.graph.measurements import Noise
 
 _INLIER_SHARE = 0.99  # of right factors have a χ² below the bound
 GRADUATION = 1.4  # the paper's
@@ -69,11 +68,6 @@ def reject_outliers(data: GraphData, start: Array, report: Progress) -> tuple[Ar
     return poses_of(values, data), frozenset(wrong.tolist())
 
 
-def loops_of(data: GraphData) -> list[int]:
-    """Ids of the between-factors of keys that are not consecutive."""
-    return [number for number, factor in data.factors.items() if factor.kind == "between" and not is_step(factor)]
-
-
 def start_without_loops(data: GraphData) -> Array | None:
     """Coordinates along the odometry, which no wrong loop spoils; None where it does not reach every pose."""
     try:
@@ -111,7 +105,7 @@ class _Weighted:
         weights = np.maximum(weights, _LEAST_WEIGHT if self._needed else 0.0)
         information = weights[:, None, None] * self._edges.information
         for k in np.flatnonzero(weights):
-            model = noise_model(Noise("information", information[k]), None, self._dimension)
+            model = noise_model("information", information[k], None, self._dimension)
             graph.add(self._factor(X(int(self._edges.i[k])), X(int(self._edges.j[k])), self._measured[k], model))
         try:
             return gtsam.LevenbergMarquardtOptimizer(graph, values, self._params).optimize()

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from types import MappingProxyType
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,23 +11,54 @@ from numpy.typing import ArrayLike
 from hybridlio.errors import GraphError
 from hybridlio.estimates import Array
 from hybridlio.graph import coordinates as co
+from hybridlio.graph.edge_table import FORMS, EdgeTable, Rows
 from hybridlio.graph.keys import Key, check_key, named
-from hybridlio.graph.measurements import Factor, Kind, RobustLike, check_vector, label, make_noise, make_robust
+from hybridlio.graph.measurements import Factor, Kind, Robust, RobustLike, check_vector, label, make_noise, make_robust
 
 if TYPE_CHECKING:
     from hybridlio.graph.solution import Solution
 
 
+class FactorView(Mapping[int, Factor]):
+    """A graph's factors by id, in the order they were added; those of the table become objects when asked for."""
+
+    def __init__(self, keys: list[Key], edges: EdgeTable, others: dict[int, Factor]) -> None:
+        self._keys, self._edges, self._others = keys, edges, others
+
+    def __getitem__(self, number: int) -> Factor:
+        other = self._others.get(number)
+        return self._edges.factor(number, self._keys) if other is None else other
+
+    def __contains__(self, number: object) -> bool:
+        return number in self._others or number in self._edges
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(sorted([*self._edges.ids.tolist(), *self._others]))
+
+    def __len__(self) -> int:
+        return len(self._edges) + len(self._others)
+
+
 class GraphData:
-    """Poses and factors without the ways to add and to solve them; a call that raises changes nothing."""
+    """Poses and factors without the ways to add and to solve them; a call that raises changes nothing.
+
+    Attributes:
+        dimension: 2 or 3.
+        edges: the between-factors.
+        others: all other factors by id, in the order they were added.
+        next_id: of the next factor.
+    """
 
     def __init__(self, dimension: co.Dimension = 3) -> None:
         if dimension not in (2, 3):
             raise GraphError(f"a pose graph has dimension 2 or 3, not {dimension!r}")
         self.dimension: co.Dimension = dimension
-        self._initial: dict[Key, Array | None] = {}
+        self._keys: list[Key] = []
+        self._places: dict[Key, int] = {}
+        self._initial = Rows(co.IDENTITY[dimension].shape)  # NaN where none is known
         self._fixed: set[Key] = set()
-        self._factors: dict[int, Factor] = {}
+        self.edges = EdgeTable(dimension)
+        self.others: dict[int, Factor] = {}
         self.next_id = 0
 
     # poses
@@ -36,12 +66,17 @@ class GraphData:
     @property
     def keys(self) -> list[Key]:
         """Keys of all poses, in the order they were added."""
-        return list(self._initial)
+        return self._keys.copy()
+
+    @property
+    def places(self) -> Mapping[Key, int]:
+        """Each key's place in that order."""
+        return self._places
 
     @property
     def factors(self) -> Mapping[int, Factor]:
         """Factors by id, in the order they were added; read only."""
-        return MappingProxyType(self._factors)
+        return FactorView(self._keys, self.edges, self.others)
 
     @property
     def fixed(self) -> frozenset[Key]:
@@ -49,10 +84,10 @@ class GraphData:
         return frozenset(self._fixed)
 
     def __len__(self) -> int:
-        return len(self._initial)
+        return len(self._keys)
 
     def __contains__(self, key: object) -> bool:
-        return key in self._initial
+        return key in self._places
 
     def add_pose(self, key: Key, initial: ArrayLike | None = None) -> None:
         """Add a pose, with its initial value if it is known.
@@ -62,19 +97,20 @@ class GraphData:
             DataError: the initial value is not a pose.
         """
         key = check_key(key)
-        if key in self._initial:
+        if key in self._places:
             raise GraphError(f"pose {key} is there already; set_initial gives it another initial value")
-        self._initial[key] = None if initial is None else self._coordinates(initial, f"pose {key}")
+        self.put_pose(key, None if initial is None else self._coordinates(initial, f"pose {key}"))
 
     def set_initial(self, key: Key, pose: ArrayLike | None) -> None:
         """Give a pose another initial value, or take it away (None)."""
         (key,) = self._known(key, what="initial value")
-        self._initial[key] = None if pose is None else self._coordinates(pose, f"pose {key}")
+        coordinates = np.nan if pose is None else self._coordinates(pose, f"pose {key}")
+        self._initial.array[self._places[key]] = coordinates
 
     def initial(self, key: Key) -> Array | None:
         """The initial value ``(4, 4)`` of a pose, or None."""
         (key,) = self._known(key, what="initial value")
-        found = self._initial[key]
+        found = self.coordinates(key)
         return None if found is None else np.asarray(co.to_matrices(found[None])[0])
 
     def fix(self, key: Key) -> None:
@@ -89,9 +125,9 @@ class GraphData:
 
     def start_from(self, solution: Solution) -> None:
         """Take a solution's poses as initial values."""
-        for key in self._initial:
-            if key in solution:
-                self.set_initial(key, solution.pose(key))
+        for key, pose in zip(solution.keys, solution.coordinates, strict=True):
+            if key in self._places:
+                self._initial.array[self._places[key]] = pose
 
     def remove(self, factor_id: int) -> None:
         """Take a factor out; its poses stay.
@@ -99,9 +135,12 @@ class GraphData:
         Raises:
             GraphError: there is no such factor.
         """
-        if factor_id not in self._factors:
+        if factor_id in self.others:
+            del self.others[factor_id]
+        elif factor_id in self.edges:
+            self.edges.remove(factor_id)
+        else:
             raise GraphError(f"there is no factor {factor_id}")
-        del self._factors[factor_id]
 
     # inside
 
@@ -118,7 +157,7 @@ class GraphData:
 
     def _known(self, *keys: Key, what: str) -> list[Key]:
         checked = [check_key(key) for key in keys]
-        unknown = [key for key in checked if key not in self._initial]
+        unknown = [key for key in checked if key not in self._places]
         if unknown:
             raise GraphError(f"{what}: no pose has key {named(unknown)}; add_pose, add_prior or add_between adds one")
         return checked
@@ -135,39 +174,71 @@ class GraphData:
         return self._add(Factor(kind, (key,), measured, noise, make_robust(robust, size, name)))
 
     def _add(self, factor: Factor) -> int:
-        factor_id = self.next_id
-        self._factors[factor_id] = factor
-        self.next_id += 1
-        return factor_id
+        self.put_factor(factor)
+        return self.next_id - 1
 
     def without(self, removed: Collection[int] = ()) -> GraphData:
         """A copy that later changes do not touch, without some factors."""
         copy = GraphData(self.dimension)
-        copy._initial, copy._fixed, copy.next_id = dict(self._initial), set(self._fixed), self.next_id
-        copy._factors = {number: factor for number, factor in self._factors.items() if number not in removed}
+        copy._keys, copy._places, copy._fixed = self._keys.copy(), self._places.copy(), self._fixed.copy()
+        copy._initial, copy.next_id = self._initial.where(slice(None)), self.next_id
+        keep = ~np.isin(self.edges.ids, list(removed)) if removed else slice(None)
+        copy.edges = self.edges.where(keep)
+        copy.others = {number: factor for number, factor in self.others.items() if number not in removed}
         return copy
-
-    def of_kinds(self, *kinds: Kind) -> GraphData:
-        """A copy with factors of these kinds only."""
-        return self.without([number for number, factor in self._factors.items() if factor.kind not in kinds])
 
     def initial_coordinates(self) -> Array | None:
         """Initial values of all poses, ``(N, 7)`` or ``(N, 3)``; None where some are missing."""
-        found = [pose for pose in self._initial.values() if pose is not None]
-        return np.array(found) if len(found) == len(self._initial) else None
+        found = self._initial.array
+        return None if np.isnan(found[:, 0]).any() else found.copy()
+
+    @property
+    def coordinates_or_nan(self) -> Array:
+        """Initial values ``(N, 7)`` or ``(N, 3)``, NaN where there is none."""
+        return self._initial.array.copy()
+
+    def coordinates(self, key: Key) -> Array | None:
+        """Initial value of a pose as it is kept, or None."""
+        found = self._initial.array[self._places[key]]
+        return None if np.isnan(found[0]) else found.copy()
 
     # for readers, which have checked what they bring
 
     def put_pose(self, key: Key, coordinates: Array | None) -> None:
         """Add a pose by its coordinates, unchecked."""
-        self._initial[key] = coordinates
+        self.put_poses(
+            [key], np.full((1, *self._initial.array.shape[1:]), np.nan if coordinates is None else coordinates)
+        )
+
+    def put_poses(self, keys: Sequence[Key], coordinates: Array) -> None:
+        """Add new poses by their coordinates ``(M, 7)`` or ``(M, 3)``, NaN where unknown, unchecked."""
+        self._places.update(zip(keys, range(len(self._keys), len(self._keys) + len(keys)), strict=True))
+        self._keys.extend(keys)
+        self._initial.extend(coordinates)
+
+    def put_edges(
+        self, ids: ArrayLike, ends: ArrayLike, measured: Array, information: Array, robust: Mapping[int, Robust]
+    ) -> None:
+        """Add between-factors by the ids they shall have, which rise and are higher than all before, unchecked.
+
+        Args:
+            ids: ``(M,)``.
+            ends: ``(M, 2)`` places.
+            measured: ``(M, 7)`` or ``(M, 3)`` coordinates.
+            information: ``(M, d, d)``.
+            robust: kernels by id.
+        """
+        ids = np.asarray(ids, dtype=np.int64)
+        self.edges.extend(ids, ends, measured, information, np.full(len(ids), FORMS.index("information")))
+        self.edges.robust.update(robust)
+        self.next_id = max(self.next_id, int(ids[-1]) + 1)
 
     def put_factor(self, factor: Factor, factor_id: int | None = None) -> None:
-        """Add a factor, unchecked, by an id of its own if it had one."""
+        """Add a factor, unchecked, by an id of its own if it had one, which is higher than all before."""
         number = self.next_id if factor_id is None else factor_id
-        self._factors[number] = factor
+        if factor.kind == "between":
+            i, j = factor.keys
+            self.edges.append(number, (self._places[i], self._places[j]), factor)
+        else:
+            self.others[number] = factor
         self.next_id = max(self.next_id, number + 1)
-
-    def coordinates(self, key: Key) -> Array | None:
-        """Initial value of a pose as it is kept."""
-        return self._initial[key]

@@ -50,8 +50,8 @@ def find_roots(data: GraphData) -> dict[int, Array]:
     Raises:
         GraphError: there are several groups and nothing says where one of them lies; a fixed pose lies nowhere.
     """
-    index = {key: k for k, key in enumerate(data.keys)}
-    priors = {f.keys[0]: f.measured for f in data.factors.values() if f.kind == "prior"}
+    index = data.places
+    priors = {f.keys[0]: f.measured for f in data.others.values() if f.kind == "prior"}
     fixes = _gps_keys(data)
     parts = groups(data, ("between",))
     roots: dict[int, Array] = {}
@@ -100,16 +100,16 @@ def along_tree(data: GraphData, edges: Edges, roots: dict[int, Array]) -> Array:
 
 
 def _gps_keys(data: GraphData) -> set[Key]:
-    return {factor.keys[0] for factor in data.factors.values() if factor.kind == "gps"}
+    return {factor.keys[0] for factor in data.others.values() if factor.kind == "gps"}
 
 
 def _align_to_gps(data: GraphData, T: Array) -> None:
     """Move each group that only GPS places onto its fixes, as a whole (Umeyama, without scale)."""
-    fixes = [factor for factor in data.factors.values() if factor.kind == "gps"]
+    fixes = [factor for factor in data.others.values() if factor.kind == "gps"]
     if not fixes:
         return
-    index = {key: k for k, key in enumerate(data.keys)}
-    placed = {f.keys[0] for f in data.factors.values() if f.kind == "prior"} | data.fixed
+    index = data.places
+    placed = {f.keys[0] for f in data.others.values() if f.kind == "prior"} | data.fixed
     for part in groups(data, ("between",)):
         inside = set(part)
         here = [factor for factor in fixes if factor.keys[0] in inside]

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B
 from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.csgraph import breadth_first_order
 
 from hybridlio import se3
 from hybridlio.errors import GraphError
@@ -89,19 +89,26 @@ def parameters(orthogonal: bool) -> gtsam.LevenbergMarquardtParams:
 
 def needs_orthogonal(data: GraphData) -> bool:
     """Whether some pose is so many factors away from what is fixed or measured that only QR reaches it."""
-    kinds = {factor.kind for factor in data.factors.values()}
-    if "imu" in kinds:
+    if any(factor.kind == "imu" for factor in data.others.values()):
         return True  # biases of 1e-4 beside positions of kilometres
-    if len(data) <= _LONGEST_FOR_CHOLESKY:
+    if len(data) <= _LONGEST_FOR_CHOLESKY or not len(data.edges):
         return False
-    index = {key: k for k, key in enumerate(data.keys)}
-    ends = np.array([[index[key] for key in f.keys] for f in data.factors.values() if f.kind == "between"])
-    placed = {f.keys[0] for f in data.factors.values() if f.kind in ("prior", "gps")} | data.fixed
-    if not len(ends):
-        return False
-    joined = coo_matrix((np.ones(len(ends)), ends.T), shape=(len(index), len(index)))
-    steps = dijkstra(joined, directed=False, unweighted=True, indices=[index[k] for k in placed], min_only=True)
-    return bool(steps[np.isfinite(steps)].max() > _LONGEST_FOR_CHOLESKY)
+    placed = {f.keys[0] for f in data.others.values() if f.kind in ("prior", "gps")} | data.fixed
+    return _steps_away(data, [data.places[key] for key in placed]) > _LONGEST_FOR_CHOLESKY
+
+
+def _steps_away(data: GraphData, places: list[int]) -> int:
+    """How many between-factors the farthest pose is away from any of some poses."""
+    count = len(data)
+    start = np.column_stack([np.full(len(places), count), places])  # one more node, next to all of them
+    ends = np.vstack([data.edges.ends, start])
+    joined = coo_matrix((np.ones(len(ends), dtype=np.int8), ends.T), shape=(count + 1, count + 1))
+    _, before = breadth_first_order(joined.tocsr(), count, directed=False)
+    before[before < 0] = count
+    steps, hop = (before != count).astype(np.int64), before
+    while (hop != count).any():
+        steps, hop = steps + steps[hop], hop[hop]
+    return int(steps.max())
 
 
 def poses_of(values: gtsam.Values, data: GraphData) -> Array:

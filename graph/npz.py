@@ -14,6 +14,7 @@ from hybridlio.errors import DataError, HybridLioError
 from hybridlio.estimates import Array
 from hybridlio.files import write_whole
 from hybridlio.graph import coordinates as co
+from hybridlio.graph.edge_table import FORMS
 from hybridlio.graph.graph_data import GraphData
 from hybridlio.graph.keys import Key, check_key
 from hybridlio.graph.measurements import Factor, Kind, Noise, Robust, check_vector, make_noise, make_robust
@@ -31,23 +32,38 @@ def write_npz(data: GraphData, path: str | os.PathLike[str]) -> None:
         DataError: the place cannot be written to.
     """
     keys = data.keys
-    initial = [data.coordinates(key) for key in keys]
-    size = len(co.IDENTITY[data.dimension])
+    key_table = _key_table([(key,) for key in keys], 1)
     arrays: dict[str, Any] = {
         "format": np.array(_FORMAT),
         "dimension": np.array(data.dimension),
         "next_id": np.array(data.next_id),
-        "keys": _key_table([(key,) for key in keys], 1),
-        "initial": np.array([np.full(size, np.nan) if pose is None else pose for pose in initial]).reshape(-1, size),
+        "keys": key_table,
+        "initial": data.coordinates_or_nan,
         "fixed": np.array([key in data.fixed for key in keys], dtype=bool),
     }
+    if len(data.edges):
+        arrays |= {f"between_{name}": column for name, column in _edge_columns(data, key_table[:, 0]).items()}
     for kind in get_args(Kind):
-        numbered = {number: factor for number, factor in data.factors.items() if factor.kind == kind}
+        numbered = {number: factor for number, factor in data.others.items() if factor.kind == kind}
         if numbered:
             arrays |= {f"{kind}_{name}": column for name, column in _columns(numbered).items()}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     write_whole(path, buffer.getvalue())
+
+
+def _edge_columns(data: GraphData, keys: Any) -> dict[str, Any]:
+    table = data.edges
+    kernels = [table.robust.get(number) for number in table.ids.tolist()]
+    return {
+        "id": table.ids,
+        "keys": keys[table.ends],
+        "measured": table.measured,
+        "kernel": np.array([kernel.kernel if kernel else "" for kernel in kernels]),
+        "width": np.array([kernel.width if kernel else np.nan for kernel in kernels]),
+        "noise_form": np.array(FORMS)[table.form],
+        "noise": table.noise,
+    }
 
 
 def _key_table(keys: list[tuple[Key, ...]], width: int) -> Any:
@@ -102,6 +118,8 @@ def _assemble(arrays: dict[str, Any]) -> PoseGraph:
     for (key,), initial, fixed in zip(
         _key_rows(arrays["keys"]), arrays["initial"].reshape(-1, size), arrays["fixed"], strict=True
     ):
+        if key in graph:
+            raise DataError(f"pose {key} is there twice")
         graph.put_pose(key, None if np.isnan(initial).all() else check_vector(initial, size, f"pose {key}"))
         if fixed:
             graph.fix(key)

@@ -57,13 +57,13 @@ def choose_start(data: GraphData, initial: str) -> Array:
     start = data.initial_coordinates()
     if initial == "given":
         if start is None:
-            missing = [key for key in data.keys if data.initial(key) is None]
+            missing = [key for key in data.keys if data.coordinates(key) is None]
             raise GraphError(f"pose {named(missing)} has no initial value; give one, or choose initial='auto'")
         return start
     edges = edges_of(data)
     if start is not None and misfit(data, start, edges) <= _FITS * freedom(data):
         return start
-    kernels = {number for number, f in data.factors.items() if f.kind == "between" and f.robust is not None}
+    kernels = set(data.edges.robust)
     sure = [data.without(kernels)] if kernels else []
     starts = [] if start is None else [start]
     for part in [data, *(part for part in sure if len(groups(part, ("between",))) == len(groups(data, ("between",))))]:
@@ -77,20 +77,18 @@ def choose_start(data: GraphData, initial: str) -> Array:
 
 def freedom(data: GraphData) -> int:
     """Measured numbers about poses less those to be found: what the misfit is when all is as it should be."""
-    sizes = [len(f.noise.values) for f in data.factors.values() if f.noise and f.kind in ("between", "prior", "gps")]
-    return max(sum(sizes) - co.TANGENT_SIZE[data.dimension] * len(data), 1)
+    size = co.TANGENT_SIZE[data.dimension]
+    others = sum(len(f.noise.values) for f in data.others.values() if f.noise and f.kind in ("prior", "gps"))
+    return max(size * (len(data.edges) - len(data)) + others, 1)
 
 
 def misfit(data: GraphData, coordinates: Array, edges: Edges) -> float:
     """Twice the error of between-factors, priors and GPS: enough to tell a good start from a bad one."""
     poses = co.to_matrices(coordinates)
-    chi2 = edges.chi2(poses).tolist()
-    between = [factor for factor in data.factors.values() if factor.kind == "between"]
-    total = sum(f.robust.loss(x) if f.robust else x for f, x in zip(between, chi2, strict=True))
-    index = {key: k for k, key in enumerate(data.keys)}
-    for factor in data.factors.values():
+    total = edges.loss(poses, data.edges.robust)
+    for factor in data.others.values():
         if factor.kind in ("prior", "gps") and factor.noise is not None:
-            residual = _absolute(factor, poses[index[factor.keys[0]]])
+            residual = _absolute(factor, poses[data.places[factor.keys[0]]])
             squared = float(residual @ factor.noise.information @ residual)
             total += factor.robust.loss(squared) if factor.robust else squared
     return float(total)

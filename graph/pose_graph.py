@@ -53,7 +53,8 @@ class PoseGraph(GraphData):
         measured = self._coordinates(pose, name)
         noise = make_noise(name, self._size, covariance, information, sigmas)
         factor = Factor("prior", (key,), measured, noise, make_robust(robust, self._size, name))
-        self._initial.setdefault(key, measured)
+        if key not in self:
+            self.put_pose(key, measured)
         return self._add(factor)
 
     def add_between(
@@ -80,7 +81,8 @@ class PoseGraph(GraphData):
         measured = self._coordinates(T_i_j, name)
         noise = make_noise(name, self._size, covariance, information, sigmas)
         factor = Factor("between", (i, j), measured, noise, make_robust(robust, self._size, name))
-        self._initial.setdefault(j, None)
+        if j not in self:
+            self.put_pose(j, None)
         return self._add(factor)
 
     def add_gps(
@@ -167,7 +169,7 @@ class PoseGraph(GraphData):
         """
         from hybridlio.graph.initial import find
 
-        self._initial.update(zip(self._initial, find(self, method), strict=True))
+        self._initial.array[:] = find(self, method)
 
     def optimize(
         self, solver: Solver = "auto", *, initial: Literal["auto", "given"] = "auto", max_iterations: int = 100,

@@ -39,7 +39,7 @@ class Solution:
         self.rejected = rejected
         self._data = data
         self._solved = solved
-        self._index = {key: k for k, key in enumerate(data.keys)}
+        self._index = data.places
 
     def __contains__(self, key: object) -> bool:
         return key in self._index
@@ -130,10 +130,11 @@ class Solution:
 
     @cached_property
     def _residuals(self) -> dict[int, tuple[Array, float]]:
-        graph = Builder(self._data).graph(self._solved.poses, robust=False)
+        builder = Builder(self._data)
+        graph = builder.graph(self._solved.poses, robust=False)
         order = np.argsort(co.GTSAM_ORDER[2]) if self._data.dimension == 2 else slice(None)
         found = {}
-        for slot, factor_id in enumerate(self._data.factors):
+        for slot, factor_id in enumerate(builder.slots()):
             factor: Any = graph.at(slot)
             residual = np.asarray(factor.unwhitenedError(self._solved.values))[order]
             found[factor_id] = residual, 2 * float(factor.error(self._solved.values))

@@ -39,12 +39,12 @@ def write_text(data: GraphData, path: str | os.PathLike[str], dialect: Dialect) 
         DataError: the place cannot be written to.
     """
     tags = _TAGS[dialect, data.dimension]
-    others = Counter(f.kind for f in data.factors.values() if f.kind not in tags)
+    others = Counter(f.kind for f in data.others.values() if f.kind not in tags)
     if others:
         kinds = ", ".join(f"{count} × {kind}" for kind, count in others.items())
         raise GraphError(f"{path}: {dialect}'s format cannot hold {kinds}; save as .npz, which holds everything")
     lines = [*_vertices(data, tags["vertex"]), *_fixed(data)]
-    if any(factor.kind == "prior" for factor in data.factors.values()) and data.dimension == 3:
+    if any(factor.kind == "prior" for factor in data.others.values()) and data.dimension == 3:
         lines.append(f"PARAMS_SE3OFFSET 0 {format_numbers(co.IDENTITY[3])}")
     for factor in data.factors.values():
         lines += _factor(factor, tags[factor.kind])
@@ -76,7 +76,7 @@ def _lone_origin(data: GraphData, given: list[Key]) -> bool:
 def _fixed(data: GraphData) -> list[str]:
     numbers = sorted(to_integer(key) for key in data.fixed)
     lowest = min((to_integer(key) for key in data.keys), default=None)
-    has_prior = any(factor.kind == "prior" for factor in data.factors.values())
+    has_prior = any(factor.kind == "prior" for factor in data.others.values())
     if not numbers or (numbers == [lowest] and not has_prior):
         return []
     return [f"FIX {' '.join(map(str, numbers))}"]

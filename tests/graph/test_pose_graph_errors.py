@@ -70,11 +70,11 @@ WRONG = {
 def test_an_error_names_the_offender_and_leaves_the_graph_as_it_was(case):
     call, kind, message = WRONG[case]
     graph = small_graph()
-    before = graph.keys, dict(graph.factors), graph.fixed, [graph.coordinates(key) for key in graph.keys]
+    before, initial = (graph.keys, dict(graph.factors), graph.fixed), graph.coordinates_or_nan
     with pytest.raises(kind, match=message):
         call(graph)
-    assert before[:3] == (graph.keys, dict(graph.factors), graph.fixed)
-    assert all(a is b for a, b in zip(before[3], map(graph.coordinates, graph.keys), strict=True))
+    assert before == (graph.keys, dict(graph.factors), graph.fixed)
+    np.testing.assert_array_equal(graph.coordinates_or_nan, initial)
 
 
 def test_imu_samples_out_of_order_are_refused_with_their_row():
