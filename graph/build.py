@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
+from hybridlio.errors import GraphError
 from hybridlio.estimates import Array, State
 from hybridlio.graph import coordinates as co
 from hybridlio.graph.checks import chains_without_bias
@@ -58,12 +59,13 @@ class Builder:
         self.biases = Biases(_given_biases(data) if biases is None else biases)
         self._models: dict[tuple[str, bytes, Robust | None], gtsam.noiseModel.Base] = {}
 
-    def graph(self, fixed_at: Array, robust: bool = True) -> gtsam.NonlinearFactorGraph:
+    def graph(self, robust: bool = True) -> gtsam.NonlinearFactorGraph:
         """All factors in the order of :meth:`slots`, then those that hold fixed poses and the biases' start.
 
-        Args:
-            fixed_at: ``(N, 7)`` or ``(N, 3)`` coordinates of all poses, where fixed ones are held.
-            robust: whether kernels are in force.
+        Without the kernels where ``robust`` is False.
+
+        Raises:
+            GraphError: a fixed pose has no initial value.
         """
         graph = gtsam.NonlinearFactorGraph()
         for factor in self.edges(slice(None), robust):
@@ -71,7 +73,7 @@ class Builder:
         for other in self.data.others.values():
             graph.add(self.other(other, robust))
         for key in sorted(self.data.fixed, key=self.data.places.__getitem__):
-            graph.add(self.held(key, fixed_at[self.data.places[key]]))
+            graph.add(self.held(key))
         self._add_bias_starts(graph)
         return graph
 
@@ -113,8 +115,15 @@ class Builder:
             model = self._model(noise.form, noise.values.tobytes(), noise.values, factor.robust if robust else None)
         return getattr(self, f"_{factor.kind}")(factor, [self.data.places[key] for key in factor.keys], model)
 
-    def held(self, key: Key, at: Array) -> Any:
-        """What holds a fixed pose at its coordinates."""
+    def held(self, key: Key) -> Any:
+        """What holds a fixed pose at its initial value.
+
+        Raises:
+            GraphError: it has none.
+        """
+        at = self.data.coordinates(key)
+        if at is None:
+            raise GraphError(f"pose {key} is fixed but has no initial value; give one")
         model = gtsam.noiseModel.Diagonal.Sigmas(np.full(co.TANGENT_SIZE[self.data.dimension], FIXED_SIGMA))
         return self._pose_prior(self.data.places[key], at, model)
 
@@ -181,8 +190,11 @@ def noise_model(form: str, values: Array, kernel: Robust | None, dimension: int)
     if dimension == 2:
         values = values[_PLANAR_SIGMAS] if form == "sigmas" else values.ravel()[_PLANAR_MATRIX].reshape(3, 3)
     model = _GAUSSIAN[form](values)
-    if kernel is None:
-        return model
+    return model if kernel is None else kernel_model(kernel, model)
+
+
+def kernel_model(kernel: Robust, model: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
+    """GTSAM's noise model with a robust kernel on it."""
     width = kernel.width**2 if kernel.kernel == "dcs" else kernel.width
     return gtsam.noiseModel.Robust.Create(_ROBUST[kernel.kernel](width), model)
 

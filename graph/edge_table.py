@@ -104,7 +104,7 @@ class EdgeTable:
         if len(others):
             information = information.copy()
         for row in others:
-            information[row] = self._noise(row).information
+            information[row] = self._noise(int(row)).information
         return information
 
     def extend(

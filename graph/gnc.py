@@ -51,7 +51,7 @@ def reject_outliers(data: GraphData, start: Array, report: Progress) -> tuple[Ar
     edges = edges_of(data)
     edges = edges.where(~edges.steps)
     builder = Builder(data.without(loops))
-    optimise = _Weighted(builder.graph(start, robust=False), edges, data)
+    optimise = _Weighted(builder.graph(robust=False), edges, data)
     bound = chi2_bound(co.TANGENT_SIZE[data.dimension])
     weights = np.ones(len(loops))
     values = optimise(builder.values(start), weights)

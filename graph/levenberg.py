@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import gtsam
@@ -18,13 +18,14 @@ from hybridlio.estimates import Array
 from hybridlio.graph import coordinates as co
 from hybridlio.graph.build import Builder
 from hybridlio.graph.graph_data import GraphData
+from hybridlio.graph.solver import reason
 
 Progress: TypeAlias = Callable[[str, int, float], None]
 
 # Cholesky's normal equations lose the far end of a chain without a word: nothing at 1,000 poses, a centimetre at 2,000,
 # half a metre at 5,000. QR does not, and on a chain it costs little; on a dense graph it costs several times more.
 _LONGEST_FOR_CHOLESKY = 1000
-_RELATIVE_TOLERANCE = 1e-6
+TOLERANCE = 1e-6  # of the error: poses then lie within a few thousandths of a standard deviation
 _ABSOLUTE_TOLERANCE = 1e-9
 _INERTIAL_ROUNDS = 2  # samples are summed up again around the biases that the first round found
 
@@ -55,35 +56,108 @@ class Solved:
     orthogonal: bool
 
 
-def solve(data: GraphData, start: Array, max_iterations: int, report: Progress) -> Solved:
-    """Optimise from ``start``, coordinates ``(N, 7)`` or ``(N, 3)``; fixed poses stay there.
+@dataclass(frozen=True, eq=False)
+class _Stepped:
+    """Where iterations led, errors before and after them; ``failed`` if the next one would raise the error."""
 
-    Raises:
-        GraphError: the factors do not determine every variable.
-    """
-    builder = Builder(data)
-    orthogonal = needs_orthogonal(data)
-    graph = builder.graph(start)
-    values = builder.values(start)
-    errors: list[float] = []
-    iterations, converged = 0, False
-    inertial = builder.with_bias()
-    for number in range(_INERTIAL_ROUNDS if inertial else 1):
-        if number:
-            builder = Builder(data, _biases(values, inertial, len(data)))
-            graph = builder.graph(start)
-        errors.append(float(graph.error(values)))
-        values, done, converged = _descend(graph, values, orthogonal, max_iterations, report)
-        iterations += done
-    poses, error = poses_of(values, data), float(graph.error(values))
-    return Solved(data, graph, values, poses, errors[0], error, iterations, converged, orthogonal)
+    values: gtsam.Values
+    before: float
+    error: float
+    iterations: int
+    converged: bool
+    failed: bool = False
 
 
-def parameters(orthogonal: bool) -> gtsam.LevenbergMarquardtParams:
+def _settled(errors: list[float], tolerance: float) -> bool:
+    """Whether what further steps would gain is nothing, if each gains the same share of the one before."""
+    gains = -np.diff(errors[-3:])
+    enough = max(tolerance * errors[-1], _ABSOLUTE_TOLERANCE)
+    if gains[-1] <= enough:
+        return True
+    share = gains[-1] / gains[0] if len(gains) == 2 else 1.0
+    return bool(share < 1 and gains[-1] * share / (1 - share) <= enough)
+
+
+class Descent:
+    """Optimises a pose graph from one start or several."""
+
+    def __init__(self, data: GraphData, max_iterations: int, tolerance: float, report: Progress) -> None:
+        self._data, self._max_iterations, self._tolerance, self._report = data, max_iterations, tolerance, report
+        self._builder = Builder(data)
+        self._orthogonal = needs_orthogonal(data)
+        self._graph = self._builder.graph()
+
+    def __call__(self, start: Array) -> Solved:
+        """Gauss-Newton from ``start`` as long as the error falls, Levenberg-Marquardt from there.
+
+        Raises:
+            GraphError: the factors do not determine every variable.
+        """
+        graph = self._graph
+        stepped = self._descend(graph, self._builder.values(start))
+        inertial = self._builder.with_bias()
+        for _ in range(_INERTIAL_ROUNDS - 1 if inertial else 0):
+            graph = Builder(self._data, _biases(stepped.values, inertial, len(self._data))).graph()
+            again = self._descend(graph, stepped.values)
+            stepped = replace(again, before=stepped.before, iterations=stepped.iterations + again.iterations)
+        return Solved(
+            self._data, graph, stepped.values, poses_of(stepped.values, self._data), stepped.before, stepped.error,
+            stepped.iterations, stepped.converged, self._orthogonal,
+        )  # fmt: skip
+
+    def _descend(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> _Stepped:
+        stepped = self._undamped(graph, values)
+        return self._damped(graph, stepped) if stepped.failed else stepped
+
+    def _undamped(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> _Stepped:
+        """Gauss-Newton, which may go up once if it is lower than before one step later.
+
+        A watchdog of length one (Chamberlain, Powell, Lemarechal, Pedersen, "The watchdog technique for forcing
+        convergence in algorithms for constrained optimization", 1982): where the ground bends, the step that damping
+        would cut into ten leads across.
+        """
+        params = gtsam.GaussNewtonParams()
+        params.setLinearSolverType(_linear_solver(self._orthogonal))
+        optimiser = gtsam.GaussNewtonOptimizer(graph, values, params)
+        best, errors, rose = values, [float(optimiser.error())], False
+        for done in range(1, self._max_iterations + 1):
+            try:
+                optimiser.iterate()
+            except RuntimeError:  # damping may solve what is indeterminate here
+                return _Stepped(best, errors[0], errors[-1], done - 1, False, failed=True)
+            error = float(optimiser.error())
+            if error <= errors[-1]:
+                best, rose = gtsam.Values(optimiser.values()), False  # a copy: the next iteration frees it
+                errors.append(error)
+                self._report("optimising", done, error)
+                if _settled(errors, self._tolerance):
+                    return _Stepped(best, errors[0], error, done, True)
+            elif rose or not np.isfinite(error):
+                return _Stepped(best, errors[0], errors[-1], done, False, failed=True)
+            else:
+                rose = True
+        return _Stepped(best, errors[0], errors[-1], self._max_iterations, False)
+
+    def _damped(self, graph: gtsam.NonlinearFactorGraph, stepped: _Stepped) -> _Stepped:
+        """Levenberg-Marquardt from where Gauss-Newton stopped."""
+        done, report = stepped.iterations, self._report
+        params = parameters(self._orthogonal, self._tolerance)
+        params.setMaxIterations(max(self._max_iterations - done, 1))
+        params.iterationHook = lambda number, _before, after: report("optimising", done + int(number), float(after))
+        optimiser = gtsam.LevenbergMarquardtOptimizer(graph, stepped.values, params)
+        try:
+            values = optimiser.optimize()
+        except RuntimeError as error:
+            raise GraphError(f"the graph cannot be solved: {reason(error)}") from error
+        total = done + int(optimiser.iterations())
+        return _Stepped(values, stepped.before, float(optimiser.error()), total, total < self._max_iterations)
+
+
+def parameters(orthogonal: bool, tolerance: float = TOLERANCE) -> gtsam.LevenbergMarquardtParams:
     """Of Levenberg-Marquardt, as used everywhere here."""
     params = gtsam.LevenbergMarquardtParams()
     params.setLinearSolverType(_linear_solver(orthogonal))
-    params.setRelativeErrorTol(_RELATIVE_TOLERANCE)
+    params.setRelativeErrorTol(tolerance)
     return params
 
 
@@ -124,47 +198,6 @@ def _biases(values: gtsam.Values, places: list[int], count: int) -> Array:
     for k in places:
         biases[k] = values.atConstantBias(B(k)).vector()
     return biases
-
-
-def _descend(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, orthogonal: bool, max_iterations: int, report: Progress
-) -> tuple[gtsam.Values, int, bool]:
-    """Gauss-Newton as long as the error falls, Levenberg-Marquardt from there: values, iterations, converged."""
-    params = gtsam.GaussNewtonParams()
-    params.setLinearSolverType(_linear_solver(orthogonal))
-    optimiser = gtsam.GaussNewtonOptimizer(graph, values, params)
-    before = float(optimiser.error())
-    for done in range(1, max_iterations + 1):
-        values = gtsam.Values(optimiser.values())  # a copy: the next iteration frees what it returned
-        try:
-            optimiser.iterate()
-        except RuntimeError:  # damping may solve what is indeterminate here
-            return _damped(graph, values, orthogonal, max_iterations, done - 1, report)
-        after = float(optimiser.error())
-        if not after <= before:
-            return _damped(graph, values, orthogonal, max_iterations, done - 1, report)
-        report("optimising", done, after)
-        if before - after <= max(_RELATIVE_TOLERANCE * before, _ABSOLUTE_TOLERANCE):
-            return gtsam.Values(optimiser.values()), done, True
-        before = after
-    return gtsam.Values(optimiser.values()), max_iterations, False
-
-
-def _damped(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, orthogonal: bool, max_iterations: int, done: int,
-    report: Progress,
-) -> tuple[gtsam.Values, int, bool]:  # fmt: skip
-    """Levenberg-Marquardt after ``done`` iterations."""
-    params = parameters(orthogonal)
-    params.setMaxIterations(max_iterations - done)
-    params.iterationHook = lambda number, _before, after: report("optimising", done + int(number), float(after))
-    optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
-    try:
-        values = optimiser.optimize()
-    except RuntimeError as error:
-        raise GraphError(f"the graph cannot be solved: {' '.join(str(error).split())}") from error
-    total = done + int(optimiser.iterations())
-    return values, total, total < max_iterations
 
 
 def _linear_solver(orthogonal: bool) -> str:

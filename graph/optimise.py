@@ -10,12 +10,12 @@ from hybridlio import se3
 from hybridlio.errors import ConfigError, GraphError
 from hybridlio.estimates import Array
 from hybridlio.graph import coordinates as co
-from hybridlio.graph.checks import check_determined, groups
+from hybridlio.graph.checks import check_determined, labels
 from hybridlio.graph.edges import Edges, edges_of
 from hybridlio.graph.graph_data import GraphData
 from hybridlio.graph.initial import find
 from hybridlio.graph.keys import named
-from hybridlio.graph.levenberg import Progress, solve
+from hybridlio.graph.levenberg import Descent, Progress
 from hybridlio.graph.measurements import Factor
 from hybridlio.graph.solution import Solution
 
@@ -24,25 +24,27 @@ SOLVERS = ("auto", "batch", "gnc")
 _FITS = 2.0  # times the degrees of freedom
 
 
-def optimise(graph: GraphData, solver: str, initial: str, max_iterations: int, progress: Progress | None) -> Solution:
+def optimise(
+    graph: GraphData, solver: str, initial: str, max_iterations: int, tolerance: float, progress: Progress | None
+) -> Solution:  # fmt: skip
     """Solve a pose graph; see :meth:`hybridlio.graph.pose_graph.PoseGraph.optimize`."""
-    if solver not in SOLVERS or initial not in ("auto", "given") or max_iterations < 1:
+    if solver not in SOLVERS or initial not in ("auto", "given") or max_iterations < 1 or not tolerance > 0:
         raise ConfigError(
-            f"solver {solver!r}, initial {initial!r}, max_iterations {max_iterations}: solvers are "
-            f"{', '.join(SOLVERS)}, initial is auto or given, max_iterations at least 1"
+            f"solver {solver!r}, initial {initial!r}, max_iterations {max_iterations}, tolerance {tolerance}: "
+            f"solvers are {', '.join(SOLVERS)}, initial is auto or given, max_iterations at least 1, tolerance positive"
         )
     check_determined(graph)
     report = progress or _silent
     data = graph.without()
     if solver != "gnc":
-        return Solution(data, solve(data, choose_start(data, initial), max_iterations, report))
+        return Solution(data, Descent(data, max_iterations, tolerance, report)(choose_start(data, initial)))
     from hybridlio.graph.gnc import reject_outliers, start_without_loops
 
     start = start_without_loops(data) if initial == "auto" else None
     start, rejected = reject_outliers(data, choose_start(data, initial) if start is None else start, report)
     kept = data.without(rejected)
     check_determined(kept)
-    return Solution(data, solve(kept, start, max_iterations, report), rejected)
+    return Solution(data, Descent(kept, max_iterations, tolerance, report)(start), rejected)
 
 
 def choose_start(data: GraphData, initial: str) -> Array:
@@ -63,16 +65,22 @@ def choose_start(data: GraphData, initial: str) -> Array:
     edges = edges_of(data)
     if start is not None and misfit(data, start, edges) <= _FITS * freedom(data):
         return start
-    kernels = set(data.edges.robust)
-    sure = [data.without(kernels)] if kernels else []
     starts = [] if start is None else [start]
-    for part in [data, *(part for part in sure if len(groups(part, ("between",))) == len(groups(data, ("between",))))]:
+    for part in _parts_to_start_from(data):
         try:
             starts.append(find(part, "chordal", edges if part is data else None))
         except GraphError:  # parts that inertial factors or given values place
             if start is None:
                 raise
     return starts[0] if len(starts) == 1 else min(starts, key=lambda poses: misfit(data, poses, edges))
+
+
+def _parts_to_start_from(data: GraphData) -> list[GraphData]:
+    """The whole graph, and the graph without robust edges where those that are left join the same poses."""
+    if not data.edges.robust:
+        return [data]
+    sure = data.without(data.edges.robust)
+    return [data, sure] if labels(sure, ("between",))[0] == labels(data, ("between",))[0] else [data]
 
 
 def freedom(data: GraphData) -> int:

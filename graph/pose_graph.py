@@ -173,7 +173,7 @@ class PoseGraph(GraphData):
 
     def optimize(
         self, solver: Solver = "auto", *, initial: Literal["auto", "given"] = "auto", max_iterations: int = 100,
-        progress: Progress | None = None,
+        tolerance: float = 1e-6, progress: Progress | None = None,
     ) -> Solution:  # fmt: skip
         """Find the poses, velocities and biases that fit all factors best.
 
@@ -184,6 +184,7 @@ class PoseGraph(GraphData):
             initial: ``auto`` starts from the given initial values or from chordal ones, whichever fit better; from
                 ``given`` ones where it says so.
             max_iterations: of Gauss-Newton and Levenberg-Marquardt together.
+            tolerance: share of the error that further iterations may still gain.
             progress: called with the stage, the iteration and the error there.
 
         Raises:
@@ -191,7 +192,7 @@ class PoseGraph(GraphData):
         """
         from hybridlio.graph.optimise import optimise
 
-        return optimise(self, solver, initial, max_iterations, progress)
+        return optimise(self, solver, initial, max_iterations, tolerance, progress)
 
     # files
 

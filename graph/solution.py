@@ -131,7 +131,7 @@ class Solution:
     @cached_property
     def _residuals(self) -> dict[int, tuple[Array, float]]:
         builder = Builder(self._data)
-        graph = builder.graph(self._solved.poses, robust=False)
+        graph = builder.graph(robust=False)
         order = np.argsort(co.GTSAM_ORDER[2]) if self._data.dimension == 2 else slice(None)
         found = {}
         for slot, factor_id in enumerate(builder.slots()):

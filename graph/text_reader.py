@@ -6,6 +6,7 @@ import logging
 import os
 from collections import Counter
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -130,7 +131,8 @@ def _add_factors(graph: PoseGraph, path: Path, parts: list[Rows]) -> None:
     edges = [part for part in parts if ROWS[part.tag].what == "edge"]
     if edges:
         numbers = np.array([ids[line] for part in edges for line in part.lines])
-        ends = np.array([(graph.places[i], graph.places[j]) for part in edges for i, j in part.keys])
+        keys = chain.from_iterable(pair for part in edges for pair in part.keys)
+        ends = np.fromiter(map(graph.places.__getitem__, keys), np.int64).reshape(-1, 2)
         measured, information = (np.concatenate([getattr(part, name) for part in edges]) for name in _COLUMNS)
         order = np.argsort(numbers)
         kernels = {ids[part.lines[k]]: kernel for part in edges for k, kernel in part.kernels.items()}
@@ -149,16 +151,16 @@ def _add_priors(graph: PoseGraph, part: Rows, ids: dict[int, int]) -> None:
 
 def _check_keys(graph: PoseGraph, path: Path, rows: list[tuple[int, tuple[Key, ...]]]) -> None:
     """Raise where an edge joins a pose to itself or leads nowhere; in a file without vertices, add the poses."""
-    has_vertices = len(graph) > 0
     for line, keys in rows:
         if len(keys) == 2 and keys[0] == keys[1]:
             raise DataError(f"{path}, row {line}: joins pose {keys[0]} to itself")
-        for key in keys:
-            if key in graph:
-                continue
-            if has_vertices:
-                raise DataError(f"{path}, row {line}: there is no vertex {key}")
-            graph.put_pose(key, None)
+    named = dict.fromkeys(chain.from_iterable(keys for _, keys in rows))
+    unknown = named.keys() - graph.places.keys()
+    if not len(graph):
+        graph.put_poses(list(named), np.full((len(named), len(co.IDENTITY[graph.dimension])), np.nan))
+    elif unknown:
+        line, key = next((line, key) for line, keys in rows for key in keys if key in unknown)
+        raise DataError(f"{path}, row {line}: there is no vertex {key}")
 
 
 def _fix(graph: PoseGraph, fixed: list[int]) -> None:
