@@ -3,9 +3,9 @@
     python benchmarks/scenarios.py FOLDER [--scenarios normal,corridor,…] [--seeds 7301,7306] [--length-m 300] [-o DIR]
 
 The drives are simulated below FOLDER unless they are there. Each system's drift is held against its own in `normal`
-of the same seed. hybridlio also says what it could not see (degenerate: a direction left open; bridged: a scan of no
-use) and how sure it is: σ at the end beside the error there, and the average normalised error squared of its poses (1
-is the truth, more is too sure).
+of the same seed. hybridlio also says of which share of scans it could not see enough (degenerate: a direction left
+open; bridged: of no use; disagreed: scan and IMU contradict each other), and how sure it is: σ at the end beside the
+error there, and the average normalised error squared of its poses (1 is the truth, more is too sure).
 """
 
 from __future__ import annotations
@@ -49,6 +49,7 @@ def figures(one: Pass, sequence: Sequence) -> Figures:
         "end_sigma_m": float(np.sqrt(trajectory.covariances[-1, 3:, 3:].trace())),
         "degenerate": float(np.mean([answer.degenerate for answer in marks])),
         "bridged": float(np.mean([answer.bridged for answer in marks])),
+        "disagreed": float(np.mean([answer.disagreed for answer in marks])),
         "anees_rotation": judgement.anees_rotation,
         "anees_position": judgement.anees_position,
     }
@@ -83,11 +84,12 @@ def summary(found: list[Figures], normal: list[Figures]) -> Figures:
     out |= {"t_rel [%]": drift, "r_rel [°/100 m]": mean("r_rel", found), "to own normal": ratio}
     for heading, key in (
         ("end error [m]", "end_error_m"), ("σ there [m]", "end_sigma_m"), ("degenerate", "degenerate"),
-        ("bridged", "bridged"), ("ANEES rotation", "anees_rotation"), ("ANEES position", "anees_position"),
+        ("bridged", "bridged"), ("disagreed", "disagreed"),
+        ("ANEES rotation", "anees_rotation"), ("ANEES position", "anees_position"),
     ):  # fmt: skip
         out[heading] = mean(key, found)
     if ratio is not None and found[0].get("end_sigma_m") is not None:
-        said = max(out["degenerate"], out["bridged"]) > 0 or out["σ there [m]"] > _ALLOWED * (
+        said = max(out["degenerate"], out["bridged"], out["disagreed"]) > 0 or out["σ there [m]"] > _ALLOWED * (
             mean("end_sigma_m", normal) or np.inf
         )
         out["verdict"] = "held" if ratio <= _ALLOWED else "reported" if said else "drifted in silence"

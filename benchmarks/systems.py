@@ -28,6 +28,7 @@ class Answer:
         stamp_ns: when it holds.
         covariance: ``(6, 6)`` relative to the first pose, rotation first; None of a system that gives none.
         bridged, degenerate: whether the system says that the scan was of no use, or left a direction open.
+        disagreed: whether it says that scan and IMU contradict each other.
     """
 
     pose: Array
@@ -35,6 +36,7 @@ class Answer:
     covariance: Array | None = None
     bridged: bool = False
     degenerate: bool = False
+    disagreed: bool = False
 
 
 Step = Callable[[Frame], Answer]
@@ -49,8 +51,9 @@ def ours(config: Config, _: Sequence, threads: int) -> Step:
     def step(frame: Frame) -> Answer:
         estimate = odometry.step(frame)
         relative = estimate.relative
+        disagreed = estimate.agreement.verdict in ("down-weighted", "rejected", "trusted again")
         marks = (False, False) if relative is None else (not relative.ok, len(relative.degenerate) > 0)
-        return Answer(estimate.pose, estimate.stamp_ns, estimate.covariance, *marks)
+        return Answer(estimate.pose, estimate.stamp_ns, estimate.covariance, *marks, disagreed)
 
     return step
 
