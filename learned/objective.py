@@ -5,12 +5,16 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hybridlio.learned.correspondences import Clouds, match
-from hybridlio.learned.losses import LossValue, loss
+from hybridlio.learned import se3
+from hybridlio.learned.correspondences import Clouds, Matches, match
+from hybridlio.learned.losses import LossValue, gauss_newton, loss
 from hybridlio.learned.odometry_network import NetworkOutput
 from hybridlio.learned.pairs import PairBatch
 from hybridlio.learned.settings import LossSettings
 from hybridlio.projection import MapGeometry
+
+_LEVER_M = 10.0  # rotations count as what they move at this distance
+_DAMPING = 1e-4
 
 
 def clouds_for(batch: PairBatch, settings: LossSettings) -> tuple[Clouds, Clouds]:
@@ -29,13 +33,49 @@ def objective(output: NetworkOutput, batch: PairBatch, settings: LossSettings, g
     """The loss of a batch, averaged over the network's steps, with the initial pose's where it is given a weight."""
     clouds = clouds_for(batch, settings)
     poses = [*output.poses, output.initial] if settings.initial_weight else list(output.poses)
-    if settings.matched_at == "answer":
-        matches = match(output.pose, *clouds, settings, geometry)
+    shares = [1 / len(output.poses)] * len(output.poses) + [settings.initial_weight] * bool(settings.initial_weight)
+    matches = match(output.pose, *clouds, settings, geometry) if settings.matched_at == "answer" else None
+    if matches is not None:
         values = [loss(matches, pose, settings) for pose in poses]
     else:
         values = [pose_loss(pose, clouds, settings, geometry) for pose in poses]
-    steps, answer = len(output.poses), values[len(output.poses) - 1]
-    total = torch.stack([value.total for value in values[:steps]]).mean(0)
-    for value in values[steps:]:
-        total = total + settings.initial_weight * value.total
+    costs = [value.total for value in values]
+    if settings.target_weight:
+        target = descended(output.pose, clouds, settings, geometry, matches)
+        costs = [
+            cost + settings.target_weight * _apart_m(target, pose) for cost, pose in zip(costs, poses, strict=True)
+        ]
+    total = torch.stack([share * cost for share, cost in zip(shares, costs, strict=True)]).sum(0)
+    answer = values[len(output.poses) - 1]
     return LossValue(total, answer.po2pl_m, answer.pl2pl, answer.matched)
+
+
+@torch.no_grad()
+def descended(
+    pose: Tensor,
+    clouds: tuple[Clouds, Clouds],
+    settings: LossSettings,
+    geometry: MapGeometry,
+    matches: Matches | None = None,
+) -> Tensor:
+    """Poses ``(B, 4, 4)`` after ``target_steps`` Gauss-Newton steps down the loss; ``matches`` are those at the start.
+
+    Directions that hardly any point constrains stay as they are.
+    """
+    lever = torch.tensor([_LEVER_M] * 3 + [1.0] * 3, dtype=pose.dtype, device=pose.device)
+    for _ in range(settings.target_steps):
+        matches = matches or match(pose, *clouds, settings, geometry)
+        near = gauss_newton(matches, pose, settings)
+        # the curvature of a match without residual, times how many there are
+        scale = _DAMPING * matches.weight.sum(1).clamp(min=1) * settings.alpha / settings.kernel_m
+        H = near.hessian + torch.diag(lever.square()) * scale[:, None, None]
+        pose = pose @ se3.exp(-torch.linalg.solve(H, near.gradient[..., None])[..., 0])
+        matches = None
+    return pose
+
+
+def _apart_m(target: Tensor, pose: Tensor) -> Tensor:
+    """How far poses are apart ``(B,)``: translation, and rotation at a lever of 10 m."""
+    xi = se3.log(se3.inverse(target) @ pose)
+    squared = xi[:, 3:].square().sum(1) + (_LEVER_M * xi[:, :3]).square().sum(1)
+    return (squared + 1e-8).sqrt()  # smooth within a tenth of a millimetre

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from hybridlio.errors import ConfigError
 from hybridlio.learned import maps, se3
 from hybridlio.learned.imu_network import ImuNetwork
-from hybridlio.learned.projective import ProjectiveSteps
+from hybridlio.learned.projective import ProjectiveSteps, SeenPoints
 from hybridlio.learned.residual_network import ResidualNetwork
 from hybridlio.learned.settings import NetworkSettings
 
@@ -60,6 +60,20 @@ class NetworkOutput:
         return self.pose @ se3.inverse(self.initial)
 
 
+@dataclass(frozen=True, eq=False)
+class SeenScan:
+    """What is computed of a scan alone.
+
+    Attributes:
+        vertices, normals: maps ``(B, 3, H, W)`` in its own frame.
+        points: as the projective steps see it; None in a network without.
+    """
+
+    vertices: Tensor
+    normals: Tensor
+    points: SeenPoints | None
+
+
 class OdometryNetwork(nn.Module):
     """UnDeepLIO: from two vertex maps and the inertial data between them to the relative pose ``T_k_k1``.
 
@@ -100,17 +114,27 @@ class OdometryNetwork(nn.Module):
         self, given: NetworkInput, initial: Tensor, features: tuple[Tensor, Tensor] | None = None
     ) -> NetworkOutput:
         """Estimate the residual of any initial poses ``(B, 4, 4)``; ``features`` are those of :meth:`imu_features`."""
-        last = (given.last, maps.normal_map(given.last))
-        current = (given.current, maps.normal_map(given.current))
+        return self.refine_seen(self.look(given.last), self.look(given.current), initial, features)
+
+    def look(self, vertices: Tensor) -> SeenScan:
+        """What is computed of a scan alone, from its vertex map ``(B, 3, H, W)``: once for both pairs that it is in."""
+        normals = maps.normal_map(vertices)
+        points = None if self.projective is None else self.projective.look(vertices, normals)
+        return SeenScan(vertices, normals, points)
+
+    def refine_seen(
+        self, last: SeenScan, current: SeenScan, initial: Tensor, features: tuple[Tensor, Tensor] | None = None
+    ) -> NetworkOutput:
+        """As :meth:`refine`, for scans that :meth:`look` has seen."""
         pose, poses = initial, []
         for _ in range(self.settings.iterations):
-            if self.projective is not None:
-                poses += self.projective(last, current, pose)
+            if self.projective is not None and last.points is not None and current.points is not None:
+                poses += self.projective(last.points, current.points, pose)
                 pose = poses[-1]
             if self.residual_network is not None:
-                moved = maps.remap(*current, pose, self.settings.geometry)
-                with torch.autocast(given.last.device.type, torch.bfloat16, enabled=self.mixed_precision):
-                    residual = self.residual_network(last, moved, features)
+                moved = maps.remap(current.vertices, current.normals, pose, self.settings.geometry)
+                with torch.autocast(pose.device.type, torch.bfloat16, enabled=self.mixed_precision):
+                    residual = self.residual_network((last.vertices, last.normals), moved, features)
                 pose = residual.float() @ pose
                 poses.append(pose)
         return NetworkOutput(initial, tuple(poses))

@@ -34,21 +34,22 @@ DEFAULT = Recipe(
         imu_layers=1,
         velocity=True,
         mean_rate=True,
-        projective_steps=3,
-        stem=16,
-        stem_stride=(4, 4),
-        stages=(16, 32),
-        blocks=1,
-        normalisation="group",
-        features=32,
-        distance="gradient",
+        encoder=False,
+        projective_steps=4,
         vertex_scale_m=20.0,
-        residual_scale=0.1,
         output_scale=0.02,
     ),
-    LossSettings(reduction="mean", matched_at="answer", initial_weight=0.1, keep_ground=True, max_distance_m=1.0),
+    LossSettings(
+        kernel_m=0.03,
+        max_distance_m=1.0,
+        reduction="mean",
+        matched_at="answer",
+        initial_weight=0.1,
+        target_weight=1.0,
+        keep_ground=True,
+    ),
     OptimiserSettings(
-        epochs=10,
+        epochs=8,
         batch=8,
         learning_rate=2e-3,
         schedule="cosine",
@@ -58,7 +59,8 @@ DEFAULT = Recipe(
         velocity_noise_m_s=0.1,
     ),
 )
-"""What ships: the published structure, smaller, behind weighted steps of registration between the maps.
+"""What ships: the LSTMs correct what velocity and mean angular velocity give, and a siamese encoder of both maps weighs
+the points of a registration between them, instead of the residual being read off pooled features.
 
 Each departure from ``paper``, and what it is worth, is in docs/learned.md.
 """

@@ -11,6 +11,7 @@ a robust kernel.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -19,104 +20,158 @@ from torch.nn import functional
 from hybridlio.learned import maps, se3
 from hybridlio.learned.residual_network import CircularConv
 from hybridlio.learned.settings import NetworkSettings
-from hybridlio.projection import MapGeometry
 
-_KERNEL_M = 0.3
+_KERNELS_M = (0.4, 0.05)  # of the first and the last step, before training
+_KERNEL_GAIN = 10.0  # Adam's steps are as large for one number as for a layer's weights
 _LEVER_M = 10.0  # rotations are measured at this lever, so that the system is well scaled
-_DAMPING = 5e-4  # of the normal equations a point: directions that hardly any cell constrains stay as they are
+_DAMPING = 1e-4  # of the normal equations a point: directions that hardly any cell constrains stay as they are
 _LIMIT_M = 1.0
 _DISTANCE_M = 0.1  # what is left after an initial pose, so that networks see numbers around 1
+_FEW = 2  # the first steps take one of so many points
+_DILATION = 3
 _COARSE = 2  # features have a cell for so many rows and columns of the maps
 
-Maps = tuple[Tensor, Tensor]
+
+@dataclass(frozen=True, eq=False)
+class SeenPoints:
+    """A scan as the steps see it, whether it is the last one or the current one; computed once a scan.
+
+    Attributes:
+        points: ``(B, 3, N)`` the cells of its vertex map, row by row.
+        seen: ``(B, 1, N)`` which cells hold a point.
+        planes: ``(B, 4, N)`` the normal n of each cell and n·v, which is infinite where there is no normal.
+        rough: ``(B, 1, N)`` of :func:`_roughness`; None without weights to be told of it.
+        as_last, as_current: ``(B, N, C)`` and ``(B, C, N)`` what the cells contribute to the weights of points that
+            fall into them, and of their own points; None without weights.
+    """
+
+    points: Tensor
+    seen: Tensor
+    planes: Tensor
+    rough: Tensor | None = None
+    as_last: Tensor | None = None
+    as_current: Tensor | None = None
 
 
 class ProjectiveSteps(nn.Module):
-    """From two pairs of maps and a pose to better poses, one for each step."""
+    """From two scans and a pose to better poses, one for each step."""
 
     def __init__(self, settings: NetworkSettings) -> None:
         super().__init__()
         self.settings = settings
-        self.log_kernel = nn.Parameter(torch.full((settings.projective_steps,), math.log(_KERNEL_M)))
+        self.log_kernel = nn.Parameter(torch.zeros(settings.projective_steps))
+        first, last = map(math.log, _KERNELS_M)
+        self.register_buffer("_start", torch.linspace(first, last, settings.projective_steps), persistent=False)
         self.weights = PointWeights(settings) if settings.weight_channels else None
 
-    def forward(self, last: Maps, current: Maps, pose: Tensor) -> list[Tensor]:
+    def look(self, vertices: Tensor, normals: Tensor) -> SeenPoints:
+        """What the steps need of a scan, from its maps ``(B, 3, H, W)`` in its own frame."""
+        offset = (normals * vertices).sum(dim=1, keepdim=True)
+        offset = torch.where(maps.valid_cells(normals)[:, None], offset, torch.inf)
+        planes = torch.cat([normals, offset], dim=1).flatten(2)
+        seen = maps.valid_cells(vertices)[:, None]
+        points = SeenPoints(vertices.flatten(2), seen.flatten(2), planes)
+        if self.weights is None:
+            return points
+        rough = _roughness(vertices, normals)
+        as_last, as_current = self.weights.look(vertices, normals, rough, seen)
+        return replace(points, rough=rough.flatten(2), as_last=as_last, as_current=as_current)
+
+    def forward(self, last: SeenPoints, current: SeenPoints, pose: Tensor) -> list[Tensor]:
         """Poses ``T_k_k1`` ``(B, 4, 4)`` after each step.
 
-        A step takes the pose before it as given: gradients go through the weights, not back through earlier steps.
-
-        Args:
-            last: vertex and normal maps ``(B, 3, H, W)`` of the last scan.
-            current: those of the current scan, in its own frame.
-            pose: ``(B, 4, 4)`` to start from.
+        A step takes the pose before it as given: gradients go through the weights, not back through earlier steps. The
+        first half of the steps takes every second point.
         """
-        planes = _planes(*last)
-        points, seen = current[0].flatten(2), maps.valid_cells(current[0]).flatten(1)[:, None]
-        logits = None if self.weights is None else self.weights(last, current)
-        poses = []
-        for kernel_m in self.log_kernel.exp():
-            pose = pose.detach()
-            moved = pose[:, :3, :3] @ points + pose[:, :3, 3:]
-            cell, inside = maps.cells(moved, self.settings.geometry)
-            normals, distance, there = _held_against(planes, moved, cell, inside[:, None] & seen)
-            weights = there * (kernel_m**2 / (kernel_m**2 + distance.square())).square()
-            if logits is not None:
-                weights = weights * torch.sigmoid(logits(cell, distance))
-            pose = weighted_step(normals, moved, distance, weights) @ pose
+        few, poses = _thinned(current, _FEW), []
+        for k, kernel_m in enumerate(self.kernels_m):
+            points = few if k < self.settings.projective_steps // 2 else current
+            pose = self._step(last, points, pose.detach(), kernel_m) @ pose.detach()
             poses.append(pose)
         return poses
 
+    def _step(self, last: SeenPoints, current: SeenPoints, pose: Tensor, kernel_m: Tensor) -> Tensor:
+        """``δT`` ``(B, 4, 4)`` of one step."""
+        moved = torch.baddbmm(pose[:, :3, 3:], pose[:, :3, :3], current.points)
+        cell, inside = maps.cells(moved, self.settings.geometry)
+        normals, distance, there = _held_against(last.planes, moved, cell, inside[:, None] & current.seen)
+        weights = there * (kernel_m**2 / (kernel_m**2 + distance.square())).square()
+        if self.weights is not None:
+            weights = weights * self.weights(last, current, cell, distance, kernel_m)
+        return weighted_step(normals, moved, distance, weights)
+
+    @property
+    def kernels_m(self) -> Tensor:
+        """Width of each step's robust kernel, in metres."""
+        start: Tensor = self.get_buffer("_start")
+        return (start + _KERNEL_GAIN * self.log_kernel).exp()
+
 
 class PointWeights(nn.Module):
-    """What each point of the current map counts, by the features of its cell in both maps and its distance."""
+    """What each point of the current scan counts, by the features of its cell in both maps and its distance."""
 
     def __init__(self, settings: NetworkSettings) -> None:
         super().__init__()
-        self.scale_m, self.geometry = settings.vertex_scale_m, settings.geometry
+        self.scale_m = settings.vertex_scale_m
         channels = settings.weight_channels
         self.features = nn.Sequential(
             CircularConv(8, channels, 3, (_COARSE, _COARSE), bias=True),
             nn.ReLU(),
             CircularConv(channels, channels, 3, (1, 1), bias=True),
             nn.ReLU(),
-            CircularConv(channels, channels, 3, (1, 1), bias=True),
+            CircularConv(channels, channels, 3, (1, 1), bias=True, dilation=_DILATION),  # sees about 10° around
             nn.ReLU(),
         )
-        self.of_last = nn.Conv2d(channels, channels, 1)
-        self.of_current = nn.Conv2d(channels, channels, 1, bias=False)
-        self.of_point = nn.Conv1d(3, channels, 1, bias=False)
-        self.logit = nn.Conv1d(channels, 1, 1)
+        self.of_last = nn.Linear(channels, channels)
+        self.of_current = nn.Linear(channels, channels, bias=False)
+        self.of_point = nn.Linear(4, channels, bias=False)
+        self.logit = nn.Linear(channels, 1)
         for parameter in self.logit.parameters():
             nn.init.zeros_(parameter)
+        self.size = settings.geometry.rows, settings.geometry.columns
 
-    def forward(self, last: Maps, current: Maps) -> _Logits:
-        """The weights' logits, as a function of the cells that points fall into and their distances there."""
-        rough = [_roughness(*both) for both in (last, current)]
-        seen = [
-            torch.cat([v / self.scale_m, n, r, (v != 0).any(1, keepdim=True)], dim=1)
-            for (v, n), r in zip((last, current), rough, strict=True)
-        ]
-        of_last, of_current = self.features(torch.cat(seen)).chunk(2)
-        coarse = _coarse_cells(self.geometry, of_last.device)
-        own = self.of_current(of_current).flatten(2)[..., coarse]
-        return _Logits(self, self.of_last(of_last).flatten(2), own, coarse, rough[0].flatten(2), rough[1].flatten(2))
+    def look(self, vertices: Tensor, normals: Tensor, rough: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+        """What a scan's cells contribute, as those of the last scan ``(B, N, C)`` and of the current ``(B, C, N)``."""
+        inputs = torch.cat([vertices / self.scale_m, normals, rough, seen.to(vertices.dtype)], dim=1)
+        features = self.features(inputs).permute(0, 2, 3, 1)
+        as_last = self._fine(self.of_last(features)).flatten(1, 2)
+        as_current = self._fine(self.of_current(features)).flatten(1, 2).transpose(1, 2).contiguous()
+        return as_last, as_current
+
+    def _fine(self, coarse: Tensor) -> Tensor:
+        """Coarse cells ``(B, h, w, C)``, each repeated over the cells of the maps that it covers."""
+        batch, rows, columns, channels = coarse.shape
+        shape = (batch, rows, _COARSE, columns, _COARSE, channels)
+        fine = coarse[:, :, None, :, None].expand(shape).reshape(batch, rows * _COARSE, columns * _COARSE, channels)
+        return fine[:, : self.size[0], : self.size[1]]
+
+    def forward(
+        self, last: SeenPoints, current: SeenPoints, cell: Tensor, distance: Tensor, kernel_m: Tensor
+    ) -> Tensor:
+        """Weights ``(B, 1, N)`` from 0 to 1 of points by the cells ``(B, N)`` they fall into and their distances."""
+        assert last.rough is not None
+        assert last.as_last is not None
+        assert current.rough is not None
+        assert current.as_current is not None
+        size = distance.abs()
+        compared = (size / kernel_m.detach()).clamp(max=5.0)
+        rough = last.rough.gather(2, cell[:, None])
+        point = torch.cat([size / _DISTANCE_M, compared, rough, current.rough], dim=1)
+        batch, cells, channels = last.as_last.shape
+        # rows of a table are fetched faster than channels one by one
+        first = torch.arange(0, batch * cells, cells, device=cell.device)[:, None]
+        there = (
+            last.as_last.reshape(-1, channels).index_select(0, (cell + first).flatten()).reshape(batch, -1, channels)
+        )
+        weight = self.of_point.weight.expand(batch, -1, -1)
+        hidden = torch.relu(torch.baddbmm(current.as_current, weight, point) + there.transpose(1, 2))
+        return torch.sigmoid(self.logit.weight @ hidden + self.logit.bias)
 
 
-class _Logits:
-    """Logits ``(B, 1, N)`` of points by the flat cells ``(B, N)`` they fall into and their distances ``(B, 1, N)``."""
-
-    def __init__(
-        self, net: PointWeights, of_last: Tensor, own: Tensor, coarse: Tensor, rough_last: Tensor, rough_own: Tensor
-    ) -> None:
-        self.net, self.of_last, self.own, self.coarse = net, of_last, own, coarse
-        self.rough_last, self.rough_own = rough_last, rough_own
-
-    def __call__(self, cell: Tensor, distance: Tensor) -> Tensor:
-        there = self.coarse[cell][:, None].expand(-1, self.of_last.shape[1], -1)
-        size = distance.abs().detach() / _DISTANCE_M
-        point = torch.cat([size, self.rough_last.gather(2, cell[:, None]), self.rough_own], dim=1)
-        hidden = torch.relu(self.of_last.gather(2, there) + self.own + self.net.of_point(point))
-        return self.net.logit(hidden)  # type: ignore[no-any-return]
+def _thinned(scan: SeenPoints, by: int) -> SeenPoints:
+    """Every so-manieth point; planes and features, which belong to cells, stay."""
+    rough, own = (None if values is None else values[..., ::by] for values in (scan.rough, scan.as_current))
+    return replace(scan, points=scan.points[..., ::by], seen=scan.seen[..., ::by], rough=rough, as_current=own)
 
 
 def _roughness(vertices: Tensor, normals: Tensor) -> Tensor:
@@ -132,23 +187,11 @@ def _roughness(vertices: Tensor, normals: Tensor) -> Tensor:
     return (torch.maximum(*off) / _DISTANCE_M).clamp(max=5.0)
 
 
-def _coarse_cells(geometry: MapGeometry, device: torch.device) -> Tensor:
-    """For each cell of the maps the flat cell of the features ``(H·W,)``."""
-    rows = torch.arange(geometry.rows, device=device) // _COARSE
-    columns = torch.arange(geometry.columns, device=device) // _COARSE
-    return (rows[:, None] * math.ceil(geometry.columns / _COARSE) + columns).flatten()
-
-
-def _planes(vertices: Tensor, normals: Tensor) -> Tensor:
-    """``(B, 4, H·W)``: the normal n of each cell, and n·v; 0 where it has no plane."""
-    return torch.cat([normals, (normals * vertices).sum(dim=1, keepdim=True)], dim=1).flatten(2)
-
-
 def _held_against(planes: Tensor, points: Tensor, cell: Tensor, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Normals ``(B, 3, N)``, signed distances ``(B, 1, N)`` in metres, and where there are such, as 0 and 1.
 
     Args:
-        planes: of :func:`_planes`.
+        planes: ``(B, 4, H·W)`` as in :class:`SeenPoints`.
         points: ``(B, 3, N)`` in the planes' frame.
         cell: ``(B, N)`` they fall into.
         known: ``(B, 1, N)`` which of them are points at all.
@@ -156,7 +199,7 @@ def _held_against(planes: Tensor, points: Tensor, cell: Tensor, known: Tensor) -
     chosen = planes.gather(2, cell[:, None].expand(-1, 4, -1))
     normals = chosen[:, :3]
     distance = (normals * points).sum(dim=1, keepdim=True) - chosen[:, 3:]
-    there = known & (distance.abs() < _LIMIT_M) & (normals != 0).any(dim=1, keepdim=True)
+    there = known & (distance.abs() < _LIMIT_M)
     return normals, torch.where(there, distance, 0.0), there.to(distance.dtype)
 
 

@@ -24,10 +24,12 @@ _LEVER_M = 10.0  # makes gradients by rotation as large as those by translation
 class CircularConv(nn.Module):
     """A square convolution whose columns wrap around; rows are padded by zeros. A bias only where no norm follows."""
 
-    def __init__(self, inputs: int, outputs: int, size: int, stride: tuple[int, int], bias: bool = False) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, size: int, stride: tuple[int, int], bias: bool = False, dilation: int = 1
+    ) -> None:
         super().__init__()
-        self.reach = size // 2
-        self.conv = nn.Conv2d(inputs, outputs, size, stride, padding=(self.reach, 0), bias=bias)
+        self.reach = size // 2 * dilation
+        self.conv = nn.Conv2d(inputs, outputs, size, stride, (self.reach, 0), dilation, bias=bias)
         nn.init.kaiming_normal_(self.conv.weight, nonlinearity="relu")
 
     def forward(self, x: Tensor) -> Tensor:

@@ -122,6 +122,9 @@ class LossSettings:
         matched_at: matches are looked for at ``each`` pose that is judged, or once at the ``answer``, the last of them.
         initial_weight: of the loss at the initial pose itself beside that of the answers, which hardly depend on it
             once the residual undoes its error; the paper's is 0.
+        target_weight: of the distance, in metres with rotations at 10 m, to where ``target_steps`` Gauss-Newton steps
+            down the loss lead from the answer. The loss itself hardly weighs directions that few points see, such as
+            ahead on an open road; this weighs all alike. Not in the paper.
         keep_ground: the clouds keep the ground, which the paper removes; decided when recordings are prepared.
     """
 
@@ -135,12 +138,17 @@ class LossSettings:
     reduction: Literal["sum", "mean"] = "sum"
     matched_at: Literal["each", "answer"] = "each"
     initial_weight: float = 0.0
+    target_weight: float = 0.0
+    target_steps: int = 2
     keep_ground: bool = False
 
     def __post_init__(self) -> None:
         _check_choices(self)
         _check_positive(self, "kernel_m", "max_distance_m")
-        if min(self.alpha, self.lambda_, self.initial_weight) < 0 or self.alpha + self.lambda_ == 0:
+        if (
+            min(self.alpha, self.lambda_, self.initial_weight, self.target_weight, self.target_steps) < 0
+            or self.alpha + self.lambda_ == 0
+        ):
             raise ConfigError(
                 f"loss: weights must not be negative, nor alpha and lambda_ both 0, got {self.alpha}, {self.lambda_}, "
                 f"{self.initial_weight}"

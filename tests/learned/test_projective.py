@@ -35,7 +35,8 @@ def steps(recipe, count, **changes):
 
 
 def test_steps_between_the_maps_find_the_pose_without_any_training(tiny_recipe):
-    poses = steps(tiny_recipe, 4)(room_maps(np.eye(4)), room_maps(STEP), torch.eye(4)[None])
+    net = steps(tiny_recipe, 4)
+    poses = net(net.look(*room_maps(np.eye(4))), net.look(*room_maps(STEP)), torch.eye(4)[None])
     assert len(poses) == 4
     rotation_deg, translation_m = step_errors(poses[-1].detach().double().numpy(), STEP[None])
     assert rotation_deg < 0.05
@@ -43,9 +44,10 @@ def test_steps_between_the_maps_find_the_pose_without_any_training(tiny_recipe):
 
 
 def test_untrained_weights_leave_the_kernel_alone(tiny_recipe):
-    given = room_maps(np.eye(4)), room_maps(STEP), torch.eye(4)[None]
-    learned, bare = steps(tiny_recipe, 2)(*given), steps(tiny_recipe, 2, weight_channels=0)(*given)
-    assert torch.allclose(learned[-1], bare[-1], atol=1e-5)
+    nets = steps(tiny_recipe, 2), steps(tiny_recipe, 2, weight_channels=0)
+    at = torch.eye(4)[None]
+    found = [net(net.look(*room_maps(np.eye(4))), net.look(*room_maps(STEP)), at)[-1] for net in nets]
+    assert torch.allclose(*found, atol=1e-5)
 
 
 def test_weights_follow_the_points_and_not_their_order_in_the_batch(tiny_recipe):
@@ -53,10 +55,11 @@ def test_weights_follow_the_points_and_not_their_order_in_the_batch(tiny_recipe)
     torch.nn.init.normal_(net.weights.logit.weight)
     one, other, at = room_maps(np.eye(4)), room_maps(STEP), torch.eye(4)[None]
     last, current = (tuple(map(torch.cat, zip(*pair, strict=True))) for pair in ((one, other), (other, one)))
-    both = net(last, current, at.expand(2, 4, 4))[-1]
-    assert torch.allclose(both[:1], net(one, other, at)[-1], atol=1e-5)
-    assert torch.allclose(both[1:], net(other, one, at)[-1], atol=1e-5)
-    assert not torch.allclose(both[:1], steps(tiny_recipe, 2)(one, other, at)[-1], atol=1e-5)
+    both = net(net.look(*last), net.look(*current), at.expand(2, 4, 4))[-1]
+    assert torch.allclose(both[:1], net(net.look(*one), net.look(*other), at)[-1], atol=1e-5)
+    assert torch.allclose(both[1:], net(net.look(*other), net.look(*one), at)[-1], atol=1e-5)
+    fresh = steps(tiny_recipe, 2)
+    assert not torch.allclose(both[:1], fresh(fresh.look(*one), fresh.look(*other), at)[-1], atol=1e-5)
 
 
 def test_one_step_solves_a_small_motion_of_planes():
