@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from hybridlio import se3
 from hybridlio.errors import ConfigError, DataError
@@ -19,7 +18,7 @@ from hybridlio.learned.correspondences import Clouds
 from hybridlio.learned.devices import pick_device
 from hybridlio.learned.loss_judge import Judged, LossJudge, on_device
 from hybridlio.learned.lstm_initial_pose import inertial
-from hybridlio.learned.odometry_network import NetworkInput
+from hybridlio.learned.odometry_network import NetworkInput, SeenScan
 from hybridlio.learned.pairs import padded
 from hybridlio.learned.preparing import Prepared
 from hybridlio.learned.settings import Recipe
@@ -42,7 +41,7 @@ class _Seen:
     """A scan as the network and the loss take it."""
 
     stamp_ns: int
-    vertices: Tensor
+    maps: SeenScan
     cells: int
     cloud: Clouds
 
@@ -130,15 +129,20 @@ class NetworkResidual:
         normals = cloud.normals if cloud.normals is not None else np.zeros_like(cloud.points)
         both = padded([(cloud.points, normals)])
         clouds = Clouds(*(part.to(self._device) for part in (both.points, both.normals, both.there)))
-        tensor = on_device(vertices, self._device)
-        there = int(maps.valid_cells(maps.normal_map(tensor)).sum()) if prepared.usable else 0
-        return _Seen(scan.stamp_ns, tensor, there, clouds)
+        with torch.no_grad():
+            seen = self._network.look(on_device(vertices, self._device))
+        there = int(maps.valid_cells(seen.normals).sum()) if prepared.usable else 0
+        return _Seen(scan.stamp_ns, seen, there, clouds)
 
     def _given(self, last: _Seen, current: _Seen, frame: Frame, dt_s: float) -> NetworkInput:
         imu, velocity = inertial(frame.imu, frame, self._network.settings, self._step)
         dt = torch.tensor([dt_s], device=self._device)
         return NetworkInput(
-            last.vertices, current.vertices, on_device(imu, self._device), dt, on_device(velocity, self._device)
+            last.maps.vertices,
+            current.maps.vertices,
+            on_device(imu, self._device),
+            dt,
+            on_device(velocity, self._device),
         )
 
     def _estimate(
@@ -149,7 +153,8 @@ class NetworkResidual:
         before = min((self._judge.judge(T, *clouds) for T in self._starts(initial, dt_s)), key=lambda j: j.cost)
         with torch.no_grad():
             features = self._network.imu_features(given)
-            found = self._network.refine(given, on_device(before.pose, self._device), features).pose[0]
+            start = on_device(before.pose, self._device)
+            found = self._network.refine_seen(last.maps, current.maps, start, features).pose[0]
         pose = se3.orthonormalise(found.double().cpu().numpy())
         return before, self._judge.descend(self._judge.judge(pose, *clouds), *clouds, self._settings.refine_steps)
 

@@ -94,7 +94,7 @@ def test_an_answer_that_the_loss_finds_worse_is_not_passed_on(weights, seen, mon
     residual = source(weights(), [seen(np.eye(4), seed=0), seen(STEP, seed=1)])
     worse = torch.tensor(STEP @ se3.exp(3 * OFF), dtype=torch.float32)[None]
     answer = type("Answer", (), {"pose": worse})
-    monkeypatch.setattr(residual._network, "refine", lambda *_: answer)
+    monkeypatch.setattr(residual._network, "refine_seen", lambda *_: answer)
     found = residual.refine(frame(1), initial(OFF))
     assert not found.ok
     assert np.allclose(found.pose, initial(OFF).pose)
