@@ -169,8 +169,7 @@ def _full_name(wanted: str, names: tuple[str, ...]) -> str:
 
 
 def _named(found: list[Recording]) -> Iterator[Recording]:
-    """Names that can be folders and are not given twice; a name does not depend on what else is in the list in order,
-    only on whether another recording has it too."""
+    """Names that can be folders, none given twice: where several recordings share one, each gets a mark of its own."""
     safe = [re.sub(r"[^\w.-]+", "_", item.name).lstrip(".") or "recording" for item in found]
     count = Counter(safe)
     for item, name in zip(found, safe, strict=True):

@@ -153,7 +153,7 @@ def test_the_exit_code_says_whether_any_recording_failed(tiny_drive, tmp_path):
     options = ("-o", tmp_path / "out", "--residual", "none", "--frames", ":4", "--engine", "threading")
     code, said = command(tiny_drive, *options)
     assert code == 0, said
-    assert "1 recordings: 1 done" in said
+    assert "1 recording: 1 done" in said
     code, said = command(tiny_drive, "/gone", *options)
     assert code == 1
     assert "1 done before, 1 failed" in said
