@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hybridlio.estimates import Array, RelativePose, ResidualSource
+from hybridlio.estimates import Array, RelativePose, ResidualSource, TakesBack
 from hybridlio.sensors import Frame
 
 
@@ -51,6 +51,12 @@ class ResidualChain:
         if coarse.ok:  # the second kept its place by the first's step, which is as good as a step of its own
             return replace(coarse, source=self.name, drift=fine.drift, details=details)
         return replace(fine, details=details)
+
+    def take_back(self, initial: RelativePose) -> None:
+        """Tell those of the two that want to know that their answer was not believed."""
+        for source in (self._first, self._second):
+            if isinstance(source, TakesBack):
+                source.take_back(initial)
 
 
 def _both(a: Array, b: Array) -> Array:

@@ -120,6 +120,11 @@ class NetworkResidual:
         uses_imu = self._network.settings.imu == "feature" and initial.from_imu
         return self._answer(after, uses_imu, details)
 
+    def take_back(self, initial: RelativePose) -> None:
+        """Go on at the velocity of the initial pose: the last answer was not believed."""
+        if self._step is not None:
+            self._step = (initial.pose, self._step[1])
+
     def _look(self, scan: Scan) -> _Seen:
         prepared = self._prepare(scan)
         vertices, cloud = prepared.vertex_map, prepared.loss_cloud

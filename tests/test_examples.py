@@ -45,6 +45,16 @@ def test_own_initial_pose_source_takes_the_place_of_a_built_in_one(folder):
     assert wheels_m < 0.1
 
 
+def test_initial_poses_are_swapped_by_one_word(folder):
+    text = run_example("swap_initial_pose.py", folder)
+    lines = dict(line.split(": ", 1) for line in text.splitlines())
+    assert list(lines) == ["preintegration", "lstm", "kalman", "constant-velocity"]
+    for line in lines.values():
+        initial_m, end_m = metres(line)
+        assert 0 < initial_m < 0.3
+        assert end_m < 0.1
+
+
 def test_a_pose_graph_by_hand_closes_its_loop_and_rejects_the_wrong_one(folder):
     text = run_example("pose_graph_by_hand.py", folder)
     alone_m, _, closed_m, sigma_m = metres(text)

@@ -79,3 +79,14 @@ def test_a_direction_that_the_first_leaves_loose_is_not_less_sure_than_the_initi
     second = Moved("fine", 0.0)
     ResidualChain(Moved("coarse", 0.0, sigma=10.0), second).refine(FRAME, INITIAL)
     assert np.sqrt(np.diag(second.given[0].covariance)).max() <= 0.2
+
+
+def test_both_hear_that_their_answer_was_not_believed():
+    class Humble(Moved):
+        def take_back(self, initial):
+            self.given.append(("back", initial))
+
+    first, second = Humble("coarse", 0.2), Moved("fine", 0.03)
+    ResidualChain(first, second).take_back(INITIAL)
+    assert first.given == [("back", INITIAL)]
+    assert second.given == []
