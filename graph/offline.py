@@ -14,8 +14,11 @@ from numpy.typing import NDArray
 from hybridlio import se3
 from hybridlio.errors import GraphError
 from hybridlio.estimates import Array, State
+from hybridlio.gps import GpsOptions
 from hybridlio.graph import factors
 from hybridlio.graph.factor_groups import FactorGroup
+from hybridlio.graph.gps_factors import GpsGroup
+from hybridlio.graph.ordering import chain_order
 from hybridlio.graph.preintegration import covers, preintegrate
 from hybridlio.graph.robust import Added, check_treatment
 from hybridlio.graph.scans import Scans
@@ -65,6 +68,7 @@ def smooth(
     progress: Progress | None = None,
     *,
     loops: bool | LoopSettings = False,
+    gps: bool | GpsOptions = False,
     groups: Sequence[FactorGroup] = (),
     robust: str | None = None,
 ) -> Smoothed:
@@ -75,17 +79,21 @@ def smooth(
         progress: called with the stage, what is done of it and what there is in all.
         loops: find where the run comes back to a place, and close the loops; settings of how, or True. What became of
             them is ``found["loops"]``, a :class:`hybridlio.graph.loops.ClosedLoops`.
+        gps: whether to use the record's GPS fixes, and how; what came of it is ``found["gps"]``, a
+            :class:`hybridlio.gps.GpsFit`.
         groups: more measurements.
         robust: how to treat those of the groups' measurements that may be wrong: ``huber``, ``cauchy``,
             ``geman-mcclure``, ``dcs`` or ``gnc``; by default as each group prefers.
 
     Raises:
         GraphError: the graph cannot be solved.
+        EstimationError: too few fixes lie in the run's time.
         ConfigError: an unknown treatment.
         DataError: loops are asked for, and the record has no keyframes.
     """
     report = progress or _silent
-    added = Added(_with_loops(groups, record, loops, report), check_treatment(robust))
+    fixes = [GpsGroup(record, gps if isinstance(gps, GpsOptions) else GpsOptions())] if gps else []
+    added = Added([*fixes, *_with_loops(groups, record, loops, report)], check_treatment(robust))
     states = _online_states(record)
     error_before: float | None = None
     for number in range(_ROUNDS):
@@ -153,7 +161,10 @@ def _optimiser(
     params.setLinearSolverType("MULTIFRONTAL_QR")  # Cholesky finds long straight chains indeterminate
     params.setRelativeErrorTol(1e-6)
     params.setMaxIterations(iterations)
-    return gtsam.LevenbergMarquardtOptimizer(graph, values, params)
+    ordering = chain_order(graph, values)
+    if ordering is None:
+        return gtsam.LevenbergMarquardtOptimizer(graph, values, params)
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, ordering, params)
 
 
 def _solve(optimiser: gtsam.LevenbergMarquardtOptimizer) -> gtsam.Values:

@@ -14,11 +14,13 @@ _RELINEARISE = {
     "v": np.full(3, 1.0),  # velocity, m/s
     "b": np.r_[np.full(3, 0.1), np.full(3, 0.01)],  # biases: m/s², rad/s
     "g": np.full(3, 0.1),  # gravity, m/s²
+    "e": np.r_[np.full(3, 0.02), np.full(3, 1.0)],  # world in the frame of GPS fixes: rad, m
+    "t": np.full(1, 0.1),  # time between the clocks of fixes and scans, s
 }
 
 
 def incremental_solver() -> gtsam.ISAM2:
-    """An empty iSAM2 for graphs of poses ``x`` and ``m``, velocities ``v``, biases ``b`` and gravity ``g``."""
+    """An empty iSAM2 for graphs of poses ``x`` and ``m``, velocities ``v``, biases ``b``, gravity ``g`` …"""
     params = gtsam.ISAM2Params()
     params.setFactorization("QR")  # Cholesky finds long straight chains indeterminate
     params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(_WILDFIRE_THRESHOLD))

@@ -209,15 +209,22 @@ class Calibration:
     Attributes:
         T_imu_lidar: ``(4, 4)``; maps lidar points into the IMU (body) frame.
         T_camera_lidar: ``(4, 4)`` or None; KITTI pose files are in this camera's frame.
+        antenna_imu_m: ``(3,)`` the GPS antenna in the IMU frame; None where it is not known, and taken to be there.
     """
 
     T_imu_lidar: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     T_camera_lidar: NDArray[np.float64] | None = None
+    antenna_imu_m: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_imu_lidar", se3.check_pose(self.T_imu_lidar, "T_imu_lidar"))
         if self.T_camera_lidar is not None:
             object.__setattr__(self, "T_camera_lidar", se3.check_pose(self.T_camera_lidar, "T_camera_lidar"))
+        if self.antenna_imu_m is not None:
+            antenna = np.asarray(self.antenna_imu_m, dtype=np.float64)
+            if antenna.shape != (3,) or not np.isfinite(antenna).all():
+                raise DataError(f"antenna_imu_m: expected three finite numbers, got {antenna.tolist()}")
+            object.__setattr__(self, "antenna_imu_m", antenna)
 
 
 @dataclass(frozen=True, eq=False)

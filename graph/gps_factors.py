@@ -1,0 +1,212 @@
+"""GPS fixes in offline smoothing: where they say the antenna was, in a frame and at times that have to be found too.
+
+Fixes are in a local east-north-up frame, the run's poses in its own world; between the two lies an unknown pose, and
+between their clocks an unknown constant. Both are variables of the graph. A fix falls between scans: the motion from
+the nearest scan to its time is taken from the path as it is known (:class:`hybridlio.pose_path.PosePath`), as a lever
+that the time shift draws along the velocity. In 50 ms the path is known to millimetres where a fix is known to
+decimetres, so no variable and no noise is added for it; each round takes the levers anew.
+
+Keys: ``e`` pose of the run's world in the fixes' frame, ``t`` time shift in seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import E, G, T, X
+from numpy.typing import NDArray
+
+from hybridlio import se3
+from hybridlio.estimates import Array, State
+from hybridlio.fix_alignment import FixAlignment, align_fixes, fix_stamps
+from hybridlio.gps import GpsFit, GpsOptions
+from hybridlio.graph import noise
+from hybridlio.graph.factor_groups import Doubtful, GroupAnswer, GroupFactors
+from hybridlio.pose_path import PosePath
+from hybridlio.record import Record
+from hybridlio.sensors import NS_PER_S, GpsFix
+
+_UP = np.array([0.0, 0.0, 1.0])
+_PLUMB_SIGMA_RAD = 5e-4  # of the vertical against the ellipsoid's, and over a few kilometres
+_LEVEL_SIGMA_RAD = 0.1  # without IMU: how level the lidar started
+_NOWHERE_RAD, _NOWHERE_M = 10.0, 1e5
+_MEDIAN_CHI2 = 2.366  # of three degrees of freedom
+_SECOND_DIFFERENCE = 6.0  # 1 + 4 + 1: variance of x[-1] - 2 x[0] + x[1]
+_LEAST_FOR_SPREAD = 10
+_LONGEST_PAUSE = 1.5  # times the usual time between fixes
+
+
+class GpsGroup:
+    """A record's fixes as a group of factors.
+
+    Raises:
+        EstimationError: too few fixes in the run's time.
+    """
+
+    name = "gps"
+
+    def __init__(self, record: Record, options: GpsOptions | None = None) -> None:
+        self._options = options or GpsOptions()
+        self.robust = self._options.robust
+        self._fixes = record.gps
+        self._T_imu_lidar = record.calibration.T_imu_lidar
+        antenna = self._options.antenna_m if self._options.antenna_m is not None else record.calibration.antenna_imu_m
+        self._antenna = np.zeros(3) if antenna is None else np.asarray(antenna, dtype=np.float64)
+        self._scale: float | None = None
+        self._rows: NDArray[np.int64] = np.empty(0, np.int64)
+
+    def build(self, states: Sequence[State], before: gtsam.Values | None) -> GroupFactors:
+        """One factor a fix, and what is known of frame and clock beforehand."""
+        path = _path_of(states)
+        if before is None:
+            aligned = self._align(path, states[0])
+            T_enu_world, shift = aligned.T_enu_world, aligned.shift_s
+            self._scale = _noise_scale([self._fixes[k] for k in self._rows], aligned.residuals_m)
+        else:
+            T_enu_world, shift = before.atPose3(E(0)).matrix(), float(before.atVector(T(0))[0])
+        values = gtsam.Values()
+        values.insert(E(0), gtsam.Pose3(T_enu_world))
+        values.insert(T(0), np.array([shift]))
+        sure = [*self._priors(T_enu_world), _plumb_factor(states[0])]
+        return GroupFactors(sure, self._fix_factors(path, shift), values)
+
+    def _align(self, path: PosePath, start: State) -> FixAlignment:
+        stamps = fix_stamps(self._fixes)
+        out = np.zeros(len(stamps), dtype=bool)
+        for first, last in self._options.outages:
+            out |= (stamps >= first) & (stamps <= last)
+        self._rows = np.flatnonzero(~out)
+        up, sigma = _up_of(start)
+        aligned = align_fixes(
+            path, [self._fixes[k] for k in self._rows], self._antenna, up, sigma, self._options.max_shift_s
+        )
+        self._rows = self._rows[aligned.used]
+        kept = aligned.used
+        return FixAlignment(
+            aligned.T_enu_world, aligned.shift_s, aligned.covariance, aligned.residuals_m[kept], kept[kept],
+            aligned.inliers[kept],
+        )  # fmt: skip
+
+    def _priors(self, T_enu_world: Array) -> list[gtsam.NonlinearFactor]:
+        """The frame may be anywhere; the shift is within what was searched."""
+        anywhere = noise.sigmas(np.r_[np.full(3, _NOWHERE_RAD), np.full(3, _NOWHERE_M)])
+        shift = noise.sigmas(np.array([max(self._options.max_shift_s, 1e-6)]))
+        return [
+            gtsam.PriorFactorPose3(E(0), gtsam.Pose3(T_enu_world), anywhere),
+            gtsam.PriorFactorVector(T(0), np.zeros(1), shift),
+        ]
+
+    def _fix_factors(self, path: PosePath, shift_s: float) -> list[Doubtful]:
+        fixes = [self._fixes[k] for k in self._rows]
+        stamps = fix_stamps(fixes, shift_s)
+        near = path.nearest(stamps)
+        points, velocities = path.points(stamps, self._antenna)
+        T_scan_world = se3.inverse(path.poses[near])
+        levers = (T_scan_world @ np.column_stack([points, np.ones(len(points))])[..., None])[:, :3, 0]
+        drawn = (T_scan_world[:, :3, :3] @ velocities[..., None])[..., 0]
+        return [
+            Doubtful(
+                _maker(int(k), fix.position_m, lever, velocity, shift_s),
+                (self._scale or 1.0) ** 2 * fix.covariance_m2,
+                f"GPS fix at {fix.stamp_ns} ns",
+            )
+            for k, fix, lever, velocity in zip(near, fixes, levers, drawn, strict=True)
+        ]
+
+    def read(self, answer: GroupAnswer) -> GpsFit:
+        """Frame, clock, and how each fix fits."""
+        T_enu_imu = answer.values.atPose3(E(0)).matrix()
+        shift = float(answer.values.atVector(T(0))[0])
+        joint = answer.covariance([E(0), T(0)])
+        count = len(self._fixes)
+        residuals, weights, used = np.full((count, 3), np.nan), np.zeros(count), np.zeros(count, bool)
+        used[self._rows] = True
+        weights[self._rows] = answer.weights
+        points, _ = _path_of(answer.states).points(
+            fix_stamps([self._fixes[k] for k in self._rows], shift), self._antenna
+        )
+        positions = np.array([self._fixes[k].position_m for k in self._rows])
+        residuals[self._rows] = se3.transform(T_enu_imu, points) - positions
+        T_imu_lidar = self._T_imu_lidar
+        covariance = se3.rotate_covariance(joint[:6, :6], se3.inverse(T_imu_lidar))
+        return GpsFit(
+            T_enu_imu @ T_imu_lidar, covariance, shift, float(np.sqrt(joint[6, 6])), residuals, used, weights,
+            self._scale or 1.0,
+        )  # fmt: skip
+
+
+def _path_of(states: Sequence[State]) -> PosePath:
+    stamps = np.array([state.stamp_ns for state in states])
+    poses = np.array([state.T_world_imu for state in states])
+    velocities = np.array([state.velocity_m_s for state in states]) if states[0].has_imu else None
+    return PosePath(stamps, poses, velocities)
+
+
+def _up_of(state: State) -> tuple[Array, float]:
+    """The direction up in the run's world, and how far it may be off."""
+    if not state.has_imu:
+        return _UP, _LEVEL_SIGMA_RAD
+    spread = float(np.sqrt(np.trace(state.gravity_covariance) / 3)) / float(np.linalg.norm(state.gravity_m_s2))
+    return -state.gravity_m_s2, float(np.hypot(spread, _PLUMB_SIGMA_RAD))
+
+
+def _maker(
+    k: int, position: Array, lever: Array, velocity: Array, shift_s: float
+) -> Callable[[gtsam.noiseModel.Base], gtsam.NonlinearFactor]:
+    """The factor of one fix, nearest scan ``k``: ``T_enu_world · T_world_imu · (lever + velocity · (t - shift))``."""
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        T_enu_world, T_world_imu = values.atPose3(E(0)), values.atPose3(X(k))
+        arm = lever + velocity * (float(values.atVector(T(0))[0]) - shift_s)
+        if jacobians is None:
+            return np.asarray(T_enu_world.transformFrom(T_world_imu.transformFrom(arm)) - position)
+        by_world, by_point = np.zeros((3, 6), order="F"), np.zeros((3, 3), order="F")
+        by_pose, by_arm = np.zeros((3, 6), order="F"), np.zeros((3, 3), order="F")
+        point = T_world_imu.transformFrom(arm, by_pose, by_arm)
+        placed = T_enu_world.transformFrom(point, by_world, by_point)
+        jacobians[0] = by_world
+        jacobians[1] = by_point @ by_pose
+        jacobians[2] = (by_point @ by_arm @ velocity)[:, None]
+        return np.asarray(placed - position)
+
+    return lambda model: gtsam.CustomFactor(model, [E(0), X(k), T(0)], error)
+
+
+def _plumb_factor(start: State) -> gtsam.NonlinearFactor:
+    """The fixes' up is opposite to gravity; without IMU, the lidar started about level."""
+    if not start.has_imu:
+        model = noise.sigmas(np.full(2, _LEVEL_SIGMA_RAD))
+        return gtsam.AttitudeFactorPose3(E(0), gtsam.Unit3(_UP), model, gtsam.Unit3(_UP))
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        R = values.atPose3(E(0)).rotation().matrix()
+        gravity = values.atVector(G(0))
+        length = float(np.linalg.norm(gravity))
+        down = gravity / length
+        if jacobians is not None:
+            jacobians[0] = np.hstack([-R @ se3.hat(down), np.zeros((3, 3))])[:2]
+            jacobians[1] = (R @ (np.eye(3) - np.outer(down, down)) / length)[:2]
+        return np.asarray((R @ down)[:2])
+
+    return gtsam.CustomFactor(noise.sigmas(np.full(2, _PLUMB_SIGMA_RAD)), [E(0), G(0)], error)
+
+
+def _noise_scale(fixes: Sequence[GpsFix], residuals: Array) -> float:
+    """How many times their claimed standard deviations the fixes scatter, at least 1.
+
+    Told by second differences of consecutive residuals, which the path's drift leaves alone; by their median, which
+    wrong fixes leave alone. An error common to neighbouring fixes does not show.
+    """
+    stamps = fix_stamps(fixes) / NS_PER_S
+    steps = np.diff(stamps)
+    if len(steps) < _LEAST_FOR_SPREAD:
+        return 1.0
+    regular = (np.maximum(steps[1:], steps[:-1]) < _LONGEST_PAUSE * np.median(steps)).nonzero()[0]
+    if len(regular) < _LEAST_FOR_SPREAD:
+        return 1.0
+    second = residuals[regular] - 2 * residuals[regular + 1] + residuals[regular + 2]
+    covariances = np.array([fixes[k + 1].covariance_m2 for k in regular]) * _SECOND_DIFFERENCE
+    chi2 = np.einsum("ni,nij,nj->n", second, np.linalg.inv(covariances), second)
+    return float(np.sqrt(max(np.median(chi2) / _MEDIAN_CHI2, 1.0)))

@@ -1,0 +1,74 @@
+"""How GPS fixes are used in smoothing, and what comes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridlio.fix_alignment import MAX_SHIFT_S
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class GpsOptions:
+    """How fixes are used.
+
+    Attributes:
+        antenna_m: ``(3,)`` the antenna in the IMU's frame; None takes the calibration's, or the IMU's own place.
+        max_shift_s: the clocks are no farther apart (also the shift's prior); 0 takes the stamps as they are.
+        outages: times ``(start_ns, end_ns)`` whose fixes are left out.
+        robust: how to treat those that may be wrong.
+    """
+
+    antenna_m: Array | None = None
+    max_shift_s: float = MAX_SHIFT_S
+    outages: Sequence[tuple[int, int]] = ()
+    robust: str | None = "cauchy"
+
+
+@dataclass(frozen=True, eq=False)
+class GpsFit:
+    """What smoothing found of the fixes.
+
+    Attributes:
+        T_enu_world: ``(4, 4)``; maps the first scan's lidar frame into the fixes'.
+        T_enu_world_covariance: ``(6, 6)`` of a right perturbation.
+        shift_s, shift_sigma_s: a fix stamped ``t`` shows the antenna at ``t + shift_s``, and how sure that is.
+        residuals_m: ``(M, 3)`` the antenna as smoothed less the fix; NaN where the run does not reach.
+        used: ``(M,)`` whether the run reaches, and the fix is in no outage.
+        weights: ``(M,)`` what counts of each, 0 to 1; 0 of those not used.
+        noise_scale: the fixes' standard deviations were taken so many times as large as they claim, as they scatter.
+    """
+
+    T_enu_world: Array
+    T_enu_world_covariance: Array
+    shift_s: float
+    shift_sigma_s: float
+    residuals_m: Array
+    used: NDArray[np.bool_]
+    weights: Array
+    noise_scale: float
+
+    @property
+    def rejected(self) -> NDArray[np.bool_]:
+        """``(M,)`` used fixes that count for less than a tenth."""
+        return self.used & (self.weights < 0.1)
+
+    @property
+    def rmse_m(self) -> float:
+        """Root mean square distance from the fixes that are not rejected."""
+        kept = self.residuals_m[self.used & ~self.rejected]
+        return float(np.sqrt((kept**2).sum(axis=1).mean())) if len(kept) else float("nan")
+
+    def summary(self) -> str:
+        """One line."""
+        shift = f"clocks {1e3 * self.shift_s:.0f} ± {1e3 * self.shift_sigma_s:.0f} ms apart"
+        scale = f", fixes taken {self.noise_scale:.1f} times less sure than they claim" if self.noise_scale > 1 else ""
+        return (
+            f"GPS: {int(self.used.sum())} of {len(self.used)} fixes used, {int(self.rejected.sum())} rejected, "
+            f"{self.rmse_m:.2f} m RMSE, {shift}{scale}"
+        )
