@@ -10,12 +10,13 @@ from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hybridlio.errors import DataError
 from hybridlio.estimates import KeyframePose, RelativePose, State
 from hybridlio.files import writing_whole
 from hybridlio.keyframes import Keyframes
+from hybridlio.geodesy import GeodeticPoint
 from hybridlio.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.trajectory import Trajectory
 
@@ -52,6 +53,40 @@ class Record:
     calibration: Calibration
     imu_noise: ImuNoise
     keyframes: Keyframes | None = None
+
+    @classmethod
+    def from_odometry(
+        cls,
+        trajectory: Trajectory,
+        imu: ImuSamples | None = None,
+        gps: tuple[GpsFix, ...] = (),
+        calibration: Calibration | None = None,
+        imu_noise: ImuNoise | None = None,
+        covariances: ArrayLike | None = None,
+    ) -> Record:
+        """A record of an odometry that is not ours, to be smoothed with what else was recorded.
+
+        Args:
+            trajectory: ``N`` lidar poses, two or more, in any frame.
+            imu: samples on the same clock.
+            gps: fixes; their clock may differ by a constant.
+            calibration: where the sensors sit; by default the IMU at the lidar.
+            imu_noise: what the IMU is worth.
+            covariances: ``(N-1, 6, 6)`` of the steps between consecutive poses, or ``(6, 6)`` of each, rad² and m²,
+                rotation first, errors of different steps independent. By default they are found from how the poses
+                agree with the IMU (:func:`hybridlio.odometry_noise.odometry_noise`).
+
+        Raises:
+            DataError: fewer than two poses, or covariances that do not fit or are none.
+        """
+        from hybridlio.foreign_odometry import record_from_odometry
+
+        return record_from_odometry(trajectory, imu, gps, calibration, imu_noise, covariances)
+
+    @property
+    def origin(self) -> GeodeticPoint | None:
+        """Where on Earth the fixes' frame has its origin; None without fixes, or where it is not known."""
+        return self.gps[0].origin if self.gps else None
 
     @property
     def edges(self) -> list[tuple[int, int, RelativePose]]:
@@ -161,6 +196,10 @@ def _to_arrays(record: Record) -> dict[str, Any]:
     }
     if record.calibration.T_camera_lidar is not None:
         arrays["T_camera_lidar"] = record.calibration.T_camera_lidar
+    if record.calibration.antenna_imu_m is not None:
+        arrays["antenna_imu_m"] = record.calibration.antenna_imu_m
+    if record.origin is not None:
+        arrays["gps_origin"] = np.array(record.origin)
     arrays |= {f"start_{f.name}": getattr(record.start, f.name) for f in fields(State)}
     steps = _relative_arrays("initial", record.initial) | _relative_arrays("relative", record.relative)
     return arrays | steps | _keyframe_arrays(record.relative)
@@ -171,14 +210,15 @@ def _from_arrays(arrays: Mapping[str, Any]) -> Record:
         raise ValueError(f"format version {int(arrays['version'])}, this release reads {FORMAT_VERSION} and older")
     start = {f.name: arrays[f"start_{f.name}"] for f in fields(State)}
     start |= {"stamp_ns": int(start["stamp_ns"]), "has_imu": bool(start["has_imu"])}
+    origin = GeodeticPoint(*arrays["gps_origin"].tolist()) if "gps_origin" in arrays else None
     gps = zip(arrays["gps_stamps_ns"], arrays["gps_positions_m"], arrays["gps_covariances_m2"], strict=True)
     return Record(
         online=Trajectory(arrays["stamps_ns"], arrays["online_poses"], arrays["online_covariances"]),
         initial=_relatives("initial", arrays),
         relative=_with_keyframes(_relatives("relative", arrays), arrays),
         imu=ImuSamples(arrays["imu_stamps_ns"], arrays["gyro_rad_s"], arrays["accel_m_s2"]),
-        gps=tuple(GpsFix(int(stamp), position, covariance) for stamp, position, covariance in gps),
+        gps=tuple(GpsFix(int(stamp), position, covariance, origin) for stamp, position, covariance in gps),
         start=State(**start),
-        calibration=Calibration(arrays["T_imu_lidar"], arrays.get("T_camera_lidar")),
+        calibration=Calibration(arrays["T_imu_lidar"], arrays.get("T_camera_lidar"), arrays.get("antenna_imu_m")),
         imu_noise=ImuNoise(*map(float, arrays["imu_noise"])),
     )

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from hybridlio import se3
 from hybridlio.errors import DataError
+from hybridlio.geodesy import GeodeticPoint
 
 NS_PER_S = 1_000_000_000
 LONGEST_INTERPOLATION_NS = 250_000_000  # inertial samples farther apart say nothing of what lies between them
@@ -150,13 +151,15 @@ class GpsFix:
 
     Attributes:
         stamp_ns: time of the fix.
-        position_m: ``(3,)`` in a local east-north-up frame.
+        position_m: ``(3,)`` in a local east-north-up frame, the same for all fixes of a recording.
         covariance_m2: ``(3, 3)``.
+        origin: where on Earth that frame has its origin; None where it is not known.
     """
 
     stamp_ns: int
     position_m: NDArray[np.float64]
     covariance_m2: NDArray[np.float64]
+    origin: GeodeticPoint | None = None
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from hybridlio.errors import DataError
+from hybridlio.geodesy import GeodeticPoint, enu_from_geodetic, origin_of
 from hybridlio.sensors import LIDAR_MODELS, GpsFix, ImuNoise, LidarModel
 
-GPS_COLUMNS = ("stamp_ns", "east", "north", "up", "sigma")
+_LOCAL, _GEODETIC = ("east", "north", "up"), ("latitude", "longitude", "height")
 _LEAST_SIGMA_M = 1e-3  # an exact fix still needs a covariance that can be inverted
 
 
@@ -26,7 +27,11 @@ class Simulation:
 
 
 def read_gps_csv(path: Path) -> tuple[GpsFix, ...]:
-    """Fixes of a CSV file with the columns ``stamp_ns,east,north,up,sigma`` (metres); none where there is no file.
+    """Fixes of a CSV file, in order of time; none where there is no file.
+
+    The columns are ``stamp_ns``, ``sigma`` (metres) and where the antenna was: ``east``, ``north``, ``up`` in metres in a
+    frame of the file's own, or ``latitude``, ``longitude``, ``height`` in degrees and metres (WGS 84), whose frame is
+    that at the first row. With both, the frame is the file's own, and where it lies on Earth is known.
 
     Raises:
         DataError: a column is missing or a row is malformed; names file and line.
@@ -35,21 +40,41 @@ def read_gps_csv(path: Path) -> tuple[GpsFix, ...]:
         return ()
     with path.open(newline="", encoding="utf-8") as file:
         rows = csv.DictReader(file)
-        missing = set(GPS_COLUMNS) - set(rows.fieldnames or ())
-        if missing:
-            raise DataError(f"{path}: the header lacks {', '.join(sorted(missing))}; expected {','.join(GPS_COLUMNS)}")
-        return tuple(sorted((_fix(path, rows.line_num, row) for row in rows), key=lambda fix: fix.stamp_ns))
+        given = set(rows.fieldnames or ())
+        local, geodetic = given >= set(_LOCAL), given >= set(_GEODETIC)
+        if not given >= {"stamp_ns", "sigma"} or not (local or geodetic):
+            missing = {"stamp_ns", "sigma", *_LOCAL} - given
+            raise DataError(
+                f"{path}: the header lacks {', '.join(sorted(missing))}; expected stamp_ns, sigma and "
+                f"{','.join(_LOCAL)} or {','.join(_GEODETIC)}"
+            )
+        names = ("stamp_ns", "sigma") + (_LOCAL if local else ()) + (_GEODETIC if geodetic else ())
+        read = [_numbers(path, rows.line_num, row, names) for row in rows]
+    if not read:
+        return ()
+    first = GeodeticPoint(*read[0][-3:]) if geodetic else None
+    origin = origin_of(read[0][2:5], first) if first is not None and local else first
+    return tuple(sorted((_fix(numbers, local, origin) for numbers in read), key=lambda fix: fix.stamp_ns))
 
 
-def _fix(path: Path, line: int, row: dict[str, str]) -> GpsFix:
+def _numbers(path: Path, line: int, row: dict[str, str], names: tuple[str, ...]) -> list[float]:
+    """The row's numbers, the stamp first and exact."""
     try:
-        stamp, position = int(row["stamp_ns"]), np.array([row["east"], row["north"], row["up"]], dtype=np.float64)
-        sigma = float(row["sigma"])
+        numbers = [int(row["stamp_ns"]), *(float(row[name]) for name in names[1:])]
     except (ValueError, TypeError):
-        raise DataError(f"{path}, line {line}: expected numbers in {','.join(GPS_COLUMNS)}") from None
-    if not np.isfinite(position).all() or not 0 <= sigma < np.inf:
+        raise DataError(f"{path}, line {line}: expected numbers in {','.join(names)}") from None
+    if not np.isfinite(numbers[1:]).all() or numbers[1] < 0:
         raise DataError(f"{path}, line {line}: position must be finite and sigma not negative")
-    return GpsFix(stamp, position, max(sigma, _LEAST_SIGMA_M) ** 2 * np.eye(3))
+    return numbers
+
+
+def _fix(numbers: list[float], local: bool, origin: GeodeticPoint | None) -> GpsFix:
+    stamp, sigma = int(numbers[0]), max(numbers[1], _LEAST_SIGMA_M)
+    if local or origin is None:
+        position = np.array(numbers[2:5])
+    else:
+        position = enu_from_geodetic([numbers[2:5]], origin)[0]
+    return GpsFix(stamp, position, sigma**2 * np.eye(3), origin)
 
 
 def read_simulation(path: Path) -> Simulation | None:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from hybridlio import se3
 from hybridlio.files import write_whole
+from hybridlio.geodesy import GeodeticPoint
 from hybridlio.sensors import Scan
 from hybridlio.simulation.path import Motion
 from hybridlio.simulation.rig import T_CAMERA_LIDAR, T_LIDAR_IMU
@@ -22,7 +23,7 @@ Array = NDArray[np.float64]
 DATE = "2026_01_01"
 START_NS = int(datetime.datetime(2026, 1, 1, 12, tzinfo=datetime.UTC).timestamp()) * 1_000_000_000
 _EARTH_RADIUS_M = 6378137.0
-_LATITUDE_DEG, _LONGITUDE_DEG = 49.0, 8.4
+FIRST_PLACE = GeodeticPoint(49.0, 8.4, 110.0)  # of the first row
 
 
 @dataclass(frozen=True)
@@ -82,16 +83,16 @@ def oxts_rows(motion: Motion, origin_m: Array, gyro_rad_s: Array, accel_m_s2: Ar
     R = motion.poses[:, :3, :3]
     yaw, pitch, roll = Rotation.from_matrix(R).as_euler("ZYX").T
     east, north, up = (motion.poses[:, :3, 3] - origin_m).T
-    scale = _EARTH_RADIUS_M * np.cos(np.radians(_LATITUDE_DEG))
-    mercator = np.log(np.tan(np.pi / 4 + np.radians(_LATITUDE_DEG) / 2)) + north / scale
+    scale = _EARTH_RADIUS_M * np.cos(np.radians(FIRST_PLACE.latitude_deg))
+    mercator = np.log(np.tan(np.pi / 4 + np.radians(FIRST_PLACE.latitude_deg) / 2)) + north / scale
     latitude = np.degrees(2 * np.arctan(np.exp(mercator)) - np.pi / 2)
-    longitude = _LONGITUDE_DEG + np.degrees(east / scale)
+    longitude = FIRST_PLACE.longitude_deg + np.degrees(east / scale)
     level = Rotation.from_euler("ZYX", np.column_stack([0 * yaw, pitch, roll])).as_matrix()
     heading = Rotation.from_euler("Z", yaw[:, None]).as_matrix()
     local = np.einsum("nji,nj->ni", heading, motion.velocity_m_s)
     level_accel, level_gyro = (np.einsum("nij,nj->ni", level, v) for v in (accel_m_s2, gyro_rad_s))
     velocity = motion.velocity_m_s
-    columns = [latitude, longitude, 110.0 + up, roll, pitch, yaw, velocity[:, 1], velocity[:, 0]]
+    columns = [latitude, longitude, FIRST_PLACE.height_m + up, roll, pitch, yaw, velocity[:, 1], velocity[:, 0]]
     status = np.tile([0.02, 0.01, 4, 10, 5, 5, 6], (len(yaw), 1))
     return np.column_stack([*columns, local, accel_m_s2, level_accel, gyro_rad_s, level_gyro, status])
 

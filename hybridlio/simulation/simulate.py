@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 
 from hybridlio.errors import DataError
 from hybridlio.files import write_whole
+from hybridlio.geodesy import origin_of
 from hybridlio.sensors import NS_PER_S, Scan
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.gps import gps_csv, gps_fixes
 from hybridlio.simulation.imu import add_noise, ideal_imu
 from hybridlio.simulation.kitti_writer import (
+    FIRST_PLACE,
     START_NS,
     DriveFolders,
     oxts_rows,
@@ -128,7 +130,8 @@ def _write_measurements(folders: DriveFolders, drive: Drive, config: SimulationC
     if config.gps:
         fix_times = np.arange(0.0, drive.scan_times_s[-1] + 1e-9, 1.0 / config.gps_rate_hz)
         noise = np.random.default_rng([config.seed, 8])
-        fixes = gps_fixes(drive.path, fix_times, START_NS, config.gps_sigma_m, noise)
+        place = origin_of(origin, FIRST_PLACE)
+        fixes = gps_fixes(drive.path, fix_times, START_NS, config.gps_sigma_m, noise, place)
         write_whole(folders.sync / "gps.csv", gps_csv(fixes))
 
 
