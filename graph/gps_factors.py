@@ -63,7 +63,7 @@ class GpsGroup:
         if before is None:
             aligned = self._align(path, states[0])
             T_enu_world, shift = aligned.T_enu_world, aligned.shift_s
-            self._scale = _noise_scale([self._fixes[k] for k in self._rows], aligned.residuals_m)
+            self._scale = _noise_scale([self._fixes[k] for k in self._rows], aligned.residuals_m, aligned.inliers)
         else:
             T_enu_world, shift = before.atPose3(E(0)).matrix(), float(before.atVector(T(0))[0])
         values = gtsam.Values()
@@ -193,20 +193,22 @@ def _plumb_factor(start: State) -> gtsam.NonlinearFactor:
     return gtsam.CustomFactor(noise.sigmas(np.full(2, _PLUMB_SIGMA_RAD)), [E(0), G(0)], error)
 
 
-def _noise_scale(fixes: Sequence[GpsFix], residuals: Array) -> float:
+def _noise_scale(fixes: Sequence[GpsFix], residuals: Array, inliers: NDArray[np.bool_]) -> float:
     """How many times their claimed standard deviations the fixes scatter, at least 1.
 
-    Told by second differences of consecutive residuals, which the path's drift leaves alone; by their median, which
-    wrong fixes leave alone. An error common to neighbouring fixes does not show.
+    Told by second differences of consecutive residuals, which the path's drift leaves alone; by their median, and
+    without the fixes that are far off the path, so that wrong ones do not decide. An error common to neighbouring fixes
+    does not show.
     """
     stamps = fix_stamps(fixes) / NS_PER_S
     steps = np.diff(stamps)
     if len(steps) < _LEAST_FOR_SPREAD:
         return 1.0
-    regular = (np.maximum(steps[1:], steps[:-1]) < _LONGEST_PAUSE * np.median(steps)).nonzero()[0]
+    beside = np.maximum(steps[1:], steps[:-1]) < _LONGEST_PAUSE * np.median(steps)
+    regular = np.flatnonzero(beside & inliers[2:] & inliers[1:-1] & inliers[:-2])
     if len(regular) < _LEAST_FOR_SPREAD:
         return 1.0
     second = residuals[regular] - 2 * residuals[regular + 1] + residuals[regular + 2]
-    covariances = np.array([fixes[k + 1].covariance_m2 for k in regular]) * _SECOND_DIFFERENCE
+    covariances = np.array([fixes[k + 1].covariance_m2 for k in regular.tolist()]) * _SECOND_DIFFERENCE
     chi2 = np.einsum("ni,nij,nj->n", second, np.linalg.inv(covariances), second)
     return float(np.sqrt(max(np.median(chi2) / _MEDIAN_CHI2, 1.0)))

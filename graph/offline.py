@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 Progress = Callable[[str, int, int], None]
 
 _MAX_ITERATIONS = 50
-_ITERATIONS_A_STEP = 2  # while wrong measurements are looked for
+_ITERATIONS_A_STEP = 4  # while wrong measurements are looked for
 _ROUNDS = 2  # samples are summed up again with the biases that the first round found
 
 

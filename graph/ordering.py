@@ -14,7 +14,7 @@ def chain_order(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsa
     order (COLAMD, METIS): it then costs ten times what the same graph costs without it, and twice in this order.
     Where nothing is shared, or where loops close, the search does well.
     """
-    keys = [(gtsam.Symbol(key).index(), chr(gtsam.Symbol(key).chr()), key) for key in values.keys()]
+    keys = [(gtsam.Symbol(key).index(), chr(gtsam.Symbol(key).chr()), key) for key in list(values.keys())]
     shared = [key for _, kind, key in keys if kind not in _SCANS]
     if not shared or not _is_chain(graph, set(shared)):
         return None
@@ -28,7 +28,7 @@ def chain_order(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsa
 
 def _is_chain(graph: gtsam.NonlinearFactorGraph, shared: set[int]) -> bool:
     for k in range(graph.size()):
-        places = [gtsam.Symbol(key).index() for key in graph.at(k).keys() if key not in shared]
+        places = [gtsam.Symbol(key).index() for key in list(graph.at(k).keys()) if key not in shared]
         if places and max(places) - min(places) > 1:
             return False
     return True

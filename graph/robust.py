@@ -18,6 +18,7 @@ from hybridlio.graph.measurements import KERNELS, Robust, default_width
 
 TREATMENTS = (*KERNELS, "gnc")
 _STEPS = 100
+_SETTLED = 0.99  # of the error before
 
 Solve = Callable[[gtsam.NonlinearFactorGraph, gtsam.Values], gtsam.Values]
 
@@ -144,13 +145,24 @@ def reject(
         graph = gtsam.NonlinearFactorGraph(sure)
         for factor in robust_factors(doubtful, "gnc", weights):
             graph.add(factor)
-        values = solve(graph, values)
+        values = _settle(graph, values, solve)
         shares = chi2_of(doubtful, values) / bounds
         control = control * GRADUATION if step else 1 / max(2 * float(shares.max()) - 1, 1.0)
         weights = truncated_weights(shares, 1.0, control)
         if ((weights == 0) | (weights == 1)).all():
             break
     return values, np.round(weights)
+
+
+def _settle(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, solve: Solve) -> gtsam.Values:
+    """Solve until the error has stopped falling: residuals far from the answer would say nothing of what is wrong."""
+    error = float(graph.error(values))
+    for _ in range(_STEPS):
+        values, before = solve(graph, values), error
+        error = float(graph.error(values))
+        if error > _SETTLED * before:
+            break
+    return values
 
 
 def _kernel(measurement: Doubtful, kernel: str) -> Robust:

@@ -13,6 +13,7 @@ from hybridlio.commands.common import start_quietly
 from hybridlio.commands.compare import compare
 from hybridlio.commands.config import config
 from hybridlio.commands.evaluate import evaluate
+from hybridlio.commands.georeference import georeference
 from hybridlio.commands.odometry import odometry
 from hybridlio.commands.simulate import simulate
 from hybridlio.commands.smooth import smooth
@@ -48,5 +49,5 @@ def main(
     """Lidar-inertial odometry: from a drive to a trajectory with covariances, a pose graph and a report."""
 
 
-for _command in (simulate, odometry, smooth, batch, compare, evaluate, train, ablate, config, view):
+for _command in (simulate, odometry, smooth, georeference, batch, compare, evaluate, train, ablate, config, view):
     app.command()(_command)

@@ -1,4 +1,4 @@
-"""A trajectory on the map: placed on GPS fixes as a whole, or as smoothing placed it, and written for other programs."""
+"""A trajectory on the map: placed on GPS fixes as a whole, and written for other programs."""
 
 from __future__ import annotations
 

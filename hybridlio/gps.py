@@ -69,6 +69,6 @@ class GpsFit:
         shift = f"clocks {1e3 * self.shift_s:.0f} ± {1e3 * self.shift_sigma_s:.0f} ms apart"
         scale = f", fixes taken {self.noise_scale:.1f} times less sure than they claim" if self.noise_scale > 1 else ""
         return (
-            f"GPS: {int(self.used.sum())} of {len(self.used)} fixes used, {int(self.rejected.sum())} rejected, "
+            f"{int(self.used.sum())} of {len(self.used)} fixes used, {int(self.rejected.sum())} rejected, "
             f"{self.rmse_m:.2f} m RMSE, {shift}{scale}"
         )

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from hybridlio.errors import DataError
 from hybridlio.estimates import KeyframePose, RelativePose, State
 from hybridlio.files import writing_whole
-from hybridlio.keyframes import Keyframes
 from hybridlio.geodesy import GeodeticPoint
+from hybridlio.keyframes import Keyframes
 from hybridlio.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.trajectory import Trajectory
 

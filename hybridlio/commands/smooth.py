@@ -29,6 +29,9 @@ def smooth(
     loops: Annotated[
         bool, typer.Option("--loops", help="Find where the run comes back to a place, and close the loops.")
     ] = False,
+    gps: Annotated[
+        bool, typer.Option("--gps", help="Use the run's GPS fixes; their frame and their clock are found.")
+    ] = False,
     robust: Annotated[
         str | None,
         typer.Option(
@@ -53,7 +56,7 @@ def smooth(
     record = Record.load(run / RECORD)
     if loops:
         record = replace(record, keyframes=Keyframes.load(run / KEYFRAMES))
-    smoothed = _smooth(record, loops, robust)
+    smoothed = _smooth(record, loops, gps, robust)
     findings = write_smoothed(folder, stored, record, smoothed)
     error = (
         f"error {smoothed.error_before:.4g} before, {smoothed.error_after:.4g} after {smoothed.iterations} iterations"
@@ -61,6 +64,8 @@ def smooth(
     say(f"{stored.metrics['sequence']}: {len(smoothed.trajectory)} poses, {error}")
     if (closed := smoothed.found.get("loops")) is not None:
         say(f"loops: {closed.summary()}")
+    if (fit := smoothed.found.get("gps")) is not None:
+        say(f"GPS: {fit.summary()}")
     if not smoothed.converged:
         complain("warning: the optimiser stopped before the error had stopped falling", "yellow")
     if findings.evaluations:
@@ -69,7 +74,7 @@ def smooth(
     say(f"report  {folder / REPORT}")
 
 
-def _smooth(record: Record, loops: bool, robust: str | None) -> Smoothed:
+def _smooth(record: Record, loops: bool, gps: bool, robust: str | None) -> Smoothed:
     from hybridlio.graph.offline import smooth as optimise
 
     with progress("smoothing", "poses") as tick:
@@ -82,4 +87,4 @@ def _smooth(record: Record, loops: bool, robust: str | None) -> Smoothed:
             else:
                 tick(0, len(record.online), f"{stage}, round {done + 1} of {total}")
 
-        return optimise(record, show, loops=loops, robust=robust)
+        return optimise(record, show, loops=loops, gps=gps, robust=robust)

@@ -29,8 +29,8 @@ class Simulation:
 def read_gps_csv(path: Path) -> tuple[GpsFix, ...]:
     """Fixes of a CSV file, in order of time; none where there is no file.
 
-    The columns are ``stamp_ns``, ``sigma`` (metres) and where the antenna was: ``east``, ``north``, ``up`` in metres in a
-    frame of the file's own, or ``latitude``, ``longitude``, ``height`` in degrees and metres (WGS 84), whose frame is
+    The columns are ``stamp_ns``, ``sigma`` (metres) and where the antenna was: ``east``, ``north``, ``up`` in metres in
+    a frame of the file's own, or ``latitude``, ``longitude``, ``height`` in degrees and metres (WGS 84), whose frame is
     that at the first row. With both, the frame is the file's own, and where it lies on Earth is known.
 
     Raises:
@@ -70,10 +70,8 @@ def _numbers(path: Path, line: int, row: dict[str, str], names: tuple[str, ...])
 
 def _fix(numbers: list[float], local: bool, origin: GeodeticPoint | None) -> GpsFix:
     stamp, sigma = int(numbers[0]), max(numbers[1], _LEAST_SIGMA_M)
-    if local or origin is None:
-        position = np.array(numbers[2:5])
-    else:
-        position = enu_from_geodetic([numbers[2:5]], origin)[0]
+    given = np.array(numbers[2:5])
+    position = given if local or origin is None else enu_from_geodetic([given], origin)[0]
     return GpsFix(stamp, position, sigma**2 * np.eye(3), origin)
 
 

@@ -31,7 +31,7 @@ def gps_fixes(
 
 
 def gps_csv(fixes: tuple[GpsFix, ...]) -> str:
-    """The fixes as CSV: ``stamp_ns,east,north,up,sigma``, and ``latitude,longitude,height`` where the origin is known."""
+    """The fixes as CSV: ``stamp_ns,east,north,up,sigma``; and ``latitude,longitude,height`` with a known origin."""
     known = bool(fixes) and fixes[0].origin is not None
     rows = ["stamp_ns,east,north,up,sigma" + (",latitude,longitude,height" if known else "")]
     for fix in fixes:

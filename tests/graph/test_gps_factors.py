@@ -101,17 +101,25 @@ def test_the_nominal_fixes_all_count_and_fit_as_well_as_they_scatter(smoothed: A
     assert "fixes used, 0 rejected" in fit.summary()
 
 
+WRONG = [4, 11, 12, 20, 29, 37, 43]
+
+
+@pytest.fixture(scope="module")
+def without_wrong(drive: Any) -> Any:
+    record = with_fixes(drive, 1)
+    return smooth(replace(record, gps=tuple(fix for k, fix in enumerate(record.gps) if k not in WRONG)), gps=True)
+
+
 @pytest.mark.parametrize("robust", ["cauchy", "geman-mcclure", "gnc"])
-def test_wrong_fixes_are_rejected_and_counted(drive: Any, smoothed: Any, robust: str):
+def test_wrong_fixes_are_rejected_and_counted(drive: Any, without_wrong: Any, robust: str):
     record = with_fixes(drive, 1)
     rng = np.random.default_rng(2)
-    wrong = rng.choice(np.arange(2, len(record.gps) - 2), 7, replace=False)
     fixes = list(record.gps)
-    for k in wrong:
+    for k in WRONG:
         fixes[k] = replace(fixes[k], position_m=fixes[k].position_m + rng.uniform(8, 40, 3) * rng.choice([-1, 1], 3))
     bent = smooth(replace(record, gps=tuple(fixes)), gps=GpsOptions(robust=robust))
-    assert set(np.flatnonzero(bent.found["gps"].rejected)) == set(wrong)
-    assert rmse_m(bent, drive) < 1.2 * rmse_m(smoothed, drive) + 0.02
+    assert np.flatnonzero(bent.found["gps"].rejected).tolist() == WRONG
+    assert rmse_m(bent, drive) < 1.2 * rmse_m(without_wrong, drive)
 
 
 def test_an_outage_is_bridged_by_odometry_and_imu(drive: Any, smoothed: Any):
@@ -175,7 +183,7 @@ def test_jacobians_agree_with_differences(drive: Any, which: str):
         factor = _plumb_factor(drive.start)
     jacobian, residual = factor.linearize(values).jacobian()
     offset = 0
-    for key in factor.keys():
+    for key in list(factor.keys()):
         size = {"e": 6, "x": 6, "t": 1, "g": 3}[chr(gtsam.Symbol(key).chr())]
         for axis in range(size):
             step = np.zeros(size)

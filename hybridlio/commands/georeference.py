@@ -1,0 +1,74 @@
+"""``hybridlio georeference``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hybridlio.commands.common import Verbose, guarded
+from hybridlio.errors import ConfigError, DataError
+from hybridlio.terminal import complain, say
+
+if TYPE_CHECKING:
+    from hybridlio.geodesy import GeodeticPoint
+
+
+@guarded
+def georeference(
+    run: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RUN", help="A run folder that `hybridlio odometry` or `hybridlio smooth` made.", show_default=False
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Where to write; by default into RUN.")
+    ] = None,
+    origin: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LAT,LON,HEIGHT",
+            help="Where on Earth the fixes' local frame has its origin (degrees, metres), if they do not say.",
+        ),
+    ] = None,
+    max_shift: Annotated[
+        float, typer.Option(metavar="S", min=0.0, help="The clocks of fixes and scans are no farther apart (seconds).")
+    ] = 2.0,
+    _verbose: Verbose = 0,
+) -> None:
+    """Place a run on its GPS fixes as a whole, without bending it, and write it as CSV, GeoJSON and TUM."""
+    from hybridlio.georeference import georeference as place
+    from hybridlio.georeference import write_georeferenced
+    from hybridlio.record import Record
+    from hybridlio.run_folder import RECORD, read_run
+
+    stored = read_run(run)
+    path = next((p for p in (run / RECORD, run.parent / RECORD) if p.is_file()), None)
+    if path is None:
+        raise DataError(f"{run}: neither it nor the folder above has {RECORD}, which holds the fixes")
+    placed = place(Record.load(path), stored.trajectory, max_shift_s=max_shift, origin=_origin(origin))
+    fit = placed.alignment
+    say(
+        f"{stored.metrics['sequence']}: {int(fit.inliers.sum())} of {len(fit.used)} fixes agree, {fit.rmse_m:.2f} m "
+        f"RMSE, clocks {1e3 * fit.shift_s:.0f} ± {1e3 * fit.shift_sigma_s:.0f} ms apart"
+    )
+    for written in write_georeferenced(run if out is None else out, placed):
+        say(f"wrote   {written}")
+    if placed.origin is None:
+        complain("warning: the fixes do not say where on Earth they are; give --origin for latitudes", "yellow")
+
+
+def _origin(text: str | None) -> GeodeticPoint | None:
+    from hybridlio.geodesy import GeodeticPoint as Point
+
+    if text is None:
+        return None
+    try:
+        latitude, longitude, height = (float(part) for part in text.split(","))
+    except ValueError:
+        raise ConfigError(f"origin {text!r}: give latitude, longitude (degrees) and height (metres)") from None
+    if not (abs(latitude) <= 90 and abs(longitude) <= 360):
+        raise ConfigError(f"origin {text!r}: latitude comes first, from -90 to 90 degrees")
+    return Point(latitude, longitude, height)
