@@ -1,6 +1,6 @@
 """How good and how honest residual sources are, step by step: error left, consistency of covariances, failures, time.
 
-    python benchmarks/residuals.py DATA… [--residual network,scan-matching] [--refine-steps 0,3] [--noise-m 0.083]
+    python benchmarks/residuals.py DATA… [--residual network,scan-matching] [--refine-steps 0,2] [--noise-m 0.083]
         [--noise-deg 0.24] [--reference small_gicp] [--weights FILE] [--scale S] [--frames 0:100] [-o FILE.json]
 
 Every source refines the same initial poses: the reference's steps, each shaken by a draw of its own, of the given
@@ -117,7 +117,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", nargs="+", type=Path)
     parser.add_argument("--residual", default="network,network+scan-matching,scan-matching")
-    parser.add_argument("--refine-steps", default="0,3")
+    parser.add_argument("--refine-steps", default="0,2")
     parser.add_argument("--noise-m", type=float, default=0.083)
     parser.add_argument("--noise-deg", type=float, default=0.24)
     parser.add_argument("--reference", choices=["small_gicp"])

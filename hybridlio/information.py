@@ -38,20 +38,28 @@ def scaled_spectrum(information: Array, levers_m: Array | None = None) -> tuple[
     return values, vectors, scale
 
 
-def strong_directions(information: Array, values: Array) -> NDArray[np.bool_]:
+def strong_directions(information: Array, values: Array, normal_noise: float = NORMAL_NOISE) -> NDArray[np.bool_]:
     """Which eigenvalues ``(6,)`` of :func:`scaled_spectrum` stand out of the noise of the normals."""
-    strong: NDArray[np.bool_] = values >= 3 * NORMAL_NOISE * np.trace(information[3:, 3:])
+    strong: NDArray[np.bool_] = values >= 3 * normal_noise * np.trace(information[3:, 3:])
     return strong
 
 
-def degenerate_directions(information: Array, levers_m: Array | None = None) -> Array:
+def degenerate_directions(
+    information: Array, levers_m: Array | None = None, normal_noise: float = NORMAL_NOISE
+) -> Array:
     """``(D, 6)`` unit tangent directions along which the matches say no more than the noise of their normals."""
     values, vectors, scale = scaled_spectrum(information, levers_m)
-    directions = (vectors[:, ~strong_directions(information, values)] * scale[:, None]).T
+    directions = (vectors[:, ~strong_directions(information, values, normal_noise)] * scale[:, None]).T
     return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
 
-def covariance_of(information: Array, sigma_m: float, scale: float, levers_m: Array | None = None) -> Array:
+def covariance_of(
+    information: Array,
+    sigma_m: float,
+    scale: float,
+    levers_m: Array | None = None,
+    normal_noise: float = NORMAL_NOISE,
+) -> Array:
     """``scale·σ²·H⁻¹`` ``(6, 6)``, rad² and m², rotation first; 10 m where the matches say nothing.
 
     Args:
@@ -59,20 +67,27 @@ def covariance_of(information: Array, sigma_m: float, scale: float, levers_m: Ar
         sigma_m: standard deviation of the distances to the planes.
         scale: how much larger it is than independent residuals would make it: points on one surface share its error.
         levers_m: of :func:`lever_arms`.
+        normal_noise: of a point's information, how much its normal's noise pretends.
     """
     values, vectors, to_tangent = scaled_spectrum(information, levers_m)
-    known = values - NORMAL_NOISE * np.trace(information[3:, 3:])
+    known = values - normal_noise * np.trace(information[3:, 3:])
     variance = np.minimum(scale * sigma_m**2 / np.maximum(known, 1e-9), _UNKNOWN_SIGMA_M**2)
     root = vectors * np.sqrt(variance) * to_tangent[:, None]
     return np.asarray(root @ root.T + np.diag(FLOOR_SIGMAS**2))
 
 
-def newton_step(information: Array, gradient: Array, limit_m: float = np.inf, levers_m: Array | None = None) -> Array:
+def newton_step(
+    information: Array,
+    gradient: Array,
+    limit_m: float = np.inf,
+    levers_m: Array | None = None,
+    normal_noise: float = NORMAL_NOISE,
+) -> Array:
     """The step ``(6,)`` to the minimum of the quadratic, at most ``limit_m``, and none along degenerate directions.
 
     (Zhang, Kaess, Singh, "On degeneracy of optimization-based state estimation problems", ICRA 2016.)
     """
     values, vectors, scale = scaled_spectrum(information, levers_m)
-    inverse = np.where(strong_directions(information, values), 1 / np.maximum(values, 1e-12), 0.0)
+    inverse = np.where(strong_directions(information, values, normal_noise), 1 / np.maximum(values, 1e-12), 0.0)
     reduced = -(vectors @ (inverse * (vectors.T @ (scale * gradient))))
     return np.asarray(scale * reduced * min(1.0, limit_m / max(float(np.linalg.norm(reduced)), 1e-12)))

@@ -5,7 +5,7 @@ The loss is the one that trained the network, in a robust form whose Hessian wei
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hybridlio import se3
-from hybridlio.information import covariance_of, degenerate_directions, newton_step
+from hybridlio.information import (
+    covariance_of,
+    degenerate_directions,
+    lever_arms,
+    newton_step,
+    scaled_spectrum,
+    strong_directions,
+)
 from hybridlio.learned.correspondences import Clouds, match
 from hybridlio.learned.losses import gauss_newton, loss
 from hybridlio.learned.settings import LossSettings
@@ -22,7 +29,12 @@ from hybridlio.projection import MapGeometry
 
 Array = NDArray[np.float64]
 
+CHI2_99 = 16.8  # of six degrees of freedom
 _LONGEST_STEP_M = 0.5
+_UNKNOWN_SIGMA_M = 10.0
+_NORMAL_NOISE = 5e-3  # planes of one scan, averaged over voxels, are noisier than those of a map
+# The loss's minimum is off by what its clouds are: averages of rings that lie elsewhere in each scan. Rad, m.
+_SYSTEMATIC = np.diag(np.r_[np.full(3, 3e-4), np.full(3, 1.5e-3)] ** 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,33 +46,57 @@ class Judged:
         cost: mean over all points; one without a match costs as much as one infinitely far away.
         matched: share of the points with a match.
         information: ``(6, 6)`` Gauss-Newton Hessian, a match without residual weighing 1.
+        levers_m: ``(3,)`` of the points, see :func:`hybridlio.information.lever_arms`.
         step: ``(6,)`` right perturbation to the minimum of the loss's quadratic here.
         sigma_m: standard deviation of the distances to the planes.
+        refined: whether the pose is where the loss led.
     """
 
     pose: Array
     cost: float
     matched: float
     information: Array
+    levers_m: Array
     step: Array
     sigma_m: float
+    refined: bool = False
 
     @property
     def degenerate(self) -> Array:
         """``(D, 6)`` unit directions that the points do not constrain."""
-        return degenerate_directions(self.information)
+        return degenerate_directions(self.information, self.levers_m, _NORMAL_NOISE)
 
     def noise(self, scale: float) -> Array:
-        """``(6, 6)`` of what the points leave open: ``scale·σ²·H⁻¹``."""
-        return covariance_of(self.information, self.sigma_m, scale)
+        """``(6, 6)`` of what the points leave open: ``scale·σ²·H⁻¹``, and 10 m along what they do not constrain."""
+        loose = self._loose() * _UNKNOWN_SIGMA_M
+        known = covariance_of(self.information, self.sigma_m, scale, self.levers_m, _NORMAL_NOISE)
+        return known + loose @ loose.T
 
     def covariance(self, scale: float) -> Array:
-        """``(6, 6)`` of the pose: what the points leave open, and how far off the minimum it is.
+        """``(6, 6)`` of the pose: what the points leave open, and how far off the minimum of the loss it is.
 
-        A network's answer is not the minimum of the loss. The way to it is an error that the loss can see; it is added
-        as its outer product.
+        A network's answer is not that minimum. The way to it is an error that the loss can see; it is added as its
+        outer product. Nor is the minimum the truth: where the pose is taken from there, that is added.
         """
-        return self.noise(scale) + np.outer(self.step, self.step)
+        systematic = _SYSTEMATIC if self.refined else np.zeros((6, 6))
+        return self.noise(scale) + np.outer(self.step, self.step) + systematic
+
+    def is_off(self, scale: float) -> bool:
+        """Whether the minimum of the loss is farther away than noise and what is systematic in it explain."""
+        spread = self.noise(scale) + _SYSTEMATIC
+        return bool(self.step @ np.linalg.solve(spread, self.step) > CHI2_99)
+
+    def constrained(self, xi: Array) -> Array:
+        """A tangent vector ``(6,)`` without its parts along what the points do not constrain."""
+        loose = self._loose()
+        inverse = np.r_[self.levers_m, np.ones(3)]
+        weights = (loose * inverse[:, None]).T @ (xi * inverse)
+        return np.asarray(xi - loose @ weights)
+
+    def _loose(self) -> Array:
+        """``(6, D)``: directions that the points do not constrain, each of a metre at the points' lever arms."""
+        values, vectors, scale = scaled_spectrum(self.information, self.levers_m)
+        return np.asarray(vectors[:, ~strong_directions(self.information, values, _NORMAL_NOISE)] * scale[:, None])
 
 
 class LossJudge:
@@ -84,18 +120,21 @@ class LossJudge:
             value, share = float(loss(matches, T, self._loss).total), float(matches.share)
             near = gauss_newton(matches, T, self._loss)
         information, gradient = (x[0].double().cpu().numpy() for x in (near.information, near.gradient))
+        levers_m = lever_arms(current.points[current.there].double().cpu().numpy())
         # the information is the Hessian times k/2, the Geman-McClure kernel's scale
-        step = newton_step(information, gradient * self._kernel_m / 2, _LONGEST_STEP_M)
+        step = newton_step(information, gradient * self._kernel_m / 2, _LONGEST_STEP_M, levers_m, _NORMAL_NOISE)
         cost = share * value + (1 - share) * self._kernel_m
-        return Judged(pose, cost, share, information, step, float(near.sigma_m))
+        return Judged(pose, cost, share, information, levers_m, step, float(near.sigma_m))
 
-    def descend(self, judged: Judged, last: Clouds, current: Clouds, steps: int) -> Judged:
-        """Go down the loss by Gauss-Newton steps, as long as it falls."""
+    def descend(self, judged: Judged, last: Clouds, current: Clouds, steps: int, scale: float) -> Judged:
+        """Go down the loss by Gauss-Newton steps, as long as it falls and its minimum is farther off than noise."""
         for _ in range(steps):
+            if not judged.is_off(scale):
+                break
             tried = self.judge(se3.orthonormalise(judged.pose @ se3.exp(judged.step)), last, current)
             if not tried.cost < judged.cost:
                 break
-            judged = tried
+            judged = replace(tried, refined=True)
         return judged
 
 

@@ -16,7 +16,7 @@ from hybridlio.estimates import RelativePose
 from hybridlio.learned import maps
 from hybridlio.learned.correspondences import Clouds
 from hybridlio.learned.devices import pick_device
-from hybridlio.learned.loss_judge import Judged, LossJudge, on_device
+from hybridlio.learned.loss_judge import CHI2_99, Judged, LossJudge, on_device
 from hybridlio.learned.lstm_initial_pose import inertial
 from hybridlio.learned.odometry_network import NetworkInput, SeenScan
 from hybridlio.learned.pairs import padded
@@ -33,7 +33,6 @@ Array = NDArray[np.float64]
 Prepare = Callable[[Scan], Prepared]
 
 _UNSURE_TRANSLATION_M = 0.5
-_CHI2_99 = 16.8  # of six degrees of freedom
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,8 +159,12 @@ class NetworkResidual:
             features = self._network.imu_features(given)
             start = on_device(before.pose, self._device)
             found = self._network.refine_seen(last.maps, current.maps, start, features).pose[0]
-        pose = se3.orthonormalise(found.double().cpu().numpy())
-        return before, self._judge.descend(self._judge.judge(pose, *clouds), *clouds, self._settings.refine_steps)
+        answer = self._judge.judge(se3.orthonormalise(found.double().cpu().numpy()), *clouds)
+        if len(answer.degenerate):  # where the scans say nothing, the initial pose knows better than the network
+            way = answer.constrained(se3.log(se3.between(before.pose, answer.pose)))
+            answer = self._judge.judge(se3.orthonormalise(before.pose @ se3.exp(way)), *clouds)
+        steps, scale = self._settings.refine_steps, self._settings.covariance_scale
+        return before, self._judge.descend(answer, *clouds, steps, scale)
 
     def _starts(self, initial: RelativePose, dt_s: float) -> list[Array]:
         """The initial pose, or that and others ahead of it where it is unsure of the translation."""
@@ -175,7 +178,7 @@ class NetworkResidual:
             return False
         way = se3.log(se3.between(before.pose, after.pose))
         noise = before.noise(self._settings.covariance_scale)
-        return bool(way @ np.linalg.solve(noise, way) > _CHI2_99)
+        return bool(way @ np.linalg.solve(noise, way) > CHI2_99)
 
     def _answer(self, judged: Judged, from_imu: bool, details: dict[str, float]) -> RelativePose:
         return RelativePose(
@@ -184,7 +187,7 @@ class NetworkResidual:
             source=self.name,
             degenerate=judged.degenerate,
             from_imu=from_imu,
-            details={**details, "sigma_m": judged.sigma_m},
+            details={**details, "sigma_m": judged.sigma_m, "refined": float(judged.refined)},
         )
 
     def _bridge(

@@ -35,7 +35,8 @@ class NetworkResidualSettings:
         min_cells: with fewer cells that have a normal in either map a scan is bridged by the initial pose.
         min_matched: with a smaller share of points matched, too.
         covariance_scale: how much larger the covariance is than independent residuals would make it.
-        refine_steps: Gauss-Newton steps down the loss after the network; 0 leaves its answer.
+        refine_steps: at most so many Gauss-Newton steps down the loss where its minimum is farther from the network's
+            answer than noise explains; 0 always leaves the answer.
         kernel_m, max_distance_m: of the robust loss that weighs the answer.
         start_speeds_m_s: forward speeds tried, by the loss, where the initial pose is unsure of the translation.
     """
@@ -46,8 +47,8 @@ class NetworkResidualSettings:
     device: str = "auto"
     min_cells: int = 500
     min_matched: float = 0.3
-    covariance_scale: float = 6.0
-    refine_steps: int = 0
+    covariance_scale: float = 2.0
+    refine_steps: int = 2
     kernel_m: float = 0.1
     max_distance_m: float = 1.0
     start_speeds_m_s: tuple[float, ...] = (0.0, -5.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0)

@@ -17,6 +17,7 @@ from hybridlio.learned.source_settings import LstmSettings, NetworkResidualSetti
 from hybridlio.learned.weights import save_weights
 from hybridlio.preparation import PreparationOptions, prepare
 from hybridlio.projection import MapGeometry
+from hybridlio.run import run_odometry
 from hybridlio.sensors import Frame, ImuSamples, Scan
 
 STEP = se3.exp([0.0, 0.0, 0.03, 0.3, 0.05, 0.0])
@@ -90,16 +91,57 @@ def test_along_a_corridor_the_covariance_is_loose_and_the_direction_named(weight
     assert abs(se3.log(se3.between(STEP, found.pose))[3]) < 0.1
 
 
-def test_an_answer_that_the_loss_finds_worse_is_not_passed_on(weights, seen, monkeypatch):
-    residual = source(weights(), [seen(np.eye(4), seed=0), seen(STEP, seed=1)])
-    worse = torch.tensor(STEP @ se3.exp(3 * OFF), dtype=torch.float32)[None]
-    answer = type("Answer", (), {"pose": worse})
+def answering(residual, pose, monkeypatch):
+    """The network's answer from now on."""
+    answer = type("Answer", (), {"pose": torch.tensor(pose, dtype=torch.float32)[None]})
     monkeypatch.setattr(residual._network, "refine_seen", lambda *_: answer)
+
+
+def test_an_answer_that_the_loss_finds_worse_is_not_passed_on_and_the_log_says_why(weights, seen, monkeypatch, caplog):
+    residual = source(weights(), [seen(np.eye(4), seed=0), seen(STEP, seed=1)], replace(FEW, refine_steps=0))
+    answering(residual, STEP @ se3.exp(3 * OFF), monkeypatch)
     found = residual.refine(frame(1), initial(OFF))
     assert not found.ok
     assert np.allclose(found.pose, initial(OFF).pose)
     assert np.array_equal(found.covariance, WIDE)
     assert found.details["cost"] > found.details["initial_cost"]
+    assert "frame 1: bridged by the initial pose: network: the loss finds the answer worse" in caplog.text
+
+
+def test_a_bad_answer_is_mended_by_steps_down_the_loss_and_a_good_one_left_alone(weights, seen, monkeypatch):
+    scans = [seen(np.eye(4), seed=0), seen(STEP, seed=1)]
+    for error, mended in ((3 * OFF, True), (np.zeros(6), False)):
+        residual = source(weights(), scans, replace(FEW, refine_steps=8))
+        answering(residual, STEP @ se3.exp(error), monkeypatch)
+        found = residual.refine(frame(1), initial(OFF))
+        assert found.ok
+        assert found.details["refined"] == mended
+        off = se3.log(se3.between(STEP, found.pose))
+        assert np.abs(off[3:]).max() < (0.01 if mended else 1e-6)
+
+
+def test_how_far_off_the_losss_minimum_an_answer_is_counts_as_its_uncertainty(weights, seen, monkeypatch):
+    scans = [seen(np.eye(4), seed=0), seen(STEP, seed=1)]
+    sigmas = []
+    for error in (np.zeros(6), OFF):
+        residual = source(weights(), scans, replace(FEW, refine_steps=0))
+        answering(residual, STEP @ se3.exp(error), monkeypatch)
+        found = residual.refine(frame(1), initial(2 * OFF))
+        off = se3.log(se3.between(found.pose, STEP))
+        assert off @ np.linalg.solve(found.covariance, off) < 16.8
+        sigmas.append(np.sqrt(found.covariance[3, 3]))
+    assert sigmas[1] > 3 * sigmas[0]
+
+
+def test_along_a_corridor_the_initial_pose_is_kept_whatever_the_network_says(weights, seen, monkeypatch):
+    half = (500.0, 3.0, 2.0)
+    residual = source(weights(), [seen(np.eye(4), half, seed=0), seen(STEP, half, seed=1)])
+    answering(residual, se3.exp([0, 0, 0, 0.5, 0, 0]) @ STEP, monkeypatch)  # half a metre along it
+    found = residual.refine(frame(1), initial(OFF))
+    assert found.ok
+    along = found.pose[:3, 3] - initial(OFF).pose[:3, 3]
+    assert abs(along[0]) < 0.02
+    assert abs(found.pose[1, 3] - STEP[1, 3]) < 0.02
 
 
 def test_too_little_to_see_is_bridged_and_the_scan_after_it_too(weights, seen):
@@ -156,6 +198,29 @@ def test_both_run_in_the_odometry_as_objects_of_ones_own(weights, tiny_drive):
     # what the network has not learned, steps down the loss make up for; the drive starts at 10 m/s
     errors = [np.linalg.norm((step.pose - T)[:3, 3]) for step, T in zip(found, true, strict=True)]
     assert max(errors) < 0.1
+
+
+def test_a_pair_on_which_the_network_fails_is_listed_and_weighs_nothing(weights, tiny_drive, monkeypatch, caplog):
+    path = str(weights(geometry=GEOMETRY, projective_steps=3))
+    options = PreparationOptions(geometry=GEOMETRY, loss_points=2000, threads=1)
+    residual = NetworkResidual(lambda _: partial(prepare, options=options), replace(FEW, weights=path, refine_steps=0))
+    refine, count = residual._network.refine_seen, iter(range(99))
+
+    def failing(*given):
+        answer = refine(*given)
+        return type("Answer", (), {"pose": answer.pose + (next(count) == 4) * torch.eye(4)[:, [3, 0, 1, 2]].T})
+
+    monkeypatch.setattr(residual._network, "refine_seen", failing)
+    sequence = hl.open_sequence(tiny_drive).part(0, 12)
+    run = run_odometry(sequence, hl.Odometry(residual=residual))
+    assert run.stopped is None
+    assert run.bridged == [5]
+    assert "frame 5: bridged" in caplog.text
+    relative = run.estimates[5].relative
+    assert (relative.source, relative.ok) == ("preintegration", False)
+    assert relative.details["cost"] > relative.details["initial_cost"]
+    end = se3.between(run.trajectory.poses[-1], sequence.reference.poses[run.done - 1])
+    assert np.linalg.norm(end[:3, 3]) < 0.15
 
 
 def state() -> State:
