@@ -29,7 +29,8 @@ def check_covariance(covariance: Array, name: str, size: int = 6) -> Array:
     covariance = np.asarray(covariance, dtype=np.float64)
     if covariance.shape != (size, size) or not np.isfinite(covariance).all():
         raise DataError(f"{name}: expected a finite ({size}, {size}) covariance, got shape {covariance.shape}")
-    if not np.allclose(covariance, covariance.T, rtol=1e-6, atol=1e-12 * float(np.abs(covariance).max())):
+    uneven, largest = np.abs(covariance - covariance.T), np.abs(covariance)
+    if (uneven > 1e-6 * largest + 1e-12 * largest.max()).any():
         raise DataError(f"{name}: covariance is not symmetric")
     covariance = (covariance + covariance.T) / 2
     try:

@@ -19,6 +19,7 @@ _ROTATION_CONVERGED_RAD = 2e-5
 _TRANSLATION_CONVERGED_M = 3e-4
 _REMATCH_ROTATION_RAD = 2e-4  # a centimetre at 50 m
 _REMATCH_TRANSLATION_M = 5e-3
+_IDENTITY = np.eye(4)
 _REMATCH_STEPS = 8  # points between two equally near neighbours would have the pose go to and fro for ever
 
 
@@ -95,6 +96,7 @@ class _Matches:
     source: Array
     target: Array
     normals: Array
+    levers_m: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,14 +105,13 @@ class _Linearisation:
     gradient: Array
     residuals: Array
     weights: Array
-    levers_m: Array
 
 
 def _match(surface: Surface, source: Array, pose: Array, reach_m: float, threads: int) -> _Matches:
     index, distance2 = surface.nearest(source @ pose[:3, :3].T + pose[:3, 3], threads)
     near = distance2 < reach_m**2
-    index = index[near]
-    return _Matches(pose, source[near], surface.points[index], surface.normals[index])
+    index, source = index[near], source[near]
+    return _Matches(pose, source, surface.points[index], surface.normals[index], lever_arms(source))
 
 
 def _linearise(matches: _Matches, pose: Array, kernel_m: float) -> _Linearisation:
@@ -120,14 +121,15 @@ def _linearise(matches: _Matches, pose: Array, kernel_m: float) -> _Linearisatio
     normals_in_scan = matches.normals @ pose[:3, :3]
     J = np.hstack([np.cross(matches.source, normals_in_scan), normals_in_scan])
     weighted = J * weights[:, None]
-    levers_m = lever_arms(matches.source)
-    return _Linearisation(weighted.T @ J, weighted.T @ residuals, residuals, weights, levers_m)
+    return _Linearisation(weighted.T @ J, weighted.T @ residuals, residuals, weights)
 
 
 def _moved(matches: _Matches, pose: Array) -> bool:
     """Whether the pose is so far from where neighbours were looked for that others may be nearer."""
-    step = se3.log(se3.between(matches.pose, pose))
-    return bool(np.abs(step[:3]).max() > _REMATCH_ROTATION_RAD or np.abs(step[3:]).max() > _REMATCH_TRANSLATION_M)
+    step = se3.between(matches.pose, pose) - _IDENTITY  # of small steps the logarithm, at a tenth of its cost
+    return bool(
+        np.abs(step[:3, :3]).max() > _REMATCH_ROTATION_RAD or np.abs(step[:3, 3]).max() > _REMATCH_TRANSLATION_M
+    )
 
 
 def register(
@@ -154,12 +156,12 @@ def register(
         system = _linearise(matches, pose, kernel)
         step = np.zeros(6)
         if len(system.residuals) >= 6:
-            step = newton_step(system.hessian, system.gradient, levers_m=system.levers_m)
+            step = newton_step(system.hessian, system.gradient, levers_m=matches.levers_m)
         pose = pose @ se3.exp(step)
         small = np.abs(step[:3]).max() < _ROTATION_CONVERGED_RAD and np.abs(step[3:]).max() < _TRANSLATION_CONVERGED_M
         converged = bool(small and kernel == settings.kernel_m)
         kernel = max(settings.kernel_m, kernel / 2)
-    return _summary(system, len(source), settings, se3.orthonormalise(pose), iterations, converged)
+    return _summary(system, matches, len(source), settings, se3.orthonormalise(pose), iterations, converged)
 
 
 def cost_at(surface: Surface, source: Array, pose: Array, kernel_m: float, threads: int) -> float:
@@ -174,11 +176,17 @@ def _cost(residuals: Array, points: int, kernel_m: float) -> float:
 
 
 def _summary(
-    system: _Linearisation, points: int, settings: RegistrationSettings, pose: Array, iterations: int, converged: bool
+    system: _Linearisation,
+    matches: _Matches,
+    points: int,
+    settings: RegistrationSettings,
+    pose: Array,
+    iterations: int,
+    converged: bool,
 ) -> Registration:
     r2 = system.residuals**2
     cost = _cost(system.residuals, points, settings.kernel_m)
     weight = max(float(system.weights.sum()), 1e-12)
     sigma = float(np.sqrt((system.weights * r2).sum() / weight))
     matched = len(r2) / max(points, 1)
-    return Registration(pose, system.hessian, system.levers_m, sigma, matched, cost, iterations, converged)
+    return Registration(pose, system.hessian, matches.levers_m, sigma, matched, cost, iterations, converged)
