@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -119,7 +121,7 @@ def test_gradient_and_hessian_are_those_of_the_weighted_cost(rng: np.random.Gene
     gradient = [(cost(step * e) - cost(-step * e)) / (2 * step) for e in axes]
     np.testing.assert_allclose(system.gradient, gradient, rtol=1e-5, atol=1e-5 * np.abs(gradient).max())
     # Gauss-Newton leaves out the residuals' curvature: put the points on their planes and there is none
-    flat = type(matches)(matches.pose, matches.source, se3.transform(pose, matches.source), matches.normals)
+    flat = replace(matches, target=se3.transform(pose, matches.source))
     exact = _linearise(flat, pose, 0.1)
 
     def flat_cost(xi: np.ndarray) -> float:
