@@ -281,6 +281,7 @@ INTERRUPTED = """
 import os, signal, sys
 from hybridlio.odometry import Odometry
 name = sys.argv.pop(1)
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs, and what they start, ignore it
 step = Odometry.step
 def interrupted(self, frame):
     if frame.index == 8:
