@@ -170,7 +170,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--frames", metavar="A:B")
     parser.add_argument("--initial-pose", default="preintegration", metavar="A,B,…", help="or each")
     parser.add_argument("--residual", default="scan-matching", metavar="A,B,…", help="or each")
-    parser.add_argument("--backend", default="incremental", metavar="A,B,…", help="or each")
+    parser.add_argument("--backend", default="fixed-lag", metavar="A,B,…", help="or each")
     parser.add_argument("--peers", default=",".join(PEERS), metavar="A,B,…", help="'' for none")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=1)

@@ -104,7 +104,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--length-m", type=float, default=300.0)
     parser.add_argument("--initial-pose", default="preintegration", metavar="A,B,…")
     parser.add_argument("--residual", default="scan-matching", metavar="A,B,…")
-    parser.add_argument("--backend", default="incremental", metavar="A,B,…")
+    parser.add_argument("--backend", default="fixed-lag", metavar="A,B,…")
     parser.add_argument("--peers", default=",".join(PEERS), metavar="A,B,…", help="'' for none")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("-o", "--out", type=Path)

@@ -11,6 +11,7 @@ from hybridlio.errors import ConfigError
 from hybridlio.files import write_whole
 from hybridlio.keyframes import KeyframeSettings
 from hybridlio.learned.source_settings import LstmSettings, NetworkResidualSettings
+from hybridlio.recent_scans import RecentScansSettings
 from hybridlio.scan_matching import ScanMatchingSettings
 from hybridlio.sensors import ImuNoise
 
@@ -24,6 +25,8 @@ class Config(BaseModel):
         backend: a name of :data:`hybridlio.sources.BACKENDS`.
         imu_noise: the IMU's noise; without it the recording's own, where it says so, else an industrial MEMS unit's.
         scan_matching: settings of the classical residual source.
+        recent_scans: how many earlier scans each is compared with, by ``network`` and by ``scan-matching`` to the last
+            scan; a local map is made of keyframes already.
         lstm: settings of the learned initial-pose source.
         network: settings of the learned residual source.
         keyframes: which clouds are kept for closing loops.
@@ -33,9 +36,10 @@ class Config(BaseModel):
 
     initial_pose: str = "preintegration"
     residual: str = "scan-matching"
-    backend: str = "incremental"
+    backend: str = "fixed-lag"
     imu_noise: ImuNoise | None = None
     scan_matching: ScanMatchingSettings = Field(default_factory=ScanMatchingSettings)
+    recent_scans: RecentScansSettings = Field(default_factory=RecentScansSettings)
     lstm: LstmSettings = Field(default_factory=LstmSettings)
     network: NetworkResidualSettings = Field(default_factory=NetworkResidualSettings)
     keyframes: KeyframeSettings = Field(default_factory=KeyframeSettings)

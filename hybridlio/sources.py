@@ -6,7 +6,7 @@ Each is made when it is asked for, so that only what is used is imported.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,7 @@ from hybridlio.errors import ConfigError
 if TYPE_CHECKING:  # the command line lists the names, and must start quickly
     from hybridlio.config import Config
     from hybridlio.estimates import Backend, InitialPoseSource, ResidualSource
+    from hybridlio.recent_scans import PairSource
     from hybridlio.sensors import Calibration, ImuNoise
 
 
@@ -60,7 +61,10 @@ def _lstm(setup: Setup) -> InitialPoseSource:
 def _scan_matching(setup: Setup) -> ResidualSource:
     from hybridlio.scan_matching import ScanMatching
 
-    return ScanMatching(setup.config.scan_matching)
+    settings = setup.config.scan_matching
+    if settings.target == "local-map":  # it is made of the keyframes
+        return ScanMatching(settings)
+    return _with_recent_scans(ScanMatching(settings), setup)
 
 
 def _network(setup: Setup) -> ResidualSource:
@@ -68,13 +72,22 @@ def _network(setup: Setup) -> ResidualSource:
     from hybridlio.preparation import prepare
     from hybridlio.recipes import preparation_for
 
-    return NetworkResidual(lambda recipe: partial(prepare, options=preparation_for(recipe)), setup.config.network)
+    source = NetworkResidual(lambda recipe: partial(prepare, options=preparation_for(recipe)), setup.config.network)
+    return _with_recent_scans(source, setup)
+
+
+def _with_recent_scans(source: PairSource, setup: Setup) -> ResidualSource:
+    from hybridlio.recent_scans import WithRecentScans
+
+    return WithRecentScans(source, setup.config.recent_scans) if setup.config.recent_scans.count else source
 
 
 def _network_then_scan_matching(setup: Setup) -> ResidualSource:
+    from hybridlio.recent_scans import RecentScansSettings
     from hybridlio.residual_chain import ResidualChain
 
-    return ResidualChain(_network(setup), _scan_matching(setup))
+    alone = replace(setup, config=setup.config.model_copy(update={"recent_scans": RecentScansSettings()}))
+    return ResidualChain(_network(alone), _scan_matching(setup))
 
 
 def _no_residual(_: Setup) -> ResidualSource:

@@ -116,8 +116,25 @@ class NetworkResidual:
             why = f"the loss finds the answer worse ({after.cost:.4f} m, the initial pose {before.cost:.4f} m)"
             return self._bridge(frame, initial, details, dt_s, why)
         self._step = (after.pose, dt_s)
-        uses_imu = self._network.settings.imu == "feature" and initial.from_imu
-        return self._answer(after, uses_imu, details)
+        return self._answer(after, details)
+
+    @property
+    def seen(self) -> _Seen | None:
+        """The scan last looked at, for :meth:`pair`."""
+        return self._last
+
+    def pair(self, earlier: _Seen, current: _Seen, initial: RelativePose) -> RelativePose:
+        """A scan relative to any earlier one, ``T_j_k``, by the points alone; ``initial``, not ok, where that fails."""
+        if min(earlier.cells, current.cells) < self._settings.min_cells or not len(current.cloud.points[0]):
+            return replace(initial, ok=False)
+        dt_s, settings = (current.stamp_ns - earlier.stamp_ns) / NS_PER_S, self._network.settings
+        none, still = (torch.zeros(shape, device=self._device) for shape in ((1, settings.imu_samples, 6), (1, 3)))
+        dt = torch.tensor([dt_s], device=self._device)
+        given = NetworkInput(earlier.maps.vertices, current.maps.vertices, none, dt, still)
+        before, after = self._estimate(given, initial, dt_s, earlier, current)
+        if after.matched < self._settings.min_matched or self._is_worse(after, before):
+            return replace(initial, ok=False)
+        return self._answer(after, {})
 
     def take_back(self, initial: RelativePose) -> None:
         """Go on at the velocity of the initial pose: the last answer was not believed."""
@@ -180,13 +197,14 @@ class NetworkResidual:
         noise = before.noise(self._settings.covariance_scale)
         return bool(way @ np.linalg.solve(noise, way) > CHI2_99)
 
-    def _answer(self, judged: Judged, from_imu: bool, details: dict[str, float]) -> RelativePose:
+    def _answer(self, judged: Judged, details: dict[str, float]) -> RelativePose:
+        # weighed by the points alone; what a network was told of the IMU, its noise over a step (0.02°, 0.2 mm), is
+        # nothing beside the answer's own, so that it may stand beside the samples
         return RelativePose(
             judged.pose,
             judged.covariance(self._settings.covariance_scale),
             source=self.name,
             degenerate=judged.degenerate,
-            from_imu=from_imu,
             details={**details, "sigma_m": judged.sigma_m, "refined": float(judged.refined)},
         )
 
