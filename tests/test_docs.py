@@ -77,7 +77,7 @@ def test_every_setting_is_explained_and_none_that_does_not_exist():
     explained = {
         name for row in re.findall(r"^\| (`.+?) \|", text, flags=re.MULTILINE) for name in row[1:-1].split("`, `")
     }
-    groups = {"scan_matching", "registration", "local_map", "lstm", "network", "keyframes"}
+    groups = {"scan_matching", "registration", "local_map", "lstm", "network", "keyframes", "recent_scans"}
     settings = {*keys(hl.Config().model_dump()), *(field.name for field in fields(hl.ImuNoise))}
     assert groups <= settings
     assert explained == settings - groups
