@@ -65,9 +65,53 @@ the points of a registration between them, instead of the residual being read of
 Each departure from ``paper``, and what it is worth, is in docs/learned.md.
 """
 
+_ENCODER: Mapping[str, Any] = MappingProxyType(
+    {
+        "encoder": True,
+        "stem": 16,
+        "stem_stride": (4, 4),
+        "stages": (16, 32),
+        "blocks": 1,
+        "normalisation": "group",
+        "features": 32,
+        "distance": "gradient",
+    }
+)
+
+
+def _default_with(name: str, loss: Mapping[str, Any] = MappingProxyType({}), **network: Any) -> Recipe:
+    changed = replace(DEFAULT.network, **network), replace(DEFAULT.loss, **loss)
+    return Recipe(f"default-{name}", *changed, DEFAULT.optimiser)
+
+
+DEPARTURES = (
+    DEFAULT,
+    _default_with("without-velocity", velocity=False),
+    _default_with("without-mean-rate", mean_rate=False),
+    _default_with("euler", rotation="euler"),
+    _default_with("one-step", projective_steps=1),
+    _default_with("two-steps", projective_steps=2),
+    _default_with("three-steps", projective_steps=3),
+    _default_with("kernel-alone", weight_channels=0),
+    _default_with("and-encoder", **_ENCODER),
+    _default_with("encoder-alone", projective_steps=0, **_ENCODER),
+    _default_with("without-ground", {"keep_ground": False}),
+    _default_with("without-target", {"target_weight": 0.0}),
+    _default_with("without-limit", {"max_distance_m": float("inf")}),
+    _default_with("matched-at-each", {"matched_at": "each"}),
+    _default_with("geman-mcclure", {"kernel": "geman-mcclure", "kernel_m": 0.1}),
+    replace(
+        DEFAULT,
+        name="default-unshaken",
+        optimiser=replace(DEFAULT.optimiser, initial_noise_rad=0.0, initial_noise_m=0.0),
+    ),
+    replace(DEFAULT, name="default-halved", optimiser=replace(DEFAULT.optimiser, schedule="step")),
+)
+"""``default``, and what becomes of it without each of its departures from ``paper``, or with one more."""
+
 _ALL = (
     PAPER,
-    DEFAULT,
+    *DEPARTURES,
     _paper_with("imu-feature", imu="feature"),
     _paper_with("no-imu", imu="none"),
     _paper_with("normals-joined", normals="joined"),

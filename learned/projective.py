@@ -27,6 +27,7 @@ _LEVER_M = 10.0  # rotations are measured at this lever, so that the system is w
 _DAMPING = 1e-4  # of the normal equations a point: directions that hardly any cell constrains stay as they are
 _LIMIT_M = 1.0
 _DISTANCE_M = 0.1  # what is left after an initial pose, so that networks see numbers around 1
+_PIECE = 18720
 _FEW = 2  # the first steps take one of so many points
 _DILATION = 3
 _COARSE = 2  # features have a cell for so many rows and columns of the maps
@@ -80,25 +81,34 @@ class ProjectiveSteps(nn.Module):
     def forward(self, last: SeenPoints, current: SeenPoints, pose: Tensor) -> list[Tensor]:
         """Poses ``T_k_k1`` ``(B, 4, 4)`` after each step.
 
-        A step takes the pose before it as given: gradients go through the weights, not back through earlier steps. The
-        first half of the steps takes every second point.
+        A step takes the pose before it as given: gradients go through the weights, not back through earlier steps. All
+        steps but the last take every second point.
         """
         few, poses = _thinned(current, _FEW), []
         for k, kernel_m in enumerate(self.kernels_m):
-            points = few if k < self.settings.projective_steps // 2 else current
+            points = few if k < self.settings.projective_steps - 1 else current
             pose = self._step(last, points, pose.detach(), kernel_m) @ pose.detach()
             poses.append(pose)
         return poses
 
     def _step(self, last: SeenPoints, current: SeenPoints, pose: Tensor, kernel_m: Tensor) -> Tensor:
         """``δT`` ``(B, 4, 4)`` of one step."""
+        whole = torch.is_grad_enabled() or pose.device.type != "cpu"
+        pieces = [current] if whole else _pieces(current)
+        parts = [self._equations(last, piece, pose, kernel_m) for piece in pieces]
+        return solved(*(torch.stack(part).sum(0) for part in zip(*parts, strict=True)))
+
+    def _equations(
+        self, last: SeenPoints, current: SeenPoints, pose: Tensor, kernel_m: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The points' normal equations, see :func:`normal_equations`."""
         moved = torch.baddbmm(pose[:, :3, 3:], pose[:, :3, :3], current.points)
         cell, inside = maps.cells(moved, self.settings.geometry)
         normals, distance, there = _held_against(last.planes, moved, cell, inside[:, None] & current.seen)
         weights = there * (kernel_m**2 / (kernel_m**2 + distance.square())).square()
         if self.weights is not None:
             weights = weights * self.weights(last, current, cell, distance, kernel_m)
-        return weighted_step(normals, moved, distance, weights)
+        return normal_equations(normals, moved, distance, weights)
 
     @property
     def kernels_m(self) -> Tensor:
@@ -133,16 +143,21 @@ class PointWeights(nn.Module):
     def look(self, vertices: Tensor, normals: Tensor, rough: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
         """What a scan's cells contribute, as those of the last scan ``(B, N, C)`` and of the current ``(B, C, N)``."""
         inputs = torch.cat([vertices / self.scale_m, normals, rough, seen.to(vertices.dtype)], dim=1)
-        features = self.features(inputs).permute(0, 2, 3, 1)
-        as_last = self._fine(self.of_last(features)).flatten(1, 2)
-        as_current = self._fine(self.of_current(features)).flatten(1, 2).transpose(1, 2).contiguous()
-        return as_last, as_current
+        features = self.features(inputs)
+        batch, channels, rows, columns = features.shape
+        flat = features.flatten(2)
+        as_last = self.of_last(flat.transpose(1, 2)).reshape(batch * rows, columns, channels)
+        as_current = (self.of_current.weight @ flat).reshape(batch * channels * rows, columns, 1)
+        return (
+            self._fine(as_last, batch, channels).flatten(1, 2),
+            self._fine(as_current, batch * channels, 1).reshape(batch, channels, -1),
+        )
 
-    def _fine(self, coarse: Tensor) -> Tensor:
-        """Coarse cells ``(B, h, w, C)``, each repeated over the cells of the maps that it covers."""
-        batch, rows, columns, channels = coarse.shape
-        shape = (batch, rows, _COARSE, columns, _COARSE, channels)
-        fine = coarse[:, :, None, :, None].expand(shape).reshape(batch, rows * _COARSE, columns * _COARSE, channels)
+    def _fine(self, coarse: Tensor, images: int, channels: int) -> Tensor:
+        """Rows ``(images·h, w, C)`` of coarse cells as maps ``(images, H, W, C)``, each for the cells it covers."""
+        rows, columns = len(coarse) // images, coarse.shape[1]
+        wide = coarse.reshape(images, rows, 1, columns, 1, channels).expand(-1, -1, _COARSE, -1, _COARSE, -1)
+        fine = wide.reshape(images, rows * _COARSE, columns * _COARSE, channels)
         return fine[:, : self.size[0], : self.size[1]]
 
     def forward(
@@ -168,10 +183,24 @@ class PointWeights(nn.Module):
         return torch.sigmoid(self.logit.weight @ hidden + self.logit.bias)
 
 
+def _pieces(scan: SeenPoints) -> list[SeenPoints]:
+    """The points in pieces whose temporaries stay in the processor's cache; what belongs to cells stays whole."""
+    step = max(_PIECE // len(scan.points), 1)
+    parts = [scan.points.split(step, -1), scan.seen.split(step, -1)]
+    if scan.rough is None or scan.as_current is None:
+        return [replace(scan, points=points, seen=seen) for points, seen in zip(*parts, strict=True)]
+    parts += [scan.rough.split(step, -1), scan.as_current.split(step, -1)]
+    return [
+        replace(scan, points=points, seen=seen, rough=rough, as_current=own)
+        for points, seen, rough, own in zip(*parts, strict=True)
+    ]
+
+
 def _thinned(scan: SeenPoints, by: int) -> SeenPoints:
     """Every so-manieth point; planes and features, which belong to cells, stay."""
-    rough, own = (None if values is None else values[..., ::by] for values in (scan.rough, scan.as_current))
-    return replace(scan, points=scan.points[..., ::by], seen=scan.seen[..., ::by], rough=rough, as_current=own)
+    rough, own = (None if x is None else x[..., ::by].contiguous() for x in (scan.rough, scan.as_current))
+    points, seen = scan.points[..., ::by].contiguous(), scan.seen[..., ::by].contiguous()
+    return replace(scan, points=points, seen=seen, rough=rough, as_current=own)
 
 
 def _roughness(vertices: Tensor, normals: Tensor) -> Tensor:
@@ -203,8 +232,10 @@ def _held_against(planes: Tensor, points: Tensor, cell: Tensor, known: Tensor) -
     return normals, torch.where(there, distance, 0.0), there.to(distance.dtype)
 
 
-def weighted_step(normals: Tensor, points: Tensor, distance: Tensor, weights: Tensor) -> Tensor:
-    """``δT`` ``(B, 4, 4)`` of one Gauss-Newton step of ``Σ w d²``, for points and the planes that they belong to.
+def normal_equations(
+    normals: Tensor, points: Tensor, distance: Tensor, weights: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """``Σ w JᵀJ`` ``(B, 6, 6)``, ``Σ w Jᵀd`` ``(B, 6, 1)`` and ``Σ w`` ``(B, 1, 1)`` of points and their planes.
 
     Args:
         normals, points: ``(B, 3, N)`` in one frame.
@@ -213,9 +244,12 @@ def weighted_step(normals: Tensor, points: Tensor, distance: Tensor, weights: Te
     # d of Exp(ξ)·p is n·(ω × p + v) = (p × n)·ω + n·v
     J = torch.cat([maps.cross(points, normals, dim=1) / _LEVER_M, normals], dim=1)
     weighted = J * weights
-    total = weights.sum(-1, keepdim=True).clamp(min=1e-6)
-    H = weighted @ J.transpose(1, 2) / total
-    g = weighted @ distance.transpose(1, 2) / total
+    return weighted @ J.transpose(1, 2), weighted @ distance.transpose(1, 2), weights.sum(-1, keepdim=True)
+
+
+def solved(H: Tensor, g: Tensor, total: Tensor) -> Tensor:
+    """``δT`` ``(B, 4, 4)`` of one Gauss-Newton step of ``Σ w d²``, from its normal equations."""
+    total = total.clamp(min=1e-6)
     eye = torch.eye(6, dtype=H.dtype, device=H.device)
-    xi = -torch.linalg.solve(H + _DAMPING * eye, g)[..., 0]
+    xi = -torch.linalg.solve(H / total + _DAMPING * eye, g / total)[..., 0]
     return se3.exp(torch.cat([xi[:, :3] / _LEVER_M, xi[:, 3:]], dim=1))

@@ -1,6 +1,6 @@
 """How good the learned front end is, and what it costs: accuracy of a step, drift without a graph, time by stage.
 
-    python benchmarks/learned.py --simulated DRIVE… --real DRIVE… --long DRIVE… --adapt --time [--cache DIR] [-o DIR]
+    python benchmarks/front_end.py --simulated DRIVE… --real DRIVE… --long DRIVE… --adapt --time [--cache DIR] [-o DIR]
 
 `--simulated` shakes true relative poses and measures what the network leaves of the error. `--real` does the same on
 recordings without an exact reference, around what small_gicp finds between full scans. `--adapt` trains the weights on
@@ -209,7 +209,7 @@ def main() -> None:
         first = (options.simulated + options.real + options.long)[0]
         show("Time for each scan", [row for n in (1, 2) for row in time_rows(network, open_sequence(first), n)])
     if options.out:
-        write_whole(options.out / "learned.json", json.dumps(told, indent=2) + "\n")
+        write_whole(options.out / "front_end.json", json.dumps(told, indent=2) + "\n")
 
 
 if __name__ == "__main__":

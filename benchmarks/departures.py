@@ -1,0 +1,84 @@
+"""What each departure of the default network from the paper's is worth, all rows trained for the same number of steps.
+
+    python benchmarks/departures.py DRIVE… --test DRIVE… [--steps 100] [--rows A,B] [--cache DIR] [-o DIR]
+
+Drives are recordings with a reference, such as simulated ones, or their shards. Given again with the same -o, finished
+rows are not trained again. The first line is the untrained network.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from front_end import SIZES, Row, shaken, steps_left
+
+from hybridlio import tables
+from hybridlio.files import write_whole
+from hybridlio.learned.driving import drive
+from hybridlio.learned.odometry_network import OdometryNetwork, parameter_count
+from hybridlio.learned.pairs import Pairs
+from hybridlio.learned.presets import DEFAULT, DEPARTURES
+from hybridlio.learned.settings import Recipe
+from hybridlio.learned.shards import Shard
+from hybridlio.learned.training import RunOptions, train
+from hybridlio.learned.validation import step_errors
+from hybridlio.recipes import lasting
+from hybridlio.training_data import DataOptions, shards_of
+
+
+def measured(name: str, network: OdometryNetwork, tests: list[Shard]) -> Iterator[Row]:
+    """A line for each test recording: what is left of the larger error, and the chained steps."""
+    for shard in tests:
+        reference = shard.reference[1:]
+        degrees, metres = steps_left(network, shard, reference, shaken(reference, *SIZES[0]))[-1]
+        driven = drive(network, shard)
+        off_deg, off_m = step_errors(driven.initial, driven.reference)
+        t_rel, r_rel = driven.drift or (None, None)
+        yield {
+            "preset": name,
+            "numbers": str(parameter_count(network)),
+            "recording": shard.info.name,
+            "left of 14.5 cm / 0.41°": f"{100 * metres:.2f} cm / {degrees:.3f}°",
+            "initial pose off by": f"{100 * off_m:.1f} cm / {off_deg:.2f}°",
+            "t_rel [%]": tables.number(t_rel, 2),
+            "r_rel [°/100 m]": tables.number(r_rel, 2),
+        }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("train", type=Path, nargs="+")
+    parser.add_argument("--test", type=Path, nargs="+", required=True)
+    parser.add_argument("--steps", type=int, default=100)
+    parser.add_argument("--rows", default="")
+    parser.add_argument("--cache", type=Path, default=Path("shards"))
+    parser.add_argument("-o", "--out", type=Path, default=Path("departures"))
+    options = parser.parse_args()
+    wanted = [name for name in options.rows.split(",") if name]
+    prepared = DataOptions(options.cache)
+
+    def tests(recipe: Recipe) -> list[Shard]:
+        return shards_of(options.test, recipe, prepared)
+
+    torch.manual_seed(0)
+    lines = list(measured("default, untrained", OdometryNetwork(DEFAULT.network).eval(), tests(DEFAULT)))
+    for recipe in DEPARTURES:
+        if wanted and recipe.name not in wanted:
+            continue
+        pairs = Pairs(shards_of(options.train, recipe, prepared), recipe.network)
+        recipe = lasting(recipe, options.steps, len(pairs))
+        network = train(
+            recipe, pairs, options.out / recipe.name, options=RunOptions(device="cpu", max_steps=options.steps)
+        )
+        lines += measured(recipe.name, network.eval(), tests(recipe))
+        print(tables.to_markdown(lines[-len(options.test) :], ("preset", "recording")), flush=True)
+    text = tables.to_markdown(lines, ("preset", "recording"))
+    write_whole(options.out / "departures.md", text + "\n")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
