@@ -186,21 +186,20 @@ class PointWeights(nn.Module):
 def _pieces(scan: SeenPoints) -> list[SeenPoints]:
     """The points in pieces whose temporaries stay in the processor's cache; what belongs to cells stays whole."""
     step = max(_PIECE // len(scan.points), 1)
-    parts = [scan.points.split(step, -1), scan.seen.split(step, -1)]
-    if scan.rough is None or scan.as_current is None:
-        return [replace(scan, points=points, seen=seen) for points, seen in zip(*parts, strict=True)]
-    parts += [scan.rough.split(step, -1), scan.as_current.split(step, -1)]
-    return [
-        replace(scan, points=points, seen=seen, rough=rough, as_current=own)
-        for points, seen, rough, own in zip(*parts, strict=True)
-    ]
+    return [_part(scan, slice(first, first + step)) for first in range(0, scan.points.shape[-1], step)]
+
+
+def _part(scan: SeenPoints, rows: slice) -> SeenPoints:
+    """Some of the points; what belongs to cells, not points, stays."""
+    rough, own = (None if values is None else values[..., rows] for values in (scan.rough, scan.as_current))
+    return replace(scan, points=scan.points[..., rows], seen=scan.seen[..., rows], rough=rough, as_current=own)
 
 
 def _thinned(scan: SeenPoints, by: int) -> SeenPoints:
-    """Every so-manieth point; planes and features, which belong to cells, stay."""
-    rough, own = (None if x is None else x[..., ::by].contiguous() for x in (scan.rough, scan.as_current))
-    points, seen = scan.points[..., ::by].contiguous(), scan.seen[..., ::by].contiguous()
-    return replace(scan, points=points, seen=seen, rough=rough, as_current=own)
+    """Every so-manieth point, laid out anew."""
+    part = _part(scan, slice(None, None, by))
+    rough, own = (None if values is None else values.contiguous() for values in (part.rough, part.as_current))
+    return replace(part, points=part.points.contiguous(), seen=part.seen.contiguous(), rough=rough, as_current=own)
 
 
 def _roughness(vertices: Tensor, normals: Tensor) -> Tensor:
