@@ -18,11 +18,12 @@ from hybridlio.gps import GpsOptions
 from hybridlio.graph import factors
 from hybridlio.graph.factor_groups import FactorGroup
 from hybridlio.graph.gps_factors import GpsGroup
+from hybridlio.graph.marginals import bayes_tree, pose_covariances
 from hybridlio.graph.ordering import chain_order
 from hybridlio.graph.preintegration import covers, preintegrate
 from hybridlio.graph.robust import Added, check_treatment
 from hybridlio.graph.scans import Scans
-from hybridlio.graph.solver import incremental_solver, reason
+from hybridlio.graph.solver import reason
 from hybridlio.record import Record
 from hybridlio.trajectory import Trajectory
 
@@ -42,6 +43,7 @@ class Smoothed:
 
     Attributes:
         trajectory: ``N`` lidar poses in the first scan's frame, with covariances ``(N, 6, 6)``.
+        step_covariances: ``(N-1, 6, 6)`` of the relative poses between consecutive scans.
         velocities_m_s: ``(N, 3)`` of the IMU, in the IMU's first pose; meaningless without IMU.
         accel_biases_m_s2, gyro_biases_rad_s: ``(N, 3)`` each; meaningless without IMU.
         gravity_m_s2: ``(3,)`` in the IMU's first pose.
@@ -52,6 +54,7 @@ class Smoothed:
     """
 
     trajectory: Trajectory
+    step_covariances: NDArray[np.float64]
     velocities_m_s: NDArray[np.float64]
     accel_biases_m_s2: NDArray[np.float64]
     gyro_biases_rad_s: NDArray[np.float64]
@@ -105,8 +108,8 @@ def smooth(
         values = _solve(optimiser)
         states = _read(values, states)
         added.keep(values)
-    isam = _marginals(graph, values)
-    covariances = _covariances(isam, len(states), report)
+    isam = bayes_tree(graph, values)
+    covariances = pose_covariances(isam, np.array([state.T_world_imu for state in states]), report)
     found = added.found(values, states, isam)
     return _smoothed(record, states, covariances, error_before or 0.0, optimiser, found)
 
@@ -197,29 +200,10 @@ def _few_iterations(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> 
     return _solve(_optimiser(graph, values, _ITERATIONS_A_STEP))
 
 
-def _marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.ISAM2:
-    """The solved graph as one that tells marginal covariances."""
-    isam = incremental_solver()
-    try:
-        isam.update(graph, values)
-    except RuntimeError as error:
-        raise GraphError(f"smoothing: the graph does not fix every variable: {reason(error)}") from error
-    return isam
-
-
-def _covariances(isam: gtsam.ISAM2, count: int, progress: Progress) -> Array:
-    """``(N, 6, 6)`` marginals of the IMU poses, relative to the first, which is the origin."""
-    out = np.empty((count, 6, 6))
-    for k in range(count):
-        progress("covariances", k, count)
-        out[k] = isam.marginalCovariance(X(k))
-    return (out + np.swapaxes(out, 1, 2)) / 2
-
-
 def _smoothed(
     record: Record,
     states: list[State],
-    covariances: Array,
+    covariances: tuple[Array, Array],
     error_before: float,
     optimiser: gtsam.LevenbergMarquardtOptimizer,
     found: dict[str, Any],
@@ -229,8 +213,10 @@ def _smoothed(
     poses = T_inv @ np.array([state.T_world_imu for state in states]) @ T
     stamps = np.array([state.stamp_ns for state in states])
     iterations = int(optimiser.iterations())
+    absolute, steps = (se3.rotate_covariance(part, T_inv) for part in covariances)
     return Smoothed(
-        trajectory=Trajectory(stamps, se3.between(poses[0], poses), se3.rotate_covariance(covariances, T_inv)),
+        trajectory=Trajectory(stamps, se3.between(poses[0], poses), absolute),
+        step_covariances=steps,
         velocities_m_s=np.array([state.velocity_m_s for state in states]),
         accel_biases_m_s2=np.array([state.accel_bias_m_s2 for state in states]),
         gyro_biases_rad_s=np.array([state.gyro_bias_rad_s for state in states]),

@@ -10,6 +10,7 @@ from hybridlio import se3
 from hybridlio.errors import GraphError
 from hybridlio.estimates import RelativePose, State
 from hybridlio.graph import factors
+from hybridlio.graph.marginals import step_covariance
 from hybridlio.graph.preintegration import bias_of, covers, preintegrate
 from hybridlio.graph.scans import Scans
 from hybridlio.graph.solver import incremental_solver, reason
@@ -67,8 +68,7 @@ class IncrementalBackend:
         T_w_i, T_w_j = (self._isam.calculateEstimatePose3(key).matrix() for key in (i, j))
         joint = self._isam.jointMarginalCovariance([i, j]).fullMatrix()
         step = se3.between(T_w_i, T_w_j)
-        J = np.hstack([-se3.adjoint(se3.inverse(step)), np.eye(6)])
-        covariance = se3.rotate_covariance(J @ joint @ J.T, self._T_lidar_imu)
+        covariance = se3.rotate_covariance(step_covariance(joint, step), self._T_lidar_imu)
         pose = self._T_lidar_imu @ step @ self._T_imu_lidar
         return RelativePose(pose, (covariance + covariance.T) / 2, source=self.name, from_imu=self._state.has_imu)
 

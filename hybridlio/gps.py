@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,19 @@ class GpsFit:
         """Root mean square distance from the fixes that are not rejected."""
         kept = self.residuals_m[self.used & ~self.rejected]
         return float(np.sqrt((kept**2).sum(axis=1).mean())) if len(kept) else float("nan")
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """The figures as plain values."""
+        return {
+            "fixes": len(self.used),
+            "used": int(self.used.sum()),
+            "rejected": np.flatnonzero(self.rejected).tolist(),
+            "rmse_m": self.rmse_m,
+            "shift_s": self.shift_s,
+            "shift_sigma_s": self.shift_sigma_s,
+            "noise_scale": self.noise_scale,
+            "T_enu_world": self.T_enu_world.tolist(),
+        }
 
     def summary(self) -> str:
         """One line."""

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from hybridlio import __version__, run_folder
+from hybridlio import __version__, run_folder, se3
 from hybridlio.config import Config, config_to_yaml
 from hybridlio.errors import EstimationError
 from hybridlio.files import write_whole
-from hybridlio.metrics import Evaluation
+from hybridlio.metrics import Evaluation, Steps
 from hybridlio.record import Record
 from hybridlio.report import pictures, write_report
 from hybridlio.report_data import Findings, ReportData, find
@@ -20,6 +20,7 @@ from hybridlio.trajectory_files import write_tum
 
 if TYPE_CHECKING:
     from hybridlio.agreement import Verdict
+    from hybridlio.gps import GpsFit
     from hybridlio.graph.loops import ClosedLoops
     from hybridlio.graph.offline import Smoothed
 
@@ -177,7 +178,9 @@ def write_smoothed(folder: Path, stored: run_folder.StoredRun, record: Record, s
     """
     run_folder.clear(folder)
     trajectory, T = smoothed.trajectory, stored.T_camera_lidar
-    run_folder.write_trajectory(folder, trajectory, T, stamps_before=stored.stamps_before)
+    steps = Steps(se3.between(trajectory.poses[:-1], trajectory.poses[1:]), smoothed.step_covariances)
+    run_folder.write_trajectory(folder, trajectory, T, steps, stored.stamps_before)
+    fit: GpsFit | None = smoothed.found.get("gps")
     closed: ClosedLoops | None = smoothed.found.get("loops")
     loops = () if closed is None else closed.kept
     edges = [*record.edges, *((loop.earlier, loop.later, loop.as_relative_pose()) for loop in loops)]
@@ -190,11 +193,14 @@ def write_smoothed(folder: Path, stored: run_folder.StoredRun, record: Record, s
         reference=stored.reference,
         estimate_name=_SMOOTHED,
         others={_ONLINE: stored.trajectory},
+        final_poses=steps.poses,
+        step_covariances=steps.covariances,
         ok=np.array([step.ok for step in record.relative]),
         degenerate=np.array([len(step.degenerate) > 0 for step in record.relative]),
         loops=np.array([(loop.earlier, loop.later) for loop in loops], np.int64).reshape(-1, 2),
         facts={"smoothed": f"{smoothed.iterations} iterations", "run": stored.path.name}
-        | ({} if closed is None else {"loops": closed.summary()}),
+        | ({} if closed is None else {"loops": closed.summary()})
+        | ({} if fit is None else {"GPS": fit.summary()}),
         warnings=stored.metrics["notes"],
     )
     findings = find(data)
@@ -205,6 +211,8 @@ def write_smoothed(folder: Path, stored: run_folder.StoredRun, record: Record, s
     figures |= {"path_length_m": trajectory.length_m}
     if closed is not None:
         figures |= {"loops": closed.to_json_dict(len(stored.stamps_before))}
+    if fit is not None:
+        figures |= {"gps": fit.to_json_dict()}
     judged = findings.evaluations.get(_SMOOTHED)
     run_folder.write_metrics(folder, figures | (judged.to_json_dict() if judged is not None else {}))
     return findings

@@ -10,13 +10,14 @@ import pytest
 from gtsam.symbol_shorthand import X
 
 from hybridlio import se3
-from hybridlio.consistency import pose_consistency
+from hybridlio.consistency import pose_consistency, step_errors
 from hybridlio.errors import GraphError
 from hybridlio.estimates import RelativePose
 from hybridlio.graph import offline
 from hybridlio.graph.offline import Smoothed, smooth
 from hybridlio.sensors import ImuNoise, ImuSamples
 from hybridlio.startup import start_state
+from hybridlio.trajectory import Trajectory
 
 ALMOST_NONE = ImuNoise(1e-6, 1e-6, 1e-9, 1e-9, 1e-6, 1e-6)
 TIGHT = np.r_[np.full(3, 1e-5), np.full(3, 1e-4)]
@@ -171,3 +172,21 @@ def test_a_graph_that_leaves_something_open_is_a_clear_error_that_names_it(
     start = start_state(drive.frames[0].scan.stamp_ns, ImuSamples.empty(), drive.noise)
     with pytest.raises(GraphError, match=r"smoothing: .*x\d\)\.$"):
         smooth(replace(drive.record(multiplied(drive)), imu=ImuSamples.empty(), start=start))
+
+
+def test_smoothed_steps_are_as_far_off_as_their_covariances_say(many: list[tuple[Any, Smoothed]]):
+    errors, covariances = [], []
+    for drive, smoothed in many:
+        reference = Trajectory(smoothed.trajectory.stamps_ns, drive.lidar_poses)
+        poses = smoothed.trajectory.poses
+        errors.append(step_errors(reference, se3.between(poses[:-1], poses[1:])))
+        covariances.append(smoothed.step_covariances)
+    consistency = pose_consistency(np.concatenate(errors), np.concatenate(covariances))
+    assert 0.85 < consistency.rotation.value < 1.18
+    assert 0.85 < consistency.position.value < 1.18
+
+
+def test_smoothed_steps_are_surer_than_measured_ones(many: list[tuple[Any, Smoothed]]):
+    for drive, smoothed in many:
+        before = np.array([np.trace(step.covariance) for step in drive.relative])
+        assert (np.trace(smoothed.step_covariances, axis1=1, axis2=2) < before).all()

@@ -1,0 +1,141 @@
+"""KITTI 00 in full: a peer's odometry smoothed with the recording's own IMU and GPS.
+
+python benchmarks/kitti_00.py DATA [odometry imu gps outage …] [--outages 60]
+
+DATA holds `results/kiss_icp_00/00_poses_kitti.txt` (KISS-ICP's odometry, 4,541 poses), `kitti_imu_100hz`
+(accelerometer, gyroscope and GPS fixes of the same drive), and `kitti_odometry` with calibration, times and ground truth. The truth is
+only compared with: the noise of the odometry comes from how it agrees with the IMU, that of the IMU is the library's
+default, and where the clocks stand is found. `imu` smooths odometry and IMU alone, `gps` with all fixes, `outage` with
+those of 60 s left out at each of `--places` places along the drive.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+
+import hybridlio as hl
+from hybridlio import se3
+from hybridlio.fix_alignment import fix_stamps
+from hybridlio.gps import GpsOptions
+from hybridlio.imu_faults import without_filled_gaps
+from hybridlio.metrics import align, associate
+from hybridlio.odometry_noise import odometry_noise
+from hybridlio.record import Record
+from hybridlio.sensors import NS_PER_S
+from hybridlio.trajectory_files import read_kitti
+
+# calib_imu_to_velo.txt of 2011_10_03, as KITTI publishes it
+T_LIDAR_IMU = se3.make(
+    [
+        [0.9999976, 7.553071e-4, -2.035826e-3],
+        [-7.854027e-4, 0.9998898, -1.482298e-2],
+        [2.024406e-3, 1.482454e-2, 0.9998881],
+    ],
+    [-0.8086759, 0.3195559, -0.7997231],
+)
+FIX_SIGMA_M = 0.07  # the recording says nothing; smoothing raises it to what the fixes scatter
+SEARCHED_S = np.arange(-3.0, 3.0, 0.02)
+
+
+def read(data: Path) -> tuple[hl.Trajectory, hl.Trajectory, hl.ImuSamples, tuple[hl.GpsFix, ...]]:
+    """Truth, odometry, IMU and fixes; the last two count from the first row of the inertial file."""
+    folder = data / "kitti_odometry"
+    seconds = np.loadtxt(folder / "00/times.txt")
+    rows = dict(line.split(":") for line in (folder / "00/calib.txt").read_text().splitlines() if ":" in line)
+    T_camera_lidar = np.vstack([np.array(rows["Tr"].split(), float).reshape(3, 4), [0, 0, 0, 1]])
+    stamps = np.round(seconds * NS_PER_S).astype(np.int64)
+    truth = read_kitti(folder / "poses/00.txt", stamps, T_camera_lidar)
+    odometry = read_kitti(data / "results/kiss_icp_00/00_poses_kitti.txt", stamps, T_camera_lidar)
+    raw = np.loadtxt(data / "kitti_imu_100hz/imu_100hz.txt")
+    fixes = np.loadtxt(data / "kitti_imu_100hz/KittiGps_converted.txt", delimiter=",", skiprows=1)
+    imu = hl.ImuSamples(nanoseconds(raw[:, 0] - raw[0, 0]), raw[:, 5:8], raw[:, 2:5])
+    covariance = FIX_SIGMA_M**2 * np.eye(3)
+    times = nanoseconds(fixes[:, 0] - raw[0, 0]).tolist()
+    return truth, odometry, imu, tuple(hl.GpsFix(t, p, covariance) for t, p in zip(times, fixes[:, 1:], strict=True))
+
+
+def nanoseconds(seconds: np.ndarray) -> np.ndarray:
+    return np.round(seconds * NS_PER_S).astype(np.int64)
+
+
+def imu_clock(odometry: hl.Trajectory, imu: hl.ImuSamples) -> float:
+    """How many seconds the IMU's clock is ahead of the scans', by the speeds at which both say the vehicle turns."""
+    turned = np.linalg.norm(se3.so3_log(se3.between(odometry.poses[:-1], odometry.poses[1:])[:, :3, :3]), axis=1)
+    times, spans = odometry.times_s, np.diff(odometry.times_s)
+    speeds = np.linalg.norm(imu.gyro_rad_s, axis=1)
+    at = imu.stamps_ns / NS_PER_S
+    turned_by_then = np.concatenate([[0.0], np.cumsum((speeds[1:] + speeds[:-1]) / 2 * np.diff(at))])
+
+    def misfit(shift: float) -> float:
+        inside = (times[:-1] + shift > at[1]) & (times[1:] + shift < at[-1])
+        integral = np.diff(np.interp(times + shift, at, turned_by_then))
+        return float(np.median(np.abs(integral - turned)[inside] / spans[inside]))
+
+    costs = [misfit(shift) for shift in SEARCHED_S]
+    k = int(np.argmin(costs))
+    before, here, after = costs[k - 1 : k + 2]
+    return float(SEARCHED_S[k] + (SEARCHED_S[1] - SEARCHED_S[0]) * (before - after) / (2 * (before - 2 * here + after)))
+
+
+def make_record(odometry: hl.Trajectory, imu: hl.ImuSamples, gps: tuple[hl.GpsFix, ...]) -> Record:
+    measured, gaps = without_filled_gaps(imu)
+    shift = imu_clock(odometry, measured)
+    print(f"IMU: clock {1e3 * shift:.0f} ms ahead of the scans'; {len(gaps)} gaps filled with straight lines taken out")
+    on_scans = hl.ImuSamples(measured.stamps_ns - round(shift * NS_PER_S), measured.gyro_rad_s, measured.accel_m_s2)
+    calibration = hl.Calibration(se3.inverse(T_LIDAR_IMU))
+    noise = odometry_noise(odometry, on_scans, calibration)
+    for what, covariances in (("odometry's noise a step", noise.covariances), ("of which drift", noise.drifts)):
+        sigmas = np.sqrt(np.median(np.diagonal(covariances, axis1=1, axis2=2), axis=0))
+        print(f"{what:>24s} {np.round(1e3 * sigmas[:3], 2)} mrad, {np.round(1e2 * sigmas[3:], 2)} cm")
+    return Record.from_odometry(odometry, on_scans, gps, calibration)
+
+
+def report(name: str, truth: hl.Trajectory, estimate: hl.Trajectory, spent: str = "") -> None:
+    e = hl.evaluate(truth, estimate)
+    figures = f"ATE {e.ate_m:6.3f} m  t_rel {e.t_rel_percent:.3f} %  r_rel {e.r_rel_deg_per_100m:.3f} °/100 m"
+    print(f"{name:24s} {figures}  RPE {e.rpe_m:.4f} m {e.rpe_deg:.4f}°  {spent}", flush=True)
+
+
+def smooth(name: str, truth: hl.Trajectory, record: Record, gps: GpsOptions | None) -> None:
+    begin = time.process_time()
+    smoothed = hl.smooth(record, gps=gps or False)
+    report(name, truth, smoothed.trajectory, f"{time.process_time() - begin:.0f} s of one core")
+    if gps is not None:
+        print(f"{'':24s} {smoothed.found['gps'].summary()}")
+    for start, end in gps.outages if gps is not None else ():
+        both = associate(truth, smoothed.trajectory)
+        inside = (both.reference.stamps_ns >= start) & (both.reference.stamps_ns <= end)
+        aligned = align(both.reference, both.estimate, lever_m=0.0).poses[inside, :3, 3]
+        off = np.linalg.norm(aligned - both.reference.poses[inside, :3, 3], axis=1)
+        print(f"{'':24s} in the outage: RMSE {np.sqrt((off**2).mean()):.2f} m, at most {off.max():.2f} m", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("parts", nargs="*", default=["odometry", "imu", "gps", "outage"])
+    parser.add_argument("--outage-s", type=float, default=60.0)
+    parser.add_argument("--places", type=int, default=8)
+    options = parser.parse_args()
+    truth, odometry, imu, gps = read(options.data)
+    record = make_record(odometry, imu, gps)
+    if "odometry" in options.parts:
+        report("odometry alone", truth, odometry)
+    if "imu" in options.parts:
+        smooth("with IMU", truth, record, None)
+    if "gps" in options.parts:
+        smooth("with IMU and GPS", truth, record, GpsOptions())
+    if "outage" in options.parts:
+        stamps = fix_stamps(gps)
+        length = round(options.outage_s * NS_PER_S)
+        for start in np.linspace(stamps[0], stamps[-1] - length, options.places).astype(np.int64).tolist():
+            outage = GpsOptions(outages=[(start, start + length)])
+            smooth(f"outage from {start / NS_PER_S:5.0f} s", truth, record, outage)
+
+
+if __name__ == "__main__":
+    main()
