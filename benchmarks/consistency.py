@@ -4,7 +4,8 @@ python benchmarks/consistency.py [--runs 50] [--steps 100] [--seed 1000]
 
 Each drive is a smooth path with an IMU on it (bias, bias walk and white noise as its `ImuNoise` says) and relative
 poses whose errors have exactly the covariances they claim: independent from step to step, or those of matching to a
-map, which scatter about it and drift. They go through `Odometry` with each backend, and through `smooth`. 1 is consistent.
+map, which scatter about it and drift. They go through `Odometry` with each backend, and through `smooth`. 1 is
+consistent.
 """
 
 from __future__ import annotations

@@ -3,10 +3,10 @@
 python benchmarks/kitti_00.py DATA [odometry imu gps outage …] [--outages 60]
 
 DATA holds `results/kiss_icp_00/00_poses_kitti.txt` (KISS-ICP's odometry, 4,541 poses), `kitti_imu_100hz`
-(accelerometer, gyroscope and GPS fixes of the same drive), and `kitti_odometry` with calibration, times and ground truth. The truth is
-only compared with: the noise of the odometry comes from how it agrees with the IMU, that of the IMU is the library's
-default, and where the clocks stand is found. `imu` smooths odometry and IMU alone, `gps` with all fixes, `outage` with
-those of 60 s left out at each of `--places` places along the drive.
+(accelerometer, gyroscope and GPS fixes of the same drive), and `kitti_odometry` with calibration, times and truth.
+The truth is only compared with: the noise of the odometry comes from how it agrees with the IMU, that of the IMU is the
+library's default, and where the clocks stand is found. `imu` smooths odometry and IMU alone, `gps` with all fixes,
+`outage` with those of 60 s left out at each of `--places` places along the drive.
 """
 
 from __future__ import annotations
