@@ -29,7 +29,7 @@ from hybridlio.projection import MapGeometry
 
 Array = NDArray[np.float64]
 
-CHI2_99 = 16.8  # of six degrees of freedom
+CHI2_99, _CHI2_90 = 16.8, 10.6  # of six degrees of freedom
 _LONGEST_STEP_M = 0.5
 _UNKNOWN_SIGMA_M = 10.0
 _NORMAL_NOISE = 5e-3  # planes of one scan, averaged over voxels, are noisier than those of a map
@@ -83,8 +83,11 @@ class Judged:
 
     def is_off(self, scale: float) -> bool:
         """Whether the minimum of the loss is farther away than noise and what is systematic in it explain."""
-        spread = self.noise(scale) + _SYSTEMATIC
-        return bool(self.step @ np.linalg.solve(spread, self.step) > CHI2_99)
+        return bool(self.step @ np.linalg.solve(self.spread(scale), self.step) > _CHI2_90)
+
+    def spread(self, scale: float) -> Array:
+        """``(6, 6)`` within which the loss cannot tell poses apart: noise, and what is systematic in its minimum."""
+        return self.noise(scale) + _SYSTEMATIC
 
     def constrained(self, xi: Array) -> Array:
         """A tangent vector ``(6,)`` without its parts along what the points do not constrain."""

@@ -190,12 +190,11 @@ class NetworkResidual:
         return [initial.pose @ se3.exp(np.array([0, 0, 0, shift, 0, 0])) for shift in shifts]
 
     def _is_worse(self, after: Judged, before: Judged) -> bool:
-        """Whether the loss rises on the way from the initial pose, and the way is longer than the points' noise."""
+        """Whether the loss rises on the way from the initial pose, by a way longer than what it cannot tell apart."""
         if after.cost < before.cost:
             return False
         way = se3.log(se3.between(before.pose, after.pose))
-        noise = before.noise(self._settings.covariance_scale)
-        return bool(way @ np.linalg.solve(noise, way) > CHI2_99)
+        return bool(way @ np.linalg.solve(before.spread(self._settings.covariance_scale), way) > CHI2_99)
 
     def _answer(self, judged: Judged, details: dict[str, float]) -> RelativePose:
         # weighed by the points alone; what a network was told of the IMU, its noise over a step (0.02°, 0.2 mm), is

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hybridlio.learned import se3
 from hybridlio.learned.correspondences import Clouds, Matches, match
 from hybridlio.learned.losses import LossValue, gauss_newton, loss
-from hybridlio.learned.odometry_network import NetworkOutput
+from hybridlio.learned.odometry_network import NetworkOutput, OdometryNetwork
 from hybridlio.learned.pairs import PairBatch
 from hybridlio.learned.settings import LossSettings
 from hybridlio.projection import MapGeometry
@@ -79,3 +79,15 @@ def _apart_m(target: Tensor, pose: Tensor) -> Tensor:
     xi = se3.log(se3.inverse(target) @ pose)
     squared = xi[:, 3:].square().sum(1) + (_LEVER_M * xi[:, :3]).square().sum(1)
     return (squared + 1e-8).sqrt()  # smooth within a tenth of a millimetre
+
+
+class Objective(nn.Module):
+    """A network with its loss: from batches to their :func:`objective`, which is all that training asks of it."""
+
+    def __init__(self, network: OdometryNetwork, settings: LossSettings) -> None:
+        super().__init__()
+        self.network, self.settings = network, settings
+
+    def forward(self, batch: PairBatch) -> LossValue:
+        """The loss of a batch."""
+        return objective(self.network(batch.network), batch, self.settings, self.network.settings.geometry)

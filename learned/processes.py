@@ -45,12 +45,16 @@ class Processes:
             torch.distributed.barrier()
 
     def joined(self, network: nn.Module) -> nn.Module:
-        """The network with gradients averaged over the processes; statistics of batches too, where the device can."""
+        """The network, or one with its loss, with gradients averaged over the processes.
+
+        Statistics of batches are averaged too, where the device can.
+        """
         if self.count == 1:
             return network
         if self.device.type == "cuda":
             network = nn.SyncBatchNorm.convert_sync_batchnorm(network)  # type: ignore[no-untyped-call]
-        return DistributedDataParallel(network)
+        # not every recipe's loss reaches every part: LSTMs, for one, are beyond it where steps forget their start
+        return DistributedDataParallel(network, find_unused_parameters=True)
 
 
 @contextlib.contextmanager

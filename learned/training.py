@@ -23,7 +23,8 @@ from hybridlio.errors import ConfigError, EstimationError
 from hybridlio.files import write_whole
 from hybridlio.learned import checkpoints
 from hybridlio.learned.checkpoints import Checkpoint
-from hybridlio.learned.objective import objective
+from hybridlio.learned.losses import LossValue
+from hybridlio.learned.objective import Objective
 from hybridlio.learned.odometry_network import OdometryNetwork
 from hybridlio.learned.pairs import PairBatch, Pairs, shaken
 from hybridlio.learned.processes import Processes, processes
@@ -154,7 +155,7 @@ class _Run:
         self.log = TrainingLog(out, self.step) if place.leads else None
         if place.leads:
             write_whole(out / "recipe.json", json.dumps(to_dict(recipe), indent=2) + "\n")
-        self.joined = place.joined(self.network)
+        self.objective = place.joined(Objective(self.network, recipe.loss))
         self.steps_an_epoch = math.ceil(len(pairs) / settings.batch)
         self.steps = self.steps_an_epoch * settings.epochs
 
@@ -220,7 +221,7 @@ class _Run:
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(settings, self.step / self.steps_an_epoch)
         batch = batch.to(self.place.device)
-        value = objective(self.joined(batch.network), batch, self.recipe.loss, self.recipe.network.geometry)
+        value: LossValue = self.objective(batch)
         counted = self.place.rank < len(indices)  # whether this share is not a repetition
         share = value.total.sum() / len(indices) * float(counted)
         self.optimiser.zero_grad(set_to_none=True)

@@ -73,7 +73,8 @@ def test_given_initial_poses_are_shaken_alike_after_resuming(rooms, tiny_recipe,
 
 
 def test_two_processes_agree_with_one_on_the_same_batches(rooms, room_shards, tiny_recipe, tmp_path, project_root):
-    # 15 pairs in batches of 4: the last batch has 3, shared unevenly
+    # 15 pairs in batches of 4: the last batch has 3, shared unevenly; the LSTMs are beyond this loss's reach
+    tiny_recipe = replace(tiny_recipe, network=replace(tiny_recipe.network, projective_steps=1))
     train(tiny_recipe, Pairs(rooms[:1], tiny_recipe.network), tmp_path / "one", options=CPU)
     script = tmp_path / "run.py"
     script.write_text(
