@@ -27,8 +27,7 @@ _LEVER_M = 10.0  # rotations are measured at this lever, so that the system is w
 _DAMPING = 1e-4  # of the normal equations a point: directions that hardly any cell constrains stay as they are
 _LIMIT_M = 1.0
 _DISTANCE_M = 0.1  # what is left after an initial pose, so that networks see numbers around 1
-_PIECE = 18720
-_FEW = 2  # the first steps take one of so many points
+_ONE_OF = (4, 2)  # so many points are taken in the first half of the steps, and in the others
 _DILATION = 3
 _COARSE = 2  # features have a cell for so many rows and columns of the maps
 
@@ -81,34 +80,26 @@ class ProjectiveSteps(nn.Module):
     def forward(self, last: SeenPoints, current: SeenPoints, pose: Tensor) -> list[Tensor]:
         """Poses ``T_k_k1`` ``(B, 4, 4)`` after each step.
 
-        A step takes the pose before it as given: gradients go through the weights, not back through earlier steps. All
-        steps but the last take every second point.
+        A step takes the pose before it as given: gradients go through the weights, not back through earlier steps. The
+        first half of the steps takes every fourth point, the others every second: more do not make them better.
         """
-        few, poses = _thinned(current, _FEW), []
+        few, more = (_thinned(current, by) for by in _ONE_OF)
+        poses = []
         for k, kernel_m in enumerate(self.kernels_m):
-            points = few if k < self.settings.projective_steps - 1 else current
+            points = few if k < self.settings.projective_steps // 2 else more
             pose = self._step(last, points, pose.detach(), kernel_m) @ pose.detach()
             poses.append(pose)
         return poses
 
     def _step(self, last: SeenPoints, current: SeenPoints, pose: Tensor, kernel_m: Tensor) -> Tensor:
         """``δT`` ``(B, 4, 4)`` of one step."""
-        whole = torch.is_grad_enabled() or pose.device.type != "cpu"
-        pieces = [current] if whole else _pieces(current)
-        parts = [self._equations(last, piece, pose, kernel_m) for piece in pieces]
-        return solved(*(torch.stack(part).sum(0) for part in zip(*parts, strict=True)))
-
-    def _equations(
-        self, last: SeenPoints, current: SeenPoints, pose: Tensor, kernel_m: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """The points' normal equations, see :func:`normal_equations`."""
         moved = torch.baddbmm(pose[:, :3, 3:], pose[:, :3, :3], current.points)
         cell, inside = maps.cells(moved, self.settings.geometry)
         normals, distance, there = _held_against(last.planes, moved, cell, inside[:, None] & current.seen)
         weights = there * (kernel_m**2 / (kernel_m**2 + distance.square())).square()
         if self.weights is not None:
             weights = weights * self.weights(last, current, cell, distance, kernel_m)
-        return normal_equations(normals, moved, distance, weights)
+        return weighted_step(normals, moved, distance, weights)
 
     @property
     def kernels_m(self) -> Tensor:
@@ -183,23 +174,11 @@ class PointWeights(nn.Module):
         return torch.sigmoid(self.logit.weight @ hidden + self.logit.bias)
 
 
-def _pieces(scan: SeenPoints) -> list[SeenPoints]:
-    """The points in pieces whose temporaries stay in the processor's cache; what belongs to cells stays whole."""
-    step = max(_PIECE // len(scan.points), 1)
-    return [_part(scan, slice(first, first + step)) for first in range(0, scan.points.shape[-1], step)]
-
-
-def _part(scan: SeenPoints, rows: slice) -> SeenPoints:
-    """Some of the points; what belongs to cells, not points, stays."""
-    rough, own = (None if values is None else values[..., rows] for values in (scan.rough, scan.as_current))
-    return replace(scan, points=scan.points[..., rows], seen=scan.seen[..., rows], rough=rough, as_current=own)
-
-
 def _thinned(scan: SeenPoints, by: int) -> SeenPoints:
-    """Every so-manieth point, laid out anew."""
-    part = _part(scan, slice(None, None, by))
-    rough, own = (None if values is None else values.contiguous() for values in (part.rough, part.as_current))
-    return replace(part, points=part.points.contiguous(), seen=part.seen.contiguous(), rough=rough, as_current=own)
+    """Every so-manieth point, laid out anew; what belongs to cells, not points, stays."""
+    rough, own = (None if x is None else x[..., ::by].contiguous() for x in (scan.rough, scan.as_current))
+    points, seen = scan.points[..., ::by].contiguous(), scan.seen[..., ::by].contiguous()
+    return replace(scan, points=points, seen=seen, rough=rough, as_current=own)
 
 
 def _roughness(vertices: Tensor, normals: Tensor) -> Tensor:
@@ -231,10 +210,8 @@ def _held_against(planes: Tensor, points: Tensor, cell: Tensor, known: Tensor) -
     return normals, torch.where(there, distance, 0.0), there.to(distance.dtype)
 
 
-def normal_equations(
-    normals: Tensor, points: Tensor, distance: Tensor, weights: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """``Σ w JᵀJ`` ``(B, 6, 6)``, ``Σ w Jᵀd`` ``(B, 6, 1)`` and ``Σ w`` ``(B, 1, 1)`` of points and their planes.
+def weighted_step(normals: Tensor, points: Tensor, distance: Tensor, weights: Tensor) -> Tensor:
+    """``δT`` ``(B, 4, 4)`` of one Gauss-Newton step of ``Σ w d²``, for points and the planes that they belong to.
 
     Args:
         normals, points: ``(B, 3, N)`` in one frame.
@@ -243,12 +220,9 @@ def normal_equations(
     # d of Exp(ξ)·p is n·(ω × p + v) = (p × n)·ω + n·v
     J = torch.cat([maps.cross(points, normals, dim=1) / _LEVER_M, normals], dim=1)
     weighted = J * weights
-    return weighted @ J.transpose(1, 2), weighted @ distance.transpose(1, 2), weights.sum(-1, keepdim=True)
-
-
-def solved(H: Tensor, g: Tensor, total: Tensor) -> Tensor:
-    """``δT`` ``(B, 4, 4)`` of one Gauss-Newton step of ``Σ w d²``, from its normal equations."""
-    total = total.clamp(min=1e-6)
+    total = weights.sum(-1, keepdim=True).clamp(min=1e-6)
+    H = weighted @ J.transpose(1, 2) / total
+    g = weighted @ distance.transpose(1, 2) / total
     eye = torch.eye(6, dtype=H.dtype, device=H.device)
-    xi = -torch.linalg.solve(H / total + _DAMPING * eye, g / total)[..., 0]
+    xi = -torch.linalg.solve(H + _DAMPING * eye, g)[..., 0]
     return se3.exp(torch.cat([xi[:, :3] / _LEVER_M, xi[:, 3:]], dim=1))

@@ -7,7 +7,7 @@ import torch
 from hybridlio import se3
 from hybridlio.learned import maps
 from hybridlio.learned.pairs import Pairs
-from hybridlio.learned.projective import ProjectiveSteps, normal_equations, solved
+from hybridlio.learned.projective import ProjectiveSteps, weighted_step
 from hybridlio.learned.training import RunOptions, train
 from hybridlio.learned.validation import step_errors
 from hybridlio.projection import MapGeometry
@@ -62,16 +62,6 @@ def test_weights_follow_the_points_and_not_their_order_in_the_batch(tiny_recipe)
     assert not torch.allclose(both[:1], fresh(fresh.look(*one), fresh.look(*other), at)[-1], atol=1e-5)
 
 
-def test_inference_in_pieces_gives_what_training_gives(tiny_recipe, monkeypatch):
-    monkeypatch.setattr("hybridlio.learned.projective._PIECE", 1000)
-    for channels in (8, 0):
-        net = steps(tiny_recipe, 2, weight_channels=channels)
-        whole = net(net.look(*room_maps(np.eye(4))), net.look(*room_maps(STEP)), torch.eye(4)[None])[-1]
-        with torch.no_grad():
-            pieces = net(net.look(*room_maps(np.eye(4))), net.look(*room_maps(STEP)), torch.eye(4)[None])[-1]
-        assert torch.allclose(whole, pieces, atol=1e-5)
-
-
 def test_one_step_solves_a_small_motion_of_planes():
     generator = torch.Generator().manual_seed(0)
     normals = torch.nn.functional.normalize(torch.randn(1, 3, 600, generator=generator), dim=1)
@@ -79,7 +69,7 @@ def test_one_step_solves_a_small_motion_of_planes():
     moved_back = torch.tensor(se3.exp([1e-4, -2e-4, 3e-4, 0.01, -0.02, 0.03]), dtype=torch.float32)
     shown = moved_back[:3, :3] @ points + moved_back[:3, 3:]
     distance = (normals * (shown - points)).sum(1, keepdim=True)
-    found = solved(*normal_equations(normals, shown, distance, torch.ones_like(distance)))
+    found = weighted_step(normals, shown, distance, torch.ones_like(distance))
     assert torch.allclose(found[0] @ moved_back, torch.eye(4), atol=2e-4)
 
 
@@ -90,8 +80,8 @@ def test_a_point_of_no_weight_says_nothing():
     distance[..., :300] = 0.5
     weights = torch.ones_like(distance)
     weights[..., :300] = 0.0
-    assert torch.allclose(solved(*normal_equations(normals, points, distance, weights)), torch.eye(4)[None], atol=1e-6)
-    assert solved(*normal_equations(normals, points, distance, torch.zeros_like(distance))).isfinite().all()
+    assert torch.allclose(weighted_step(normals, points, distance, weights), torch.eye(4)[None], atol=1e-6)
+    assert weighted_step(normals, points, distance, torch.zeros_like(distance)).isfinite().all()
 
 
 def test_along_a_corridor_no_step_is_taken():
@@ -101,7 +91,7 @@ def test_along_a_corridor_no_step_is_taken():
     normals[:, 1], normals[:, 2, ::2] = 0.6, 0.8
     normals[:, 1, 1::2] = 1.0
     distance = (normals * torch.tensor([0.5, -0.02, 0.03])[:, None]).sum(1, keepdim=True)
-    found = solved(*normal_equations(normals, points, distance, torch.ones_like(distance)))[0, :3, 3]
+    found = weighted_step(normals, points, distance, torch.ones_like(distance))[0, :3, 3]
     assert found.tolist() == pytest.approx([0.0, 0.02, -0.03], abs=1e-3)
 
 
