@@ -1,0 +1,100 @@
+"""What goes wrong in practice, on a short drive: each is gone through with bounded error, or said."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybridlio import se3
+from hybridlio.config import Config
+from hybridlio.datasets.registry import open_sequence
+from hybridlio.datasets.sequence import Sequence
+from hybridlio.estimates import RelativePose
+from hybridlio.odometry import Odometry
+from hybridlio.run import Run, run_odometry
+from hybridlio.scan_matching import ScanMatching
+from hybridlio.simulation.faults import block_sector, drop_scans, imu_bias, imu_gap
+
+
+@pytest.fixture(scope="module")
+def sequence(tiny_drive: Path) -> Sequence:
+    return open_sequence(tiny_drive)
+
+
+def ran(sequence: Sequence, **names: str) -> Run:
+    run = run_odometry(sequence, Odometry(config=Config(**names)))
+    assert run.stopped is None
+    assert len(run.estimates) == len(sequence)
+    return run
+
+
+def farthest_off_m(run: Run) -> float:
+    """Across the ground: height is the 16 beams' own weakness."""
+    assert run.sequence.reference is not None
+    errors = se3.log(se3.between(run.trajectory.poses, run.sequence.reference.poses))
+    return float(np.linalg.norm(errors[:, 3:5], axis=1).max())
+
+
+@pytest.fixture(scope="module")
+def normal_m(sequence: Sequence) -> float:
+    return farthest_off_m(ran(sequence))
+
+
+FAULTS: dict[str, Callable[[Sequence], Sequence]] = {
+    "a fifth of the scans lost": partial(drop_scans, share=0.2, seed=1),
+    "half of the view blocked for a second": partial(block_sector, start_s=0.8, end_s=1.8),
+    "no inertial samples for a second": partial(imu_gap, start_s=0.8, end_s=1.8),
+    "biases three times the assumed": partial(imu_bias, sigmas=3.0, seed=1),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_gone_through_with_hardly_more_error(fault: str, sequence: Sequence, normal_m: float):
+    run = ran(FAULTS[fault](sequence))
+    assert farthest_off_m(run) < 2 * normal_m + 0.03
+    assert run.bridged == []
+
+
+def test_without_scans_and_samples_the_covariance_says_what_is_not_known(sequence: Sequence):
+    dark = block_sector(imu_gap(sequence, 1.0, 1.5), 1.0, 1.5, width_deg=360.0)
+    run = ran(dark)
+    assert run.bridged == [10, 11, 12, 13, 14]
+    spread = [float(np.sqrt(np.trace(e.covariance[3:, 3:]))) for e in run.estimates]
+    assert spread[14] > 10 * spread[9]
+    assert sequence.reference is not None
+    off = np.linalg.norm(run.trajectory.poses[:, :3, 3] - sequence.reference.poses[:, :3, 3], axis=1)
+    assert (off[10:15] < 4 * np.array(spread[10:15])).all()
+
+
+# ----------------------------------------------------------------------------------- what an initial pose may cost
+
+
+def test_who_guesses_no_motion_costs_one_search_at_the_start(sequence: Sequence, monkeypatch: pytest.MonkeyPatch):
+    searches = []
+    search = ScanMatching._search
+
+    def counted(self: ScanMatching, *given: object) -> np.ndarray:
+        searches.append(1)
+        return search(self, *given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(ScanMatching, "_search", counted)
+    run = ran(sequence.part(0, 10), initial_pose="identity")
+    assert len(searches) == 1
+    assert farthest_off_m(run) < 0.05
+
+
+def test_after_a_scan_that_failed_the_motion_is_searched_anew(sequence: Sequence, monkeypatch: pytest.MonkeyPatch):
+    searches = []
+    monkeypatch.setattr(ScanMatching, "_search", lambda _, __, ___, start, *____: searches.append(1) or start)
+    matching = ScanMatching()
+    matching.start(sequence[0])
+    unsure = RelativePose(np.eye(4), np.diag(np.r_[np.full(3, 0.1), np.full(3, 2.0)] ** 2), "guess")
+    for k in (1, 2):
+        matching.refine(sequence[k], unsure)
+    matching.take_back(unsure)
+    matching.refine(sequence[3], unsure)
+    assert len(searches) == 2
