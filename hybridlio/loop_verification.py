@@ -1,7 +1,8 @@
 """Whether two keyframes are of one place: one's cloud is registered to the surroundings of the other, and the reverse.
 
 A pose counts only if many points of each cloud lie on the other's surfaces, the surfaces hold every direction, and both
-registrations end at the same pose.
+registrations end at the same pose. Ground lies on ground anywhere: only what stands out of it is judged, and of the
+points that are registered it makes up no more than half.
 """
 
 from __future__ import annotations
@@ -35,8 +36,9 @@ class VerificationSettings:
         reach_m: keyframes so far along the path on either side are merged to the surroundings.
         surface_voxel_m, source_voxel_m: sides of the voxels that thin the surroundings, and the cloud laid on them.
         neighbours: points to fit a plane to for a normal.
-        min_matched: share of points that must lie near a surface.
-        max_cost: of the mean robust cost, between 0 and 1.
+        min_standing: with fewer points of a keyframe that are not of ground, it closes no loop.
+        min_matched: share of these that must lie near a surface.
+        max_cost: of their mean robust cost, between 0 and 1.
         max_difference_m, max_difference_deg: between the registrations of either cloud to the other's surroundings.
         covariance_scale: how much larger the covariance is than independent residuals would make it.
         registration: kernel, distances, limits.
@@ -46,8 +48,9 @@ class VerificationSettings:
     surface_voxel_m: float = 0.4
     source_voxel_m: float = 1.0
     neighbours: int = 10
+    min_standing: int = 50
     min_matched: float = 0.7
-    max_cost: float = 0.5
+    max_cost: float = 0.55
     max_difference_m: float = 0.3
     max_difference_deg: float = 0.5
     covariance_scale: float = 6.0
@@ -62,7 +65,7 @@ class Verdict:
         reason: why it is no loop; empty for one that is.
         pose: ``(4, 4)`` ``T_earlier_later``; the best that was found.
         covariance: ``(6, 6)`` of a right perturbation, rad² and m², rotation first; of a loop only.
-        matched, cost: of the worse of the two registrations.
+        matched, cost: of what stands out of the ground; the worse of the two registrations.
     """
 
     reason: str
@@ -72,13 +75,31 @@ class Verdict:
     cost: float
 
 
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """A keyframe's points to register, and those of them that stand out of the ground, ``(N, 3)`` and ``(M, 3)``."""
+
+    points: Array
+    standing: Array
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """How what stands out of the ground lies on a surface: share of points near one, and mean robust cost."""
+
+    matched: float
+    cost: float
+
+
+_LEVEL = 0.7  # a normal's vertical part in a lidar's frame above which it is of ground, or of a roof
 _FINE_START_M = 0.5  # the kernel of the last registration begins so wide
 _SPARSE = 4  # one in so many points is enough to tell a metre from another
 _COARSE_ITERATIONS = 8
-_COARSE_KERNEL_M = 1.0
+_COARSE_KERNEL_M = 2.0
 _AHEAD_M, _LEFT_M = (0.0, -3.0, 3.0), (0.0, -2.0, 2.0)
 _LIKELY = 3
 _SURFACES_KEPT = 64
+_UNKNOWN = np.full((6, 6), np.nan)
 
 
 class Verifier:
@@ -109,16 +130,21 @@ class Verifier:
             earlier, later: numbers of the keyframes.
             guesses: ``(4, 4)`` poses ``T_earlier_later`` near which to look.
         """
-        start = self._search(earlier, later, guesses)
-        there = register(self._surface(earlier), self._source(later), start, self._settings.registration, _FINE_START_M)
-        if reason := self._wrong(there):
-            return _rejected(reason, there)
-        back = register(
-            self._surface(later), self._source(earlier), se3.inverse(there.pose), self._settings.registration
-        )
-        if reason := self._wrong(back) or self._differ(there, back):
-            return _rejected(reason, there)
-        return self._accepted(earlier, later, there, back)
+        one, other, settings = self._source(earlier), self._source(later), self._settings.registration
+        if min(len(one.standing), len(other.standing)) < self._settings.min_standing:
+            return Verdict("hardly anything stands out of the ground", guesses[0], _UNKNOWN, 0.0, 1.0)
+        surface = self._surface(earlier)
+        there = register(surface, other.points, self._search(surface, other, guesses), settings, _FINE_START_M)
+        fit = self._fit(surface, other, there)
+        if reason := self._wrong(there, fit):
+            return Verdict(reason, there.pose, _UNKNOWN, fit.matched, fit.cost)
+        surface = self._surface(later)
+        back = register(surface, one.points, se3.inverse(there.pose), settings)
+        reverse = self._fit(surface, one, back)
+        worse = _Fit(min(fit.matched, reverse.matched), max(fit.cost, reverse.cost))
+        if reason := self._wrong(back, reverse) or self._differ(there, back):
+            return Verdict(reason, there.pose, _UNKNOWN, worse.matched, worse.cost)
+        return self._accepted(earlier, later, there, back, worse)
 
     def _near(self, k: int) -> Index:
         travelled = self._chain.travelled_m[self._keyframes.rows]
@@ -139,14 +165,17 @@ class Verifier:
         known = np.abs(normals).sum(axis=1) > 0.5  # small_gicp leaves a normal zero where there are too few neighbours
         return Surface(points[known], normals[known], threads)
 
-    def _make_source(self, k: int) -> Array:
-        points = voxel_average(self._keyframes.points(k), None, self._settings.source_voxel_m)[0]
-        return points.astype(np.float64)
+    def _make_source(self, k: int) -> _Source:
+        points = voxel_average(self._keyframes.points(k), None, self._settings.source_voxel_m)[0].astype(np.float64)
+        surface = self._surface(k)
+        index, _ = surface.nearest(points, self._settings.registration.threads)
+        level = np.abs(surface.normals[index][:, 2]) > _LEVEL
+        ground = points[level][:: max(1, int(level.sum()) // max(1, int((~level).sum())))]
+        return _Source(np.concatenate([points[~level], ground]), points[~level])
 
-    def _search(self, earlier: int, later: int, guesses: Sequence[Array]) -> Array:
+    def _search(self, surface: Surface, source: _Source, guesses: Sequence[Array]) -> Array:
         """The best of the starts around the guesses: judged by few points, the likelier ones after some steps."""
-        surface, sparse = self._surface(earlier), self._source(later)[::_SPARSE]
-        settings = self._settings.registration
+        sparse, settings = source.points[::_SPARSE], self._settings.registration
         steps = [se3.exp(np.array([0.0, 0.0, 0.0, x, y, 0.0])) for x, y in product(_AHEAD_M, _LEFT_M)]
         starts = [guess @ step for guess in guesses for step in steps]
         starts.sort(key=lambda T: cost_at(surface, sparse, T, _COARSE_KERNEL_M, settings.threads))
@@ -154,11 +183,18 @@ class Verifier:
         tries = [register(surface, sparse, T, coarse, _COARSE_KERNEL_M) for T in starts[:_LIKELY]]
         return min(tries, key=lambda found: found.cost).pose
 
-    def _wrong(self, found: Registration) -> str:
-        if found.matched < self._settings.min_matched:
-            return f"only {found.matched:.0%} of the points match"
-        if found.cost > self._settings.max_cost:
-            return f"the surfaces do not fit (cost {found.cost:.2f})"
+    def _fit(self, surface: Surface, source: _Source, found: Registration) -> _Fit:
+        settings, points = self._settings.registration, source.standing
+        _, distance2 = surface.nearest(se3.transform(found.pose, points), settings.threads)
+        reach_m = settings.max_distance_m
+        cost = cost_at(surface, points, found.pose, settings.kernel_m, settings.threads, reach_m)
+        return _Fit(float((distance2 < reach_m**2).mean()), cost)
+
+    def _wrong(self, found: Registration, fit: _Fit) -> str:
+        if fit.matched < self._settings.min_matched:
+            return f"only {fit.matched:.0%} of the points match"
+        if fit.cost > self._settings.max_cost:
+            return f"the surfaces do not fit (cost {fit.cost:.2f})"
         return "a direction is not held" if len(degenerate_directions(found.hessian)) else ""
 
     def _differ(self, there: Registration, back: Registration) -> str:
@@ -167,14 +203,10 @@ class Verifier:
         apart = metres > self._settings.max_difference_m or degrees > self._settings.max_difference_deg
         return f"the two directions differ by {metres:.2f} m and {degrees:.1f}°" if apart else ""
 
-    def _accepted(self, earlier: int, later: int, there: Registration, back: Registration) -> Verdict:
+    def _accepted(self, earlier: int, later: int, there: Registration, back: Registration, fit: _Fit) -> Verdict:
         """The mean of the two registrations, each of which is as wrong as its surroundings are."""
         pose = se3.interpolate(there.pose, se3.inverse(back.pose), 0.5)
         covariance = covariance_of(there.hessian, there.sigma_m, self._settings.covariance_scale) / 2
         seen_from_later = se3.rotate_covariance(self._distortion(earlier), se3.inverse(pose))
         covariance = covariance + (seen_from_later + self._distortion(later)) / 4
-        return Verdict("", pose, covariance, min(there.matched, back.matched), max(there.cost, back.cost))
-
-
-def _rejected(reason: str, found: Registration) -> Verdict:
-    return Verdict(reason, found.pose, np.full((6, 6), np.nan), found.matched, found.cost)
+        return Verdict("", pose, covariance, fit.matched, fit.cost)

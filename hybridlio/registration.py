@@ -164,9 +164,14 @@ def register(
     return _summary(system, matches, len(source), settings, se3.orthonormalise(pose), iterations, converged)
 
 
-def cost_at(surface: Surface, source: Array, pose: Array, kernel_m: float, threads: int) -> float:
-    """Mean robust cost, between 0 and 1, of ``source`` at a pose, without a step from there."""
-    matches = _match(surface, source, pose, 3 * kernel_m, threads)
+def cost_at(
+    surface: Surface, source: Array, pose: Array, kernel_m: float, threads: int, reach_m: float | None = None
+) -> float:
+    """Mean robust cost, between 0 and 1, of ``source`` at a pose, without a step from there.
+
+    Points without a neighbour within ``reach_m``, by default three times the kernel, cost 1.
+    """
+    matches = _match(surface, source, pose, 3 * kernel_m if reach_m is None else reach_m, threads)
     return _cost(_linearise(matches, pose, kernel_m).residuals, len(source), kernel_m)
 
 
