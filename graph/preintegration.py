@@ -103,6 +103,8 @@ class Preintegration:
     def __init__(self, calibration: Calibration, noise: ImuNoise) -> None:
         self._T_imu_lidar = calibration.T_imu_lidar
         self._noise = noise
+        self._stamp_ns = 0
+        self._turning_rad_s: Array = np.zeros(3)  # of the last step that was estimated, in the IMU's frame
 
     def predict(self, frame: Frame, state: State) -> RelativePose:
         """Integrate the frame's samples from ``state``.
@@ -117,16 +119,17 @@ class Preintegration:
                 f"frame {frame.index}: no IMU samples; choose another initial pose, such as constant-velocity, "
                 "or a recording with IMU"
             )
+        self._stamp_ns = state.stamp_ns
         if not covers(frame.imu, state.stamp_ns, frame.scan.stamp_ns):
             return self._coast(frame, state)
         step, covariance = predict_step(preintegrate(frame.imu, state, self._noise), state)
         return self._between_lidars(step, covariance, from_imu=True)
 
     def _coast(self, frame: Frame, state: State) -> RelativePose:
-        """Straight on at the state's velocity, as unsure as a vehicle is free to accelerate and turn."""
+        """On at the state's velocity and the last step's turn, as unsure as a vehicle is free to change both."""
         dt_s = (frame.scan.stamp_ns - state.stamp_ns) / NS_PER_S
         R_imu_world = state.T_world_imu[:3, :3].T
-        step = se3.make(np.eye(3), R_imu_world @ state.velocity_m_s * dt_s)
+        step = se3.exp(np.r_[self._turning_rad_s, R_imu_world @ state.velocity_m_s] * dt_s)
         by_velocity = R_imu_world @ state.covariance[6:9, 6:9] @ R_imu_world.T * dt_s**2
         sigmas = np.r_[np.full(3, _LARGEST_RATE_RAD_S * dt_s), np.full(3, _LARGEST_ACCELERATION_M_S2 * dt_s**2 / 2)]
         covariance = np.diag(sigmas**2) + np.pad(by_velocity, (3, 0))
@@ -140,4 +143,6 @@ class Preintegration:
         return RelativePose(pose, covariance, source=self.name, ok=ok, from_imu=from_imu)
 
     def correct(self, frame: Frame, estimate: RelativePose) -> None:
-        """Nothing to learn: the graph's state carries it."""
+        """Remember the turn, for times without samples; all else the graph's state carries."""
+        dt_s = (frame.scan.stamp_ns - self._stamp_ns) / NS_PER_S
+        self._turning_rad_s = self._T_imu_lidar[:3, :3] @ se3.so3_log(estimate.pose[:3, :3]) / dt_s

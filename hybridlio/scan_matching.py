@@ -57,6 +57,7 @@ class ScanMatchingSettings:
 
 _UNSURE_TRANSLATION_M = 0.5
 _UNSURE_ROTATION_RAD = 0.02
+_LEVER_M = 10.0  # half of the points are nearer: what an unsure rotation moves them by
 _SPARSE = 8  # one in so many points is enough to tell a metre from another
 _COARSE_ITERATIONS = 6
 _LIKELY = 12
@@ -226,7 +227,8 @@ class ScanMatching:
         surface, settings = self._map.surface, self._settings.registration
         assert surface is not None
         sigma_m = float(np.sqrt(initial.covariance[3:, 3:].trace()))
-        kernel_start_m = min(max(settings.kernel_m, sigma_m), 1.0)
+        sideways_m = _LEVER_M * float(np.sqrt(initial.covariance[:3, :3].trace()))
+        kernel_start_m = min(max(settings.kernel_m, sigma_m, sideways_m), 1.0)
         start = self._path.T_map_lidar @ initial.pose
         if sigma_m > _UNSURE_TRANSLATION_M:
             if self._path.twist is not None:  # who guesses no motion leaves it to this source to know the last one

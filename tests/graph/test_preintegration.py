@@ -229,6 +229,17 @@ def test_where_samples_are_missing_it_coasts_and_says_so(imu: ImuSamples):
     assert (np.diag(coasted.covariance) > np.diag(sure.covariance)).all()
 
 
+def test_coasting_goes_on_with_the_last_turn():
+    mount = se3.make(Rotation.from_euler("z", 90, degrees=True).as_matrix(), [1.0, 0.0, 0.5])
+    state, frame = straight(1, mount)
+    source = Preintegration(Calibration(mount), NOISE)
+    known = source.predict(frame(at_rest(0.0, 0.1)), state)
+    turn = se3.so3_exp([0.01, -0.02, 0.05])
+    source.correct(frame(at_rest(0.0, 0.1)), replace(known, pose=se3.make(turn, known.pose[:3, 3])))
+    coasted = source.predict(frame(ImuSamples.empty()), state)
+    np.testing.assert_allclose(coasted.pose[:3, :3], turn, atol=1e-9)
+
+
 def test_longer_coasting_is_less_sure():
     source = Preintegration(Calibration(), NOISE)
     sigmas = []
