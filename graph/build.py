@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import gtsam
@@ -40,23 +39,12 @@ _ROBUST = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Biases:
-    """Around what each pose's inertial samples are summed up: ``(N, 6)``, accelerometer first."""
-
-    values: Array
-
-    def at(self, k: int) -> gtsam.imuBias.ConstantBias:
-        """As GTSAM has them."""
-        return gtsam.imuBias.ConstantBias(self.values[k, :3], self.values[k, 3:])
-
-
 class Builder:
     """Makes GTSAM's factors of a pose graph."""
 
-    def __init__(self, data: GraphData, biases: Array | None = None) -> None:
+    def __init__(self, data: GraphData, bias: Callable[[int], gtsam.imuBias.ConstantBias] | None = None) -> None:
         self.data = data
-        self.biases = Biases(_given_biases(data) if biases is None else biases)
+        self._bias_at = bias or _given_bias(data)
         self._models: dict[tuple[str, bytes, Robust | None], gtsam.noiseModel.Base] = {}
 
     def graph(self, robust: bool = True) -> gtsam.NonlinearFactorGraph:
@@ -74,7 +62,8 @@ class Builder:
             graph.add(self.other(other, robust))
         for key in sorted(self.data.fixed, key=self.data.places.__getitem__):
             graph.add(self.held(key))
-        self._add_bias_starts(graph)
+        for key, noise in chains_without_bias(self.data):
+            graph.add(self.bias_start(key, noise))
         return graph
 
     def slots(self) -> list[int]:
@@ -90,7 +79,7 @@ class Builder:
         for k, velocity in _velocities(self.data, poses).items():
             insert(V(k), velocity)
         for k in self.with_bias():
-            insert(B(k), self.biases.at(k))
+            insert(B(k), self._bias_at(k))
         return values
 
     def with_bias(self) -> list[int]:
@@ -172,17 +161,18 @@ class Builder:
     def _imu(self, factor: Factor, keys: list[int], _: Any) -> Any:
         assert factor.samples is not None
         z, (i, j) = factor.measured, keys
-        zero, stamp_ns = np.zeros(3), int(factor.samples.stamps_ns[0])
-        accel_bias, gyro_bias = self.biases.values[i, :3], self.biases.values[i, 3:]
-        state = State(stamp_ns, np.eye(4), zero, accel_bias, gyro_bias, _GRAVITY, np.eye(15), np.eye(3))
+        bias, zero, stamp_ns = self._bias_at(i), np.zeros(3), int(factor.samples.stamps_ns[0])
+        state = State(
+            stamp_ns, np.eye(4), zero, bias.accelerometer(), bias.gyroscope(), _GRAVITY, np.eye(15), np.eye(3)
+        )  # fmt: skip
         pim = preintegrate(factor.samples, state, ImuNoise(*z))
         return gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), pim)
 
-    def _add_bias_starts(self, graph: gtsam.NonlinearFactorGraph) -> None:
-        for key, noise in chains_without_bias(self.data):
-            sigmas = np.repeat([noise.accel_bias_sigma_m_s2, noise.gyro_bias_sigma_rad_s], 3)
-            model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-            graph.add(gtsam.PriorFactorConstantBias(B(self.data.places[key]), gtsam.imuBias.ConstantBias(), model))
+    def bias_start(self, key: Key, noise: ImuNoise) -> Any:
+        """The biases of a chain that nothing measures are around zero where it starts."""
+        sigmas = np.repeat([noise.accel_bias_sigma_m_s2, noise.gyro_bias_sigma_rad_s], 3)
+        model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        return gtsam.PriorFactorConstantBias(B(self.data.places[key]), gtsam.imuBias.ConstantBias(), model)
 
 
 def noise_model(form: str, values: Array, kernel: Robust | None, dimension: int) -> gtsam.noiseModel.Base:
@@ -199,12 +189,16 @@ def kernel_model(kernel: Robust, model: gtsam.noiseModel.Base) -> gtsam.noiseMod
     return gtsam.noiseModel.Robust.Create(_ROBUST[kernel.kernel](width), model)
 
 
-def _given_biases(data: GraphData) -> Array:
-    biases = np.zeros((len(data), 6))
-    for factor in data.others.values():
-        if factor.kind == "bias":
-            biases[data.places[factor.keys[0]]] = factor.measured
-    return biases
+def _given_bias(data: GraphData) -> Callable[[int], gtsam.imuBias.ConstantBias]:
+    """Biases as measured, else zero."""
+    given = {data.places[f.keys[0]]: f.measured for f in data.others.values() if f.kind == "bias"}
+    zero = np.zeros(6)
+
+    def at(place: int) -> gtsam.imuBias.ConstantBias:
+        bias = given.get(place, zero)
+        return gtsam.imuBias.ConstantBias(bias[:3], bias[3:])
+
+    return at
 
 
 def _velocities(data: GraphData, poses: Array) -> dict[int, Array]:

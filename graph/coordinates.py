@@ -78,6 +78,22 @@ def from_matrices(T: Array, dimension: Dimension) -> Array:
     return np.hstack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)])
 
 
+def our_order(matrix: Array, dimension: Dimension) -> Array:
+    """A matrix over GTSAM's tangent vectors in our order, rotation first."""
+    if dimension == 3:
+        return np.array(matrix)
+    order = np.argsort(GTSAM_ORDER[2])
+    return np.asarray(matrix[np.ix_(order, order)])
+
+
+def relative_covariance(joint: Any, a: int, b: int, T_b_a: Array, dimension: Dimension) -> Array:
+    """Covariance of the pose ``b`` in the frame of pose ``a`` from GTSAM's joint marginal, which names them so."""
+    blocks = np.block([[our_order(joint.at(m, n), dimension) for n in (a, b)] for m in (a, b)])
+    J = np.hstack([-adjoint(T_b_a, dimension), np.eye(TANGENT_SIZE[dimension])])
+    covariance = J @ blocks @ J.T
+    return np.asarray((covariance + covariance.T) / 2)
+
+
 def adjoint(T: Array, dimension: Dimension) -> Array:
     """Adjoint of one pose ``(4, 4)``, in our order: ``(6, 6)``, in the plane ``(3, 3)``."""
     full = se3.adjoint(T)

@@ -122,7 +122,6 @@ class EdgeTable:
         self.extend([number], [ends], factor.measured[None], values[None], [FORMS.index(noise.form)])
         if factor.robust is not None:
             self.robust[number] = factor.robust
-        self._made[number] = factor
 
     def remove(self, number: int) -> None:
         """Take one out that is there."""
@@ -136,8 +135,8 @@ class EdgeTable:
         copy = EdgeTable.__new__(EdgeTable)
         copy._columns = {name: rows.where(keep) for name, rows in self._columns.items()}
         left = self.robust.keys() & copy.ids.tolist() if self.robust else ()
+        copy._made = {}
         copy.robust = {number: self.robust[number] for number in left}
-        copy._made = dict(self._made)
         return copy
 
     def factor(self, number: int, keys: list[Key]) -> Factor:

@@ -57,7 +57,7 @@ def reject_outliers(data: GraphData, start: Array, report: Progress) -> tuple[Ar
     values = optimise(builder.values(start), weights)
     control = 0.0
     for step in range(_STEPS):
-        chi2 = edges.chi2(co.to_matrices(poses_of(values, data)))
+        chi2 = edges.chi2(co.to_matrices(poses_of(values, data.dimension)))
         control = control * GRADUATION if step else bound / max(2 * float(chi2.max()) - bound, bound)
         weights = truncated_weights(chi2, bound, control)
         report("rejecting", step, float(np.minimum(chi2, bound).sum()))
@@ -65,7 +65,7 @@ def reject_outliers(data: GraphData, start: Array, report: Progress) -> tuple[Ar
             break
         values = optimise(values, weights)
     wrong = np.array(loops)[weights < 0.5]
-    return poses_of(values, data), frozenset(wrong.tolist())
+    return poses_of(values, data.dimension), frozenset(wrong.tolist())
 
 
 def start_without_loops(data: GraphData) -> Array | None:

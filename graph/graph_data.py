@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -201,6 +201,25 @@ class GraphData:
         """Initial value of a pose as it is kept, or None."""
         found = self._initial.array[self._places[key]]
         return None if np.isnan(found[0]) else found.copy()
+
+    def keys_at(self, places: Iterable[int]) -> list[Key]:
+        """Keys of the poses at some places."""
+        return [self._keys[place] for place in places]
+
+    def concerning(self, places: range) -> set[int]:
+        """Ids of the factors that concern any of the poses at some places."""
+        ends = self.edges.ends
+        near = ((ends >= places.start) & (ends < places.stop)).any(axis=1)
+        others = (n for n, f in self.others.items() if any(self._places[key] in places for key in f.keys))
+        return {*self.edges.ids[near].tolist(), *others}
+
+    def drop(self, ids: set[int], places: range, coordinates: Array) -> None:
+        """Take out factors whose effect is held elsewhere; their poses keep ``coordinates`` as initial values."""
+        self.edges = self.edges.where(~np.isin(self.edges.ids, list(ids)))
+        for number in ids & self.others.keys():
+            del self.others[number]
+        self._initial.array[places.start : places.stop] = coordinates
+        self._fixed.difference_update(self.keys_at(places))
 
     # for readers, which have checked what they bring
 

@@ -97,12 +97,13 @@ class Descent:
         stepped = self._descend(graph, self._builder.values(start))
         inertial = self._builder.with_bias()
         for _ in range(_INERTIAL_ROUNDS - 1 if inertial else 0):
-            graph = Builder(self._data, _biases(stepped.values, inertial, len(self._data))).graph()
+            graph = Builder(self._data, biases_of(stepped.values)).graph()
             again = self._descend(graph, stepped.values)
             stepped = replace(again, before=stepped.before, iterations=stepped.iterations + again.iterations)
+        values, poses = stepped.values, poses_of(stepped.values, self._data.dimension)
         return Solved(
-            self._data, graph, stepped.values, poses_of(stepped.values, self._data), stepped.before, stepped.error,
-            stepped.iterations, stepped.converged, self._orthogonal,
+            self._data, graph, values, poses, stepped.before, stepped.error, stepped.iterations, stepped.converged,
+            self._orthogonal,
         )  # fmt: skip
 
     def _descend(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> _Stepped:
@@ -185,19 +186,17 @@ def _steps_away(data: GraphData, places: list[int]) -> int:
     return int(steps.max())
 
 
-def poses_of(values: gtsam.Values, data: GraphData) -> Array:
+def poses_of(values: gtsam.Values, dimension: int) -> Array:
     """Coordinates ``(N, 7)`` or ``(N, 3)`` of all poses."""
-    if data.dimension == 2:
+    if dimension == 2:
         return np.array(gtsam.utilities.extractPose2(values)).reshape(-1, 3)
     rows = np.array(gtsam.utilities.extractPose3(values)).reshape(-1, 12)  # rotation by rows, then position
     return co.from_matrices(se3.make(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:]), 3)
 
 
-def _biases(values: gtsam.Values, places: list[int], count: int) -> Array:
-    biases = np.zeros((count, 6))
-    for k in places:
-        biases[k] = values.atConstantBias(B(k)).vector()
-    return biases
+def biases_of(values: gtsam.Values) -> Callable[[int], gtsam.imuBias.ConstantBias]:
+    """Biases by place, as the builder asks for them."""
+    return lambda place: values.atConstantBias(B(place))
 
 
 def _linear_solver(orthogonal: bool) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -10,45 +11,90 @@ from hybridlio import se3
 from hybridlio.errors import ConfigError, GraphError
 from hybridlio.estimates import Array
 from hybridlio.graph import coordinates as co
+from hybridlio.graph.build import Builder
 from hybridlio.graph.checks import check_determined, labels
 from hybridlio.graph.edges import Edges, edges_of
 from hybridlio.graph.graph_data import GraphData
-from hybridlio.graph.initial import find
+from hybridlio.graph.initial import METHODS, find
 from hybridlio.graph.keys import named
-from hybridlio.graph.levenberg import Descent, Progress
+from hybridlio.graph.levenberg import Descent, Progress, Solved, biases_of, poses_of
 from hybridlio.graph.measurements import Factor
 from hybridlio.graph.solution import Solution
 
-Solver: TypeAlias = Literal["auto", "batch", "gnc"]
-SOLVERS = ("auto", "batch", "gnc")
+Backend: TypeAlias = Literal["auto", "batch", "gnc", "incremental", "fixed-lag"]
+Initial: TypeAlias = Literal["auto", "given", "odometry", "spanning-tree", "chordal"]
+BACKENDS = ("auto", "batch", "gnc", "incremental", "fixed-lag")
+INITIAL = ("auto", "given", *METHODS)
+LAG = 200  # poses
 _FITS = 2.0  # times the degrees of freedom
 
 
-def optimise(
-    graph: GraphData, solver: str, initial: str, max_iterations: int, tolerance: float, progress: Progress | None
-) -> Solution:  # fmt: skip
+@dataclass(frozen=True)
+class Settings:
+    """Of :meth:`hybridlio.graph.pose_graph.PoseGraph.optimize`.
+
+    Raises:
+        ConfigError: one of them cannot be.
+    """
+
+    backend: str = "auto"
+    initial: str = "auto"
+    max_iterations: int = 100
+    tolerance: float = 1e-6
+    lag: int = LAG
+
+    def __post_init__(self) -> None:
+        if self.backend not in BACKENDS:
+            raise ConfigError(f"no backend is called {self.backend!r}; there are {', '.join(BACKENDS)}")
+        if self.initial not in INITIAL:
+            raise ConfigError(f"initial={self.initial!r}: there are {', '.join(INITIAL)}")
+        if self.max_iterations < 1 or not self.tolerance > 0 or self.lag < 1:
+            raise ConfigError(
+                f"max_iterations {self.max_iterations}, tolerance {self.tolerance}, lag {self.lag}: all are positive"
+            )
+
+
+def optimise(graph: GraphData, settings: Settings, progress: Progress | None) -> Solution:
     """Solve a pose graph; see :meth:`hybridlio.graph.pose_graph.PoseGraph.optimize`."""
-    if solver not in SOLVERS or initial not in ("auto", "given") or max_iterations < 1 or not tolerance > 0:
-        raise ConfigError(
-            f"solver {solver!r}, initial {initial!r}, max_iterations {max_iterations}, tolerance {tolerance}: "
-            f"solvers are {', '.join(SOLVERS)}, initial is auto or given, max_iterations at least 1, tolerance positive"
-        )
     check_determined(graph)
-    report = progress or _silent
+    report = progress or silent
     data = graph.without()
-    if solver != "gnc":
-        return Solution(data, Descent(data, max_iterations, tolerance, report)(choose_start(data, initial)))
+    if settings.backend == "gnc":
+        return _reject(data, settings, report)
+    if settings.backend in ("incremental", "fixed-lag"):
+        return Solution(data, _replayed(data, settings, report))
+    descend = Descent(data, settings.max_iterations, settings.tolerance, report)
+    return Solution(data, descend(choose_start(data, settings.initial)))
+
+
+def _reject(data: GraphData, settings: Settings, report: Progress) -> Solution:
     from hybridlio.graph.gnc import reject_outliers, start_without_loops
 
-    start = start_without_loops(data) if initial == "auto" else None
-    start, rejected = reject_outliers(data, choose_start(data, initial) if start is None else start, report)
+    start = start_without_loops(data) if settings.initial == "auto" else None
+    start = choose_start(data, settings.initial) if start is None else start
+    start, rejected = reject_outliers(data, start, report)
     kept = data.without(rejected)
     check_determined(kept)
-    return Solution(data, Descent(kept, max_iterations, tolerance, report)(start), rejected)
+    return Solution(data, Descent(kept, settings.max_iterations, settings.tolerance, report)(start), rejected)
+
+
+def _replayed(data: GraphData, settings: Settings, report: Progress) -> Solved:
+    from hybridlio.graph.replay import replay
+
+    found, updates = replay(data, settings.backend, settings.lag, report)
+    values = Builder(data).values(poses_of(found, data.dimension))
+    variables = found.keys()
+    for variable in variables:
+        values.erase(variable)
+    values.insert(found)
+    start = Builder(data).values(choose_start(data, settings.initial))
+    graph = Builder(data, biases_of(values)).graph()
+    errors = float(graph.error(start)), float(graph.error(values))
+    return Solved(data, graph, values, poses_of(values, data.dimension), *errors, updates, True, True)
 
 
 def choose_start(data: GraphData, initial: str) -> Array:
-    """Where to start from: ``given`` initial values, or the best of several.
+    """Where to start from: ``given`` initial values, those found in one way, or (``auto``) the best of several.
 
     These are the given values, chordal ones, and chordal ones without the factors that have a robust kernel.
     Given values that fit about as well as they ever can are taken as they are.
@@ -56,6 +102,8 @@ def choose_start(data: GraphData, initial: str) -> Array:
     Raises:
         GraphError: values are missing and cannot be found.
     """
+    if initial in METHODS:
+        return find(data, initial)
     start = data.initial_coordinates()
     if initial == "given":
         if start is None:
@@ -110,6 +158,6 @@ def _absolute(factor: Factor, pose: Array) -> Array:
     return step if len(factor.measured) == 7 else step[2:5]
 
 
-def _silent(stage: str, iteration: int, error: float) -> None:
+def silent(stage: str, iteration: int, error: float) -> None:
     """Report to nobody."""
     del stage, iteration, error

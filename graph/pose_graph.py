@@ -18,7 +18,8 @@ from hybridlio.sensors import ImuNoise, ImuSamples
 if TYPE_CHECKING:
     from hybridlio.graph.initial import Method
     from hybridlio.graph.levenberg import Progress
-    from hybridlio.graph.optimise import Solver
+    from hybridlio.graph.online_solver import OnlineSolver
+    from hybridlio.graph.optimise import Backend, Initial
     from hybridlio.graph.solution import Solution
 
 _UP = np.array([0.0, 0.0, 1.0])
@@ -172,27 +173,48 @@ class PoseGraph(GraphData):
         self._initial.array[:] = find(self, method)
 
     def optimize(
-        self, solver: Solver = "auto", *, initial: Literal["auto", "given"] = "auto", max_iterations: int = 100,
-        tolerance: float = 1e-6, progress: Progress | None = None,
+        self, backend: Backend = "auto", *, initial: Initial = "auto", max_iterations: int = 100,
+        tolerance: float = 1e-6, lag: int = 200, progress: Progress | None = None,
     ) -> Solution:  # fmt: skip
         """Find the poses, velocities and biases that fit all factors best.
 
         Args:
-            solver: ``batch`` is Gauss-Newton, damped where the error would rise; ``gnc`` finds and rejects wrong loop
+            backend: ``batch`` is Gauss-Newton, damped where the error would rise; ``gnc`` finds and rejects wrong loop
                 closures (graduated non-convexity, Yang et al., RA-L 2020) and takes factors between consecutive keys
-                for right; ``auto`` is ``batch``.
+                for right; ``incremental`` and ``fixed-lag`` give the graph pose by pose, in its order, to what
+                :meth:`online` makes; ``auto`` is ``batch``.
             initial: ``auto`` starts from the given initial values or from chordal ones, whichever fit better; from
-                ``given`` ones where it says so.
+                ``given`` ones, or those that a method of :meth:`initialise` finds, where it says so. Online backends
+                start each pose from its neighbours.
             max_iterations: of Gauss-Newton and Levenberg-Marquardt together.
             tolerance: share of the error that further iterations may still gain.
+            lag: poses that ``fixed-lag`` keeps.
             progress: called with the stage, the iteration and the error there.
 
         Raises:
             GraphError: the factors do not determine every pose; names the keys.
         """
-        from hybridlio.graph.optimise import optimise
+        from hybridlio.graph.optimise import Settings, optimise
 
-        return optimise(self, solver, initial, max_iterations, tolerance, progress)
+        return optimise(self, Settings(backend, initial, max_iterations, tolerance, lag), progress)
+
+    def online(
+        self, backend: Literal["incremental", "fixed-lag"] = "incremental", *, lag: int = 200, forget: bool = False
+    ) -> OnlineSolver:
+        """A solver that follows this graph while it grows; its ``update()`` takes in what has changed.
+
+        Args:
+            backend: ``incremental`` keeps everything (iSAM2); ``fixed-lag`` the newest poses, in constant time.
+            lag: poses that ``fixed-lag`` keeps.
+            forget: whether ``fixed-lag`` takes the factors of poses that leave the lag out of the graph, and leaves
+                their last estimates as initial values, so that the graph stays small too.
+
+        Raises:
+            ConfigError: no such backend, or a lag that is not positive.
+        """
+        from hybridlio.graph.online_solver import OnlineSolver
+
+        return OnlineSolver(self, backend, lag, forget)
 
     # files
 

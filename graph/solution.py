@@ -87,8 +87,8 @@ class Solution:
 
         Marginal over everything else; a fixed pose's is that of holding it, 1e-6 rad and m.
         """
-        covariance = self._marginals.marginalCovariance(X(self._at(key)))
-        return self._ours(np.asarray(covariance))
+        covariance = np.asarray(self._marginals.marginalCovariance(X(self._at(key))))
+        return co.our_order((covariance + covariance.T) / 2, self._data.dimension)
 
     def relative_covariance(self, i: Key, j: Key) -> Array:
         """Covariance ``(6, 6)`` of the pose of j in the frame of i, ``T_i_j = T_i⁻¹ T_j``; in the plane ``(3, 3)``.
@@ -100,11 +100,8 @@ class Solution:
         if a == b:
             return np.zeros((size, size))
         joint = self._marginals.jointMarginalCovariance([X(a), X(b)])
-        blocks = [[self._ours(joint.at(X(m), X(n)), False) for n in (a, b)] for m in (a, b)]
         T_j_i = se3.between(self.poses[b], self.poses[a])
-        J = np.hstack([-co.adjoint(T_j_i, self._data.dimension), np.eye(size)])
-        covariance = J @ np.block(blocks) @ J.T
-        return np.asarray((covariance + covariance.T) / 2)
+        return co.relative_covariance(joint, X(a), X(b), T_j_i, self._data.dimension)
 
     def residual(self, factor_id: int) -> Array:
         """What a factor's measurement and the answer differ by, not divided by its deviations; rejected ones too.
@@ -156,14 +153,6 @@ class Solution:
         except RuntimeError as error:
             raise GraphError(f"covariances: {' '.join(str(error).split())}") from error
         return isam
-
-    def _ours(self, matrix: Array, symmetric: bool = True) -> Array:
-        if symmetric:
-            matrix = (matrix + matrix.T) / 2
-        if self._data.dimension == 3:
-            return np.array(matrix)
-        order = np.argsort(co.GTSAM_ORDER[2])
-        return np.asarray(matrix[np.ix_(order, order)])
 
     def _at(self, key: Key) -> int:
         if key not in self._index:

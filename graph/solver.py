@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import gtsam
 import numpy as np
+
+from hybridlio.estimates import Array
 
 # A change of the newest pose hardly moves the oldest: below this change (rad, m, m/s) it is not carried on to older
 # variables, which would make each update cost as much as the run is long. The newest are always solved in full.
@@ -21,15 +25,25 @@ _RELINEARISE = {
 
 def incremental_solver() -> gtsam.ISAM2:
     """An empty iSAM2 for graphs of poses ``x`` and ``m``, velocities ``v``, biases ``b``, gravity ``g`` …"""
+    return gtsam.ISAM2(make_isam_params(_RELINEARISE, _WILDFIRE_THRESHOLD))
+
+
+def make_isam_params(relinearise: Mapping[str, Array], wildfire_threshold: float) -> gtsam.ISAM2Params:
+    """Parameters of iSAM2 as used everywhere here.
+
+    Args:
+        relinearise: changes beyond which a variable is linearised anew, by the letter of its name.
+        wildfire_threshold: changes below it are not carried on to older variables.
+    """
     params = gtsam.ISAM2Params()
     params.setFactorization("QR")  # Cholesky finds long straight chains indeterminate
-    params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(_WILDFIRE_THRESHOLD))
+    params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(wildfire_threshold))
     params.relinearizeSkip = 10
     thresholds = gtsam.ISAM2ThresholdMap()
-    for kind, change in _RELINEARISE.items():
+    for kind, change in relinearise.items():
         thresholds.insert((kind, change))
     params.setRelinearizeThreshold(thresholds)
-    return gtsam.ISAM2(params)
+    return params
 
 
 def reason(error: RuntimeError) -> str:

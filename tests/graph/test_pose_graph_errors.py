@@ -61,7 +61,7 @@ WRONG = {
     "key of text": (lambda g: g.add_pose("x1"), GraphError, "x1"),
     "key of three": (lambda g: g.add_pose((1, 2, 3)), GraphError, re.escape("(1, 2, 3)")),
     "fixed unknown key": (lambda g: g.fix(5), GraphError, "key 5"),
-    "unknown solver": (lambda g: g.optimize("newton"), ConfigError, "newton"),
+    "unknown backend": (lambda g: g.optimize("newton"), ConfigError, "newton"),
     "unknown initialisation": (lambda g: g.initialise("magic"), ConfigError, "magic"),
 }  # fmt: skip
 
