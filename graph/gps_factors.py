@@ -6,16 +6,19 @@ the nearest scan to its time is taken from the path as it is known (:class:`hybr
 that the time shift draws along the velocity. In 50 ms the path is known to millimetres where a fix is known to
 decimetres, so no variable and no noise is added for it; each round takes the levers anew.
 
-Keys: ``e`` pose of the run's world in the fixes' frame, ``t`` time shift in seconds.
+Keys: ``e`` pose of the run's world in the fixes' frame, ``t`` time shift in seconds, and for each fix the antenna as a
+point, three times over, so that GTSAM's own factors reach from scan to fix: a factor in Python gets a copy of all
+values whenever it is evaluated, which takes longer than all the rest on a long run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import E, G, T, X
+from gtsam.symbol_shorthand import A, E, G, P, T, W, X
 from numpy.typing import NDArray
 
 from hybridlio import se3
@@ -32,6 +35,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 _PLUMB_SIGMA_RAD = 5e-4  # of the vertical against the ellipsoid's, and over a few kilometres
 _LEVEL_SIGMA_RAD = 0.1  # without IMU: how level the lidar started
 _NOWHERE_RAD, _NOWHERE_M = 10.0, 1e5
+_LINK_M = 1e-3
 _MEDIAN_CHI2 = 2.366  # of three degrees of freedom
 _SECOND_DIFFERENCE = 6.0  # 1 + 4 + 1: variance of x[-1] - 2 x[0] + x[1]
 _LEAST_FOR_SPREAD = 10
@@ -69,8 +73,9 @@ class GpsGroup:
         values = gtsam.Values()
         values.insert(E(0), gtsam.Pose3(T_enu_world))
         values.insert(T(0), np.array([shift]))
-        sure = [*self._priors(T_enu_world), _plumb_factor(states[0])]
-        return GroupFactors(sure, self._fix_factors(path, shift), values)
+        group = GroupFactors([*self._priors(T_enu_world), _plumb_factor(states[0])], values=values)
+        self._add_fixes(group, path, shift, T_enu_world)
+        return group
 
     def _align(self, path: PosePath, start: State) -> FixAlignment:
         stamps = fix_stamps(self._fixes)
@@ -98,22 +103,32 @@ class GpsGroup:
             gtsam.PriorFactorVector(T(0), np.zeros(1), shift),
         ]
 
-    def _fix_factors(self, path: PosePath, shift_s: float) -> list[Doubtful]:
+    def _add_fixes(self, group: GroupFactors, path: PosePath, shift_s: float, T_enu_world: Array) -> None:
+        """The antenna in the nearest scan's frame ``a``, in the run's world ``w`` and in the fixes' frame ``p``."""
         fixes = [self._fixes[k] for k in self._rows]
         stamps = fix_stamps(fixes, shift_s)
         near = path.nearest(stamps)
         points, velocities = path.points(stamps, self._antenna)
+        placed = se3.transform(T_enu_world, points)
         T_scan_world = se3.inverse(path.poses[near])
         levers = (T_scan_world @ np.column_stack([points, np.ones(len(points))])[..., None])[:, :3, 0]
         drawn = (T_scan_world[:, :3, :3] @ velocities[..., None])[..., 0]
-        return [
-            Doubtful(
-                _maker(int(k), fix.position_m, lever, velocity, shift_s),
-                (self._scale or 1.0) ** 2 * fix.covariance_m2,
-                f"GPS fix at {fix.stamp_ns} ns",
+        link = noise.sigmas(np.full(3, _LINK_M))
+        for n, (k, fix) in enumerate(zip(near.tolist(), fixes, strict=True)):
+            for key, value in ((A(n), levers[n]), (W(n), points[n]), (P(n), placed[n])):
+                group.values.insert(key, value)
+            links = [
+                _draw(n, levers[n], drawn[n], shift_s, link),
+                gtsam.ReferenceFrameFactorPoint3Pose3(A(n), X(k), W(n), link),
+                gtsam.ReferenceFrameFactorPoint3Pose3(W(n), E(0), P(n), link),
+            ]
+            group.sure.extend(links)
+            covariance = (self._scale or 1.0) ** 2 * fix.covariance_m2
+            group.doubtful.append(
+                Doubtful(
+                    partial(gtsam.PriorFactorPoint3, P(n), fix.position_m), covariance, f"GPS fix at {fix.stamp_ns} ns"
+                )
             )
-            for k, fix, lever, velocity in zip(near, fixes, levers, drawn, strict=True)
-        ]
 
     def read(self, answer: GroupAnswer) -> GpsFit:
         """Frame, clock, and how each fix fits."""
@@ -152,26 +167,13 @@ def _up_of(state: State) -> tuple[Array, float]:
     return -state.gravity_m_s2, float(np.hypot(spread, _PLUMB_SIGMA_RAD))
 
 
-def _maker(
-    k: int, position: Array, lever: Array, velocity: Array, shift_s: float
-) -> Callable[[gtsam.noiseModel.Base], gtsam.NonlinearFactor]:
-    """The factor of one fix, nearest scan ``k``: ``T_enu_world · T_world_imu · (lever + velocity · (t - shift))``."""
-
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        T_enu_world, T_world_imu = values.atPose3(E(0)), values.atPose3(X(k))
-        arm = lever + velocity * (float(values.atVector(T(0))[0]) - shift_s)
-        if jacobians is None:
-            return np.asarray(T_enu_world.transformFrom(T_world_imu.transformFrom(arm)) - position)
-        by_world, by_point = np.zeros((3, 6), order="F"), np.zeros((3, 3), order="F")
-        by_pose, by_arm = np.zeros((3, 6), order="F"), np.zeros((3, 3), order="F")
-        point = T_world_imu.transformFrom(arm, by_pose, by_arm)
-        placed = T_enu_world.transformFrom(point, by_world, by_point)
-        jacobians[0] = by_world
-        jacobians[1] = by_point @ by_pose
-        jacobians[2] = (by_point @ by_arm @ velocity)[:, None]
-        return np.asarray(placed - position)
-
-    return lambda model: gtsam.CustomFactor(model, [E(0), X(k), T(0)], error)
+def _draw(n: int, lever: Array, velocity: Array, shift_s: float, model: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
+    """``a = lever + velocity · (t - shift)``, which is linear and stays as it is."""
+    at = gtsam.Values()
+    at.insert(A(n), lever)
+    at.insert(T(0), np.array([shift_s]))
+    linear = gtsam.JacobianFactor(A(n), np.eye(3), T(0), -velocity[:, None], np.zeros(3), model)
+    return gtsam.LinearContainerFactor(linear, at)
 
 
 def _plumb_factor(start: State) -> gtsam.NonlinearFactor:

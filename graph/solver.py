@@ -19,6 +19,7 @@ _RELINEARISE = {
     "b": np.r_[np.full(3, 0.1), np.full(3, 0.01)],  # biases: m/s², rad/s
     "g": np.full(3, 0.1),  # gravity, m/s²
     "e": np.r_[np.full(3, 0.02), np.full(3, 1.0)],  # world in the frame of GPS fixes: rad, m
+    **{kind: np.full(3, 1.0) for kind in "awp"},  # antenna at a GPS fix, m
     "t": np.full(1, 0.1),  # time between the clocks of fixes and scans, s
 }
 

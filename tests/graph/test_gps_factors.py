@@ -7,13 +7,13 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import E, G, T, X
+from gtsam.symbol_shorthand import E, G
 from scipy.spatial.transform import Rotation
 
 from hybridlio import se3
 from hybridlio.errors import DataError, EstimationError
 from hybridlio.gps import GpsOptions
-from hybridlio.graph.gps_factors import GpsGroup, _maker, _plumb_factor
+from hybridlio.graph.gps_factors import GpsGroup, _plumb_factor
 from hybridlio.graph.offline import smooth
 from hybridlio.pose_path import PosePath
 from hybridlio.sensors import Calibration, GpsFix, ImuSamples
@@ -125,7 +125,7 @@ def test_wrong_fixes_are_rejected_and_counted(drive: Any, without_wrong: Any, ro
 def test_an_outage_is_bridged_by_odometry_and_imu(drive: Any, smoothed: Any):
     record = with_fixes(drive, 1)
     start = int(record.online.stamps_ns[0])
-    gap = (start + 8_000_000_000, start + 16_000_000_000)
+    gap = (start + 6_000_000_000, start + 14_000_000_000)
     out = smooth(record, gps=GpsOptions(outages=[gap]))
     fit = out.found["gps"]
     assert (~fit.used).sum() >= 15
@@ -168,36 +168,23 @@ def test_antennas_are_three_finite_numbers():
         Calibration(antenna_imu_m=np.array([1.0, np.nan, 0.0]))
 
 
-@pytest.mark.parametrize("which", ["fix", "plumb"])
-def test_jacobians_agree_with_differences(drive: Any, which: str):
+def test_the_plumb_factors_jacobian_agrees_with_differences(drive: Any):
     rng = np.random.default_rng(3)
     values = gtsam.Values()
     values.insert(E(0), gtsam.Pose3(se3.exp(rng.normal(size=6))))
-    values.insert(X(4), gtsam.Pose3(se3.exp(rng.normal(size=6))))
-    values.insert(T(0), np.array([0.2]))
     values.insert(G(0), rng.normal(size=3) * 9.0)
-    if which == "fix":
-        model = gtsam.noiseModel.Unit.Create(3)
-        factor = _maker(4, rng.normal(size=3), rng.normal(size=3), rng.normal(size=3), 0.1)(model)
-    else:
-        factor = _plumb_factor(drive.start)
-    jacobian, residual = factor.linearize(values).jacobian()
-    offset = 0
-    for key in list(factor.keys()):
-        size = {"e": 6, "x": 6, "t": 1, "g": 3}[chr(gtsam.Symbol(key).chr())]
-        for axis in range(size):
-            step = np.zeros(size)
-            step[axis] = 1e-6
+    factor = _plumb_factor(drive.start)
+    jacobian, _ = factor.linearize(values).jacobian()
+    columns = []
+    for key, size in ((E(0), 6), (G(0), 3)):
+        for step in 1e-6 * np.eye(size):
             moved = []
             for sign in (1, -1):
                 delta = gtsam.VectorValues()
                 delta.insert(key, sign * step)
                 moved.append(-factor.linearize(values.retract(delta)).jacobian()[1])
-            numeric = (moved[0] - moved[1]) / 2e-6
-            np.testing.assert_allclose(jacobian[:, offset + axis], numeric, atol=2e-5 * max(1, np.abs(numeric).max()))
-        offset += size
-    assert offset == jacobian.shape[1]
-    assert residual.shape == (jacobian.shape[0],)
+            columns.append((moved[0] - moved[1]) / 2e-6)
+    np.testing.assert_allclose(jacobian, np.column_stack(columns), rtol=1e-4, atol=1e-3)
 
 
 def test_the_same_group_goes_with_others(drive: Any):
