@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -172,7 +173,9 @@ def _draw(n: int, lever: Array, velocity: Array, shift_s: float, model: gtsam.no
     at = gtsam.Values()
     at.insert(A(n), lever)
     at.insert(T(0), np.array([shift_s]))
-    linear = gtsam.JacobianFactor(A(n), np.eye(3), T(0), -velocity[:, None], np.zeros(3), model)
+    by_shift = -velocity[:, None]
+    make: Any = gtsam.JacobianFactor  # its stubs know other models than its code
+    linear = make(A(n), np.eye(3), T(0), by_shift, np.zeros(3), model)
     return gtsam.LinearContainerFactor(linear, at)
 
 

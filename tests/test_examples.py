@@ -70,6 +70,22 @@ def test_a_g2o_file_is_solved_and_written_beside(folder):
     assert (folder / "spiral-solved.g2o").is_file()
 
 
+def test_a_finished_run_is_smoothed_and_its_error_falls(folder):
+    text = run_example("smooth_run.py", folder)
+    before, after = (float(number) for number in re.findall(r"error (\S+) before, (\S+) after", text)[0])
+    assert after < before
+    assert (folder / "odometry.npz").is_file()
+
+
+def test_gps_with_an_outage_is_fused_and_put_on_the_map(folder):
+    text = run_example("gps_outage.py", folder)
+    without_m, with_m, outage_m = metres(text)[:3]
+    assert with_m < without_m
+    assert outage_m < without_m
+    assert ", 1 rejected" in text
+    assert (folder / "georeferenced.geojson").is_file()
+
+
 def test_no_example_goes_untested():
     named = re.findall(r'run_example\("(\w+\.py)"', Path(__file__).read_text())
     assert sorted(set(named)) == sorted(path.name for path in (ROOT / "examples").glob("*.py"))

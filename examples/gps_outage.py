@@ -1,0 +1,55 @@
+"""Fuse GPS with an outage: odometry, IMU and fixes whose clock is off and which fail for a third of the drive.
+
+python examples/gps_outage.py [FOLDER]
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import hybridlio as hl
+from hybridlio.geodesy import GeodeticPoint
+from hybridlio.georeference import georeference, write_georeferenced
+from hybridlio.gps import GpsOptions
+from hybridlio.metrics import ate
+from hybridlio.record import Record
+from hybridlio.simulation.chain import make_chain
+
+LATE_S, SIGMA_M = 0.3, 0.2
+ORIGIN = GeodeticPoint(49.0, 8.4, 110.0)
+
+
+def main(folder: str | None = None, *_: str) -> None:
+    drive = make_chain(5, steps=200, step_sigmas=np.r_[np.full(3, 4e-3), np.full(3, 0.08)])  # 20 s, a poor odometry
+    stamps = np.array([frame.scan.stamp_ns for frame in drive.frames])
+    poses = [np.eye(4)]
+    for step in drive.relative:
+        poses.append(poses[-1] @ step.pose)
+    odometry, truth = hl.Trajectory(stamps, np.array(poses)), hl.Trajectory(stamps, drive.lidar_poses)
+
+    rng = np.random.default_rng(1)
+    antenna = drive.poses[::5, :3, 3] + SIGMA_M * rng.standard_normal((41, 3))  # at the IMU, two fixes a second
+    late = stamps[::5] + round(LATE_S * 1e9)
+    fixes = tuple(hl.GpsFix(int(t), p, SIGMA_M**2 * np.eye(3), ORIGIN) for t, p in zip(late, antenna, strict=True))
+    fixes = (*fixes[:5], replace(fixes[5], position_m=fixes[5].position_m + 30), *fixes[6:])  # one far off
+
+    record = Record.from_odometry(
+        odometry, drive.record(odometry.poses).imu, fixes, drive.calibration, covariances=drive.relative[0].covariance
+    )
+    outage = (int(stamps[70]), int(stamps[135]))
+    for name, gps in (("without GPS", False), ("with GPS", True), ("with an outage", GpsOptions(outages=[outage]))):
+        smoothed = hl.smooth(record, gps=gps)
+        print(f"{name}: ATE {ate(truth, smoothed.trajectory, lever_m=0.0).rmse_m:.3f} m")
+    print(f"the last: {smoothed.found['gps'].summary()}")
+    placed = georeference(record, smoothed.trajectory)
+    for path in write_georeferenced(Path(folder or tempfile.mkdtemp(prefix="hybridlio-")), placed):
+        print(f"written to {path}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
