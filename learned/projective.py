@@ -27,6 +27,7 @@ _LEVER_M = 10.0  # rotations are measured at this lever, so that the system is w
 _DAMPING = 1e-4  # of the normal equations a point: directions that hardly any cell constrains stay as they are
 _LIMIT_M = 1.0
 _DISTANCE_M = 0.1  # what is left after an initial pose, so that networks see numbers around 1
+_FEWEST = 9000  # so many points are not thinned any more
 _ONE_OF = (4, 2)  # so many points are taken in the first half of the steps, and in the others
 _DILATION = 3
 _COARSE = 2  # features have a cell for so many rows and columns of the maps
@@ -81,9 +82,11 @@ class ProjectiveSteps(nn.Module):
         """Poses ``T_k_k1`` ``(B, 4, 4)`` after each step.
 
         A step takes the pose before it as given: gradients go through the weights, not back through earlier steps. The
-        first half of the steps takes every fourth point, the others every second: more do not make them better.
+        first half of the steps takes every fourth point, the others every second, of large maps: more do not make
+        them better.
         """
-        few, more = (_thinned(current, by) for by in _ONE_OF)
+        most = max(current.points.shape[-1] // _FEWEST, 1)
+        few, more = (_thinned(current, min(by, most)) for by in _ONE_OF)
         poses = []
         for k, kernel_m in enumerate(self.kernels_m):
             points = few if k < self.settings.projective_steps // 2 else more
