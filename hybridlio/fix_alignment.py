@@ -134,9 +134,9 @@ class _Fit:
     def _robust(self, points: Array, fixes: Array) -> tuple[Array, Array, Array]:
         """Rigid motion, weights and squared distances, by Geman-McClure weights whose width shrinks to the spread."""
         weights = np.ones(len(points))
-        width = np.inf
+        width, spread = np.inf, 1.0
         for _ in range(_ROUNDS):
-            T = self._rigid(points, fixes, weights)
+            T = self._rigid(points, fixes, weights, spread)
             squares = ((se3.transform(T, points) - fixes) ** 2).sum(axis=1)
             spread = max(float(np.median(squares)) / _MEDIAN_NORM**2, 1e-8)
             least = _REJECTED_BEYOND**2 * spread
@@ -146,13 +146,11 @@ class _Fit:
             weights = 1 / (1 + squares / width) ** 2
         return T, weights, squares
 
-    def _rigid(self, points: Array, fixes: Array, weights: Array) -> Array:
+    def _rigid(self, points: Array, fixes: Array, weights: Array, spread2: float) -> Array:
         share = weights / weights.sum()
         p, q = share @ points, share @ fixes
         cross = (fixes - q).T @ ((points - p) * weights[:, None])
-        spread2 = max(float(weights @ ((fixes - q - points + p) ** 2).sum(axis=1)) / len(points), 1e-4)
         # the direction up counts as much as its variance says beside that of a position
-        spread2 = min(spread2, 1.0)
         U, _, Vt = np.linalg.svd(cross + spread2 / self._up_sigma**2 * np.outer([0.0, 0.0, 1.0], self._up))
         R = (U * [1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
         return se3.make(R, q - R @ p)
@@ -168,7 +166,7 @@ class _Fit:
         T, _, squares = self._robust(points, self._fixes[used])
         spread2 = max(float(np.median(squares)) / _MEDIAN_NORM**2, 1e-8)
         agree = squares <= 3 * _REJECTED_BEYOND**2 * spread2
-        T = self._rigid(points, self._fixes[used], agree.astype(np.float64))
+        T = self._rigid(points, self._fixes[used], agree.astype(np.float64), spread2)
         residuals = np.full((len(stamps), 3), np.nan)
         residuals[used] = se3.transform(T, points) - self._fixes[used]
         inliers = used.copy()
