@@ -33,6 +33,7 @@ Array = NDArray[np.float64]
 Prepare = Callable[[Scan], Prepared]
 
 _UNSURE_TRANSLATION_M = 0.5
+_RISE = 1.01  # the loss has changed by less when only which points match has
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +192,7 @@ class NetworkResidual:
 
     def _is_worse(self, after: Judged, before: Judged) -> bool:
         """Whether the loss rises on the way from the initial pose, by a way longer than what it cannot tell apart."""
-        if after.cost < before.cost:
+        if after.cost < before.cost * _RISE:
             return False
         way = se3.log(se3.between(before.pose, after.pose))
         return bool(way @ np.linalg.solve(before.spread(self._settings.covariance_scale), way) > CHI2_99)
