@@ -133,22 +133,23 @@ def reject(
     Args:
         sure: the other factors, which determine every variable with any of the doubtful ones left out.
         doubtful: ``M`` measurements.
-        values: to start from.
+        values: to start from, best those of the sure factors alone: the doubtful ones, all at once, may bend what is soft
+            to the wrong ones so far that the right ones look wrong.
         solve: optimises a graph from values; a few iterations are enough.
 
     Returns:
         Values, and weights ``(M,)``: 1 for what is right, 0 for what is wrong.
     """
     bounds = np.array([chi2_bound(len(measurement.covariance)) for measurement in doubtful])
-    weights, control = np.ones(len(doubtful)), 0.0
+    control = 0.0
     for step in range(_STEPS):
+        shares = chi2_of(doubtful, values) / bounds
+        control = control * GRADUATION if step else 1 / max(2 * float(shares.max()) - 1, 1.0)
+        weights = truncated_weights(shares, 1.0, control)
         graph = gtsam.NonlinearFactorGraph(sure)
         for factor in robust_factors(doubtful, "gnc", weights):
             graph.add(factor)
         values = _settle(graph, values, solve)
-        shares = chi2_of(doubtful, values) / bounds
-        control = control * GRADUATION if step else 1 / max(2 * float(shares.max()) - 1, 1.0)
-        weights = truncated_weights(shares, 1.0, control)
         if ((weights == 0) | (weights == 1)).all():
             break
     return values, np.round(weights)

@@ -110,7 +110,7 @@ def without_wrong(drive: Any) -> Any:
     return smooth(replace(record, gps=tuple(fix for k, fix in enumerate(record.gps) if k not in WRONG)), gps=True)
 
 
-@pytest.mark.parametrize("robust", ["cauchy", "geman-mcclure"])
+@pytest.mark.parametrize("robust", ["cauchy", "geman-mcclure", "gnc"])
 def test_wrong_fixes_are_rejected_and_counted(drive: Any, without_wrong: Any, robust: str):
     record = with_fixes(drive, 1)
     rng = np.random.default_rng(2)
