@@ -133,8 +133,8 @@ def reject(
     Args:
         sure: the other factors, which determine every variable with any of the doubtful ones left out.
         doubtful: ``M`` measurements.
-        values: to start from, best those of the sure factors alone: the doubtful ones, all at once, may bend what is soft
-            to the wrong ones so far that the right ones look wrong.
+        values: to start from, best those of the sure factors alone: all the doubtful ones at once may bend what is
+            soft to the wrong ones so far that the right ones look wrong.
         solve: optimises a graph from values; a few iterations are enough.
 
     Returns:
