@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from hybridlio.errors import GraphError
 from hybridlio.estimates import Array
+from hybridlio.geodesy import GeodeticPoint, check_geodetic
 from hybridlio.graph import coordinates as co
 from hybridlio.graph.edge_table import FORMS, EdgeTable, Rows
 from hybridlio.graph.keys import Key, check_key, named
@@ -47,6 +48,7 @@ class GraphData:
         edges: the between-factors.
         others: all other factors by id, in the order they were added.
         next_id: of the next factor.
+        origin: where on Earth world has its origin, east, north and up its axes; None while nobody has said so.
     """
 
     def __init__(self, dimension: co.Dimension = 3) -> None:
@@ -60,6 +62,7 @@ class GraphData:
         self.edges = EdgeTable(dimension)
         self.others: dict[int, Factor] = {}
         self.next_id = 0
+        self.origin: GeodeticPoint | None = None
 
     # poses
 
@@ -123,6 +126,21 @@ class GraphData:
         (key,) = self._known(key, what="unfix")
         self._fixed.discard(key)
 
+    def set_origin(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> None:
+        """Say where on Earth (WGS 84; metres above the ellipsoid) world has its origin, once and for all.
+
+        Raises:
+            DataError: not finite, or no such latitude or longitude.
+            GraphError: a planar graph, or there is another origin, by which fixes may have been placed.
+        """
+        self._in_space("origin")
+        point = check_geodetic(latitude_deg, longitude_deg, altitude_m, "origin")
+        if self.origin not in (None, point):
+            raise GraphError(
+                f"the graph has its origin at {tuple(self.origin or ())}; it cannot move to {tuple(point)}"
+            )
+        self.origin = point
+
     def start_from(self, solution: Solution) -> None:
         """Take a solution's poses as initial values."""
         for key, pose in zip(solution.keys, solution.coordinates, strict=True):
@@ -182,6 +200,7 @@ class GraphData:
         copy = GraphData(self.dimension)
         copy._keys, copy._places, copy._fixed = self._keys.copy(), self._places.copy(), self._fixed.copy()
         copy._initial, copy.next_id = self._initial.where(slice(None)), self.next_id
+        copy.origin = self.origin
         keep = ~np.isin(self.edges.ids, list(removed)) if removed else slice(None)
         copy.edges = self.edges.where(keep)
         copy.others = {number: factor for number, factor in self.others.items() if number not in removed}

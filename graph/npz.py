@@ -41,6 +41,8 @@ def write_npz(data: GraphData, path: str | os.PathLike[str]) -> None:
         "initial": data.coordinates_or_nan,
         "fixed": np.array([key in data.fixed for key in keys], dtype=bool),
     }
+    if data.origin is not None:
+        arrays["origin"] = np.array(data.origin)
     if len(data.edges):
         arrays |= {f"between_{name}": column for name, column in _edge_columns(data, key_table[:, 0]).items()}
     for kind in get_args(Kind):
@@ -108,12 +110,14 @@ def read_npz(path: str | os.PathLike[str]) -> PoseGraph:
         return _assemble(arrays)
     except OSError as error:
         raise DataError(f"cannot read {path}: {error}") from error
-    except (KeyError, ValueError, IndexError, EOFError, zipfile.BadZipFile, HybridLioError) as error:
+    except (KeyError, ValueError, TypeError, IndexError, EOFError, zipfile.BadZipFile, HybridLioError) as error:
         raise DataError(f"{path}: no pose graph, or a damaged one: {error}") from error
 
 
 def _assemble(arrays: dict[str, Any]) -> PoseGraph:
     graph = PoseGraph(int(arrays["dimension"]))  # type: ignore[arg-type]
+    if "origin" in arrays:
+        graph.set_origin(*arrays["origin"].tolist())
     size = len(co.IDENTITY[graph.dimension])
     for (key,), initial, fixed in zip(
         _key_rows(arrays["keys"]), arrays["initial"].reshape(-1, size), arrays["fixed"], strict=True

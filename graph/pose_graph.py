@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hybridlio.errors import DataError, GraphError
+from hybridlio.geodesy import check_geodetic, enu_from_geodetic
 from hybridlio.graph.graph_data import GraphData
 from hybridlio.graph.keys import Key, check_key
 from hybridlio.graph.measurements import Factor, RobustLike, label, make_noise, make_robust
@@ -93,6 +94,30 @@ class PoseGraph(GraphData):
         """The antenna's position ``(3,)`` in world; ``lever_arm_m`` is the antenna in the body's frame."""
         vectors = (position_m, lever_arm_m)
         return self._add_vectors("gps", key, vectors, 3, covariance, sigmas, robust)
+
+    def add_gps_geodetic(
+        self, key: Key, latitude_deg: float, longitude_deg: float, altitude_m: float, sigmas: ArrayLike | None = None,
+        lever_arm_m: ArrayLike = (0, 0, 0), *, covariance: ArrayLike | None = None, robust: RobustLike = None,
+    ) -> int:  # fmt: skip
+        """The antenna's place on Earth; world is east, north, up at ``origin``, which the first fix sets if need be.
+
+        Args:
+            key: a pose that is known.
+            latitude_deg, longitude_deg, altitude_m: on WGS 84, metres above the ellipsoid (not above sea level).
+            sigmas, covariance: one of them, of east, north, up in metres.
+            lever_arm_m: ``(3,)`` the antenna in the body's frame.
+            robust: as for other factors.
+
+        Raises:
+            DataError: not finite, no such latitude or longitude, or as for other factors.
+            GraphError: unknown key, a planar graph, none or both of covariance and sigmas.
+        """
+        point = check_geodetic(latitude_deg, longitude_deg, altitude_m, label("gps", (key,)))
+        origin = self.origin or point
+        position = enu_from_geodetic([point], origin)[0]
+        number = self.add_gps(key, position, sigmas, lever_arm_m, covariance=covariance, robust=robust)
+        self.origin = origin
+        return number
 
     def add_attitude(
         self, key: Key, direction_world: ArrayLike, direction_body: ArrayLike, sigma_rad: float,

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybridlio.errors import DataError
+
 Array = NDArray[np.float64]
 
 
@@ -16,6 +18,22 @@ class GeodeticPoint(NamedTuple):
     latitude_deg: float
     longitude_deg: float
     height_m: float
+
+
+def check_geodetic(latitude_deg: float, longitude_deg: float, height_m: float, name: str) -> GeodeticPoint:
+    """The place, as plain numbers.
+
+    Raises:
+        DataError: not finite, a latitude beyond ±90° or a longitude beyond -180° to 360°; the message carries ``name``.
+    """
+    point = GeodeticPoint(float(latitude_deg), float(longitude_deg), float(height_m))
+    if not np.isfinite(point).all():
+        raise DataError(f"{name}: latitude, longitude and height must be finite, got {tuple(point)}")
+    if abs(point.latitude_deg) > 90:
+        raise DataError(f"{name}: a latitude lies between -90 and 90 degrees, got {point.latitude_deg}")
+    if not -180 <= point.longitude_deg <= 360:
+        raise DataError(f"{name}: a longitude lies between -180 and 360 degrees, got {point.longitude_deg}")
+    return point
 
 
 def enu_from_geodetic(points: ArrayLike, origin: GeodeticPoint) -> Array:

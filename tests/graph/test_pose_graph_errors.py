@@ -46,6 +46,12 @@ WRONG = {
     "to itself": (lambda g: g.add_between(2, 2, np.eye(4), sigmas=ONE), GraphError, "itself"),
     "GPS at an unknown key": (lambda g: g.add_gps(9, np.zeros(3), 1), GraphError, "gps 9"),
     "GPS not finite": (lambda g: g.add_gps(1, [0, np.inf, 0], 1), DataError, "gps 1.*finite"),
+    "latitude out of range": (lambda g: g.add_gps_geodetic(1, 91, 8, 0, 1), DataError, "gps 1.*latitude.*91"),
+    "longitude out of range": (lambda g: g.add_gps_geodetic(1, 49, 361, 0, 1), DataError, "gps 1.*longitude.*361"),
+    "place not finite": (lambda g: g.add_gps_geodetic(1, 49, 8, np.nan, 1), DataError, "gps 1.*finite"),
+    "place at an unknown key": (lambda g: g.add_gps_geodetic(9, 49, 8, 0, 1), GraphError, "gps 9"),
+    "place without noise": (lambda g: g.add_gps_geodetic(1, 49, 8, 0), GraphError, "gps 1.*one of"),
+    "origin out of range": (lambda g: g.set_origin(-90.1, 8, 0), DataError, "origin.*latitude"),
     "attitude without length": (lambda g: g.add_attitude(1, np.zeros(3), [0, 0, 1], 0.1), DataError, "no length"),
     "IMU to an unknown key": (lambda g: g.add_imu(1, 9, samples()), GraphError, "imu 1-9.*key 9"),
     "one IMU sample": (lambda g: g.add_imu(1, 2, samples(1)), DataError, "imu 1-2.*1 IMU samples"),
@@ -74,6 +80,7 @@ def test_an_error_names_the_offender_and_leaves_the_graph_as_it_was(case):
     with pytest.raises(kind, match=message):
         call(graph)
     assert before == (graph.keys, dict(graph.factors), graph.fixed)
+    assert graph.origin is None
     np.testing.assert_array_equal(graph.coordinates_or_nan, initial)
 
 
