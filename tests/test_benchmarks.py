@@ -8,7 +8,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+from hybridlio.config import Config
+
 ROOT = Path(__file__).resolve().parents[1]
+OURS = f"{Config().initial_pose} + none + {Config().backend}"
 
 
 def run(script: str, *words: object) -> subprocess.CompletedProcess[str]:
@@ -25,7 +28,7 @@ def test_peers_are_compared_with_ours_as_far_as_they_are_installed(tiny_drive, t
     ((told,),) = [json.loads((tmp_path / "peers.json").read_text())["recordings"].values()]
     assert told["scans"] == 6
     (first, ours), *peers = told["systems"].items()
-    assert first == "preintegration + none + incremental"
+    assert first == OURS
     assert ours["times ours"] == 1
     for name, row in told["systems"].items():
         assert row["median [ms]"] > 0
@@ -45,7 +48,7 @@ def test_hard_cases_are_held_against_the_normal_one(tmp_path):
     told = json.loads((tmp_path / "scenarios.json").read_text())["scenarios"]
     assert set(told) == {"normal", "imu-gap"}
     for systems in told.values():
-        ours = systems["preintegration + none + incremental"][0]
+        ours = systems[OURS][0]
         assert ours["completed"]
         assert ours["end_sigma_m"] > 0
         assert "end_sigma_m" not in systems["small_gicp"][0]
