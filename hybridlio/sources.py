@@ -108,6 +108,12 @@ def _fixed_lag(setup: Setup) -> Backend:
     return FixedLagBackend(setup.calibration, setup.imu_noise)
 
 
+def _no_backend(setup: Setup) -> Backend:
+    from hybridlio.dead_reckoning import DeadReckoning
+
+    return DeadReckoning(setup.calibration)
+
+
 INITIAL_POSE_SOURCES: dict[str, Callable[[Setup], InitialPoseSource]] = {
     "preintegration": _preintegration,
     "lstm": _lstm,
@@ -124,6 +130,7 @@ RESIDUAL_SOURCES: dict[str, Callable[[Setup], ResidualSource]] = {
 BACKENDS: dict[str, Callable[[Setup], Backend]] = {
     "incremental": _incremental,
     "fixed-lag": _fixed_lag,
+    "none": _no_backend,
 }
 
 

@@ -84,6 +84,16 @@ def test_the_whole_job_from_simulation_to_smoothing(tmp_path, monkeypatch):
         assert ok("view", path).strip().endswith("report.html")
 
 
+def test_the_learned_front_end_runs_without_a_graph_and_can_be_smoothed(tiny_drive, untrained_weights, tmp_path):
+    config, folder = tmp_path / "learned.yaml", tmp_path / "run"
+    learned = f"{{weights: {untrained_weights}, device: cpu}}"
+    config.write_text(f"initial_pose: lstm\nresidual: network\nbackend: none\nlstm: {learned}\nnetwork: {learned}\n")
+    ok("odometry", tiny_drive, "--config", config, "--frames", ":8", "-o", folder)
+    assert sorted(path.name for path in folder.iterdir()) == sorted(FILES)
+    assert json.loads((folder / "metrics.json").read_text())["backend"] == "none"
+    assert "smoothed" in ok("smooth", folder)
+
+
 def test_simulating_again_leaves_the_drive_as_it_is_and_other_settings_are_refused(tiny_drive):
     root, same = tiny_drive.parent.parent, ("--seconds", 2.5, "--seed", 3, "--lidar", "16-beam")
     stamp = (tiny_drive / "poses.txt").stat().st_mtime_ns
