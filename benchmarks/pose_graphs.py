@@ -3,7 +3,8 @@
 FOLDER holds g2o files. For each one GTSAM solves from the file's initial values and from its own best initialisation
 (chordal in space; LAGO in the plane, which takes diagonal noise only). Its best result is the one of smallest error, or
 the quicker of equal ones; ours is timed from the file as well: reading, initial values, solving. ``--outliers`` adds a
-tenth of wrong loop closures by seed and lets ``gnc`` find them.
+tenth of wrong loop closures by seed and lets ``gnc`` find them. ``--bad-starts`` replaces the file's initial values by
+bad ones, of sphere2500 and torus3D by default, and prints the error reached all the same, as a multiple of the best.
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ from pathlib import Path
 
 import gtsam
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from hybridlio import se3
 from hybridlio.graph import PoseGraph
 from hybridlio.graph.coordinates import to_matrices
 from hybridlio.graph.edges import loops_of
@@ -119,13 +122,43 @@ def outliers(path: Path, seed: int) -> None:
     )
 
 
+def bad_starts(count: int, extent_m: float, seeds: int) -> dict[str, np.ndarray]:
+    """All poses at the identity, and poses anywhere and anyhow by seed."""
+    starts = {"identity": np.tile(np.eye(4), (count, 1, 1))}
+    for seed in range(seeds):
+        rng = np.random.default_rng(seed)
+        places = extent_m * rng.uniform(-0.5, 0.5, (count, 3))
+        starts[f"random {seed}"] = se3.make(Rotation.random(count, rng).as_matrix(), places)
+    return starts
+
+
+def start_badly(path: Path, seeds: int) -> None:
+    best = min(bare(path, True, "given").error, bare(path, True, "own").error, ours(path).error)
+    graph = PoseGraph.load(path)
+    extent_m = float(np.ptp(to_matrices(graph.coordinates_or_nan)[:, :3, 3], axis=0).max())
+    for name, poses in bad_starts(len(graph), extent_m, seeds).items():
+        for key, pose in zip(graph.keys, poses, strict=True):
+            graph.set_initial(key, pose)
+        for initial in ("auto", "chordal", "given"):
+            begin = time.perf_counter()
+            ratio = graph.optimize(initial=initial).error / best
+            spent_s = time.perf_counter() - begin
+            print(f"{path.stem:16s} {name:10s} {initial:8s} {best:12.6g} {ratio:12.8f} {spent_s:8.2f}", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("names", nargs="*")
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--outliers", action="store_true")
+    parser.add_argument("--bad-starts", action="store_true")
     options = parser.parse_args()
+    if options.bad_starts:
+        print(f"{'':16s} {'start':10s} {'initial':8s} {'best error':>12s} {'reached/best':>12s} {'s':>8s}")
+        for name in options.names or ("sphere2500", "torus3D"):
+            start_badly(options.folder / f"{name}.g2o", options.runs)
+        return
     paths = [options.folder / f"{name}.g2o" for name in options.names] or sorted(options.folder.glob("*.g2o"))
     if options.outliers:
         print(f"{'':16s} {'seed':>5s} {'wrong':>6s} {'missed':>7s} {'lost':>6s} {'RMSE, % of spread':>12s} {'s':>3s}")
