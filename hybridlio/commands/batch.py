@@ -10,7 +10,6 @@ import typer
 from hybridlio.commands import common
 from hybridlio.commands.common import guarded
 from hybridlio.engines import LOCAL
-from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
 from hybridlio.terminal import complain, progress, say, say_table
 
 if TYPE_CHECKING:
@@ -35,11 +34,9 @@ def batch(
     ] = None,
     reader: common.ReaderName = None,
     raw_root: common.RawRoot = None,
-    initial_pose: Annotated[
-        str | None, typer.Option("--initial-pose", metavar="NAME", help=", ".join(INITIAL_POSE_SOURCES))
-    ] = None,
-    residual: Annotated[str | None, typer.Option(metavar="NAME", help=", ".join(RESIDUAL_SOURCES))] = None,
-    backend: Annotated[str | None, typer.Option(metavar="NAME", help=", ".join(BACKENDS))] = None,
+    initial_pose: common.InitialPoseName = None,
+    residual: common.ResidualName = None,
+    backend: common.BackendName = None,
     config: common.ConfigFile = None,
     frames: common.Frames = None,
     jobs: Annotated[

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn, ParamSpec
 import typer
 
 from hybridlio.errors import ConfigError, DataError, HybridLioError
+from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
 from hybridlio.terminal import complain, set_up_logging
 
 if TYPE_CHECKING:
@@ -68,6 +69,11 @@ RawRoot = Annotated[
     typer.Option("--raw-root", metavar="DIR", help="For KITTI odometry: KITTI's raw data, to take the IMU from."),
 ]
 Frames = Annotated[str | None, typer.Option("--frames", metavar="A:B", help="Only scans A to B-1, counted from 0.")]
+InitialPoseName = Annotated[
+    str | None, typer.Option("--initial-pose", metavar="NAME", help=", ".join(INITIAL_POSE_SOURCES))
+]
+ResidualName = Annotated[str | None, typer.Option("--residual", metavar="NAME", help=", ".join(RESIDUAL_SOURCES))]
+BackendName = Annotated[str | None, typer.Option("--backend", metavar="NAME", help=", ".join(BACKENDS))]
 ConfigFile = Annotated[
     Path | None, typer.Option("--config", metavar="FILE", help="Settings, as `hybridlio config` prints them.")
 ]
