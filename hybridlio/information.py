@@ -20,7 +20,7 @@ _UNKNOWN_SIGMA_M = 10.0
 
 def lever_arms(points: Array) -> Array:
     """``(3,)`` metres: root mean square distance of points ``(N, 3)`` from each of the sensor's axes."""
-    squares = (points**2).mean(axis=0) if len(points) else np.zeros(3)
+    squares = np.einsum("ij,ij->j", points, points) / max(len(points), 1)
     return np.asarray(np.sqrt(np.maximum(squares.sum() - squares, 1e-6)))
 
 
@@ -33,7 +33,8 @@ def scaled_spectrum(information: Array, levers_m: Array | None = None) -> tuple[
     if levers_m is None:
         mean = np.sqrt(max(np.trace(information[:3, :3]), 1e-12) / max(np.trace(information[3:, 3:]), 1e-12))
         levers_m = np.full(3, mean)
-    scale = np.r_[1 / levers_m, np.ones(3)]
+    scale = np.ones(6)
+    scale[:3] /= levers_m
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     return values, vectors, scale
 

@@ -9,7 +9,7 @@ import small_gicp
 
 from hybridlio import se3
 from hybridlio.estimates import Array
-from hybridlio.registration import Surface
+from hybridlio.surface import Surface
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,8 @@ from hybridlio.estimates import Array
 from hybridlio.information import covariance_of, degenerate_directions
 from hybridlio.keyframes import Keyframes
 from hybridlio.odometry_chain import Index, OdometryChain
-from hybridlio.registration import Registration, RegistrationSettings, Surface, cost_at, register
+from hybridlio.registration import Registration, RegistrationSettings, cost_at, register
+from hybridlio.surface import Surface
 from hybridlio.voxel import voxel_average
 
 

@@ -2,6 +2,9 @@
 
 The cost is the unsupervised loss's first term (UnDeepLIO §3.3, ``L_po2pl``) in a robust squared form: with it the
 residual network is trained, and its Hessian weighs the between-factor. Correspondences are nearest neighbours.
+
+Matches take longer than a step, so that each are followed by as many steps as they are good for, along which the
+distances are linear.
 """
 
 from __future__ import annotations
@@ -9,18 +12,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import small_gicp
 
 from hybridlio import se3
 from hybridlio.estimates import Array
-from hybridlio.information import lever_arms, newton_step
+from hybridlio.information import newton_step
+from hybridlio.surface import Matches, Neighbours, Surface, System
 
 _ROTATION_CONVERGED_RAD = 2e-5
 _TRANSLATION_CONVERGED_M = 3e-4
 _REMATCH_ROTATION_RAD = 2e-4  # a centimetre at 50 m
 _REMATCH_TRANSLATION_M = 5e-3
-_IDENTITY = np.eye(4)
-_REMATCH_STEPS = 8  # points between two equally near neighbours would have the pose go to and fro for ever
+_MOST_MATCHES = 8  # points between two equally near neighbours would have the pose go to and fro for ever
+_FAR = 10.0  # times the way after which neighbours may be others: no second step by those from before
 
 
 @dataclass(frozen=True)
@@ -38,28 +41,8 @@ class RegistrationSettings:
 
     kernel_m: float = 0.1
     max_distance_m: float = 1.0
-    max_iterations: int = 15
+    max_iterations: int = 30
     threads: int = 2
-
-
-class Surface:
-    """Points with normals and a KD-tree over them: what a scan is registered to.
-
-    Args:
-        points: ``(M, 3)`` metres.
-        normals: ``(M, 3)`` unit vectors.
-        threads: for building the tree.
-    """
-
-    def __init__(self, points: Array, normals: Array, threads: int = 2) -> None:
-        self.points = points
-        self.normals = normals
-        self._tree = small_gicp.KdTree(points, threads)
-
-    def nearest(self, queries: Array, threads: int) -> tuple[Array, Array]:
-        """Index ``(N,)`` and squared distance ``(N,)`` of each query's nearest point."""
-        index, distance2 = self._tree.batch_knn_search(queries, 1, threads)
-        return index[:, 0].astype(np.int64), distance2[:, 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,50 +71,6 @@ class Registration:
     converged: bool
 
 
-@dataclass(frozen=True, eq=False)
-class _Matches:
-    """Which points of the scan lie near which of the surface, at the pose at which they were looked for."""
-
-    pose: Array
-    source: Array
-    target: Array
-    normals: Array
-    levers_m: Array
-
-
-@dataclass(frozen=True, eq=False)
-class _Linearisation:
-    hessian: Array
-    gradient: Array
-    residuals: Array
-    weights: Array
-
-
-def _match(surface: Surface, source: Array, pose: Array, reach_m: float, threads: int) -> _Matches:
-    index, distance2 = surface.nearest(source @ pose[:3, :3].T + pose[:3, 3], threads)
-    near = distance2 < reach_m**2
-    index, source = index[near], source[near]
-    return _Matches(pose, source, surface.points[index], surface.normals[index], lever_arms(source))
-
-
-def _linearise(matches: _Matches, pose: Array, kernel_m: float) -> _Linearisation:
-    moved = matches.source @ pose[:3, :3].T + pose[:3, 3]
-    residuals = np.einsum("ij,ij->i", moved - matches.target, matches.normals)
-    weights = (kernel_m**2 / (kernel_m**2 + residuals**2)) ** 2
-    normals_in_scan = matches.normals @ pose[:3, :3]
-    J = np.hstack([np.cross(matches.source, normals_in_scan), normals_in_scan])
-    weighted = J * weights[:, None]
-    return _Linearisation(weighted.T @ J, weighted.T @ residuals, residuals, weights)
-
-
-def _moved(matches: _Matches, pose: Array) -> bool:
-    """Whether the pose is so far from where neighbours were looked for that others may be nearer."""
-    step = se3.between(matches.pose, pose) - _IDENTITY  # of small steps the logarithm, at a tenth of its cost
-    return bool(
-        np.abs(step[:3, :3]).max() > _REMATCH_ROTATION_RAD or np.abs(step[:3, 3]).max() > _REMATCH_TRANSLATION_M
-    )
-
-
 def register(
     surface: Surface, source: Array, initial: Array, settings: RegistrationSettings, kernel_start_m: float = 0.0
 ) -> Registration:
@@ -147,21 +86,69 @@ def register(
         settings: kernel, distances, limits.
         kernel_start_m: a wider kernel to begin with, halved at every step; for an uncertain ``initial``.
     """
-    pose, kernel, converged, iterations = initial, max(settings.kernel_m, kernel_start_m), False, 0
-    matches = _match(surface, source, pose, max(settings.max_distance_m, 3 * kernel), settings.threads)
-    while not converged and iterations < settings.max_iterations:
-        iterations += 1
-        if iterations <= _REMATCH_STEPS and _moved(matches, pose):
-            matches = _match(surface, source, pose, max(settings.max_distance_m, 3 * kernel), settings.threads)
-        system = _linearise(matches, pose, kernel)
-        step = np.zeros(6)
-        if len(system.residuals) >= 6:
-            step = newton_step(system.hessian, system.gradient, levers_m=matches.levers_m)
-        pose = pose @ se3.exp(step)
-        small = np.abs(step[:3]).max() < _ROTATION_CONVERGED_RAD and np.abs(step[3:]).max() < _TRANSLATION_CONVERGED_M
-        converged = bool(small and kernel == settings.kernel_m)
-        kernel = max(settings.kernel_m, kernel / 2)
-    return _summary(system, matches, len(source), settings, se3.orthonormalise(pose), iterations, converged)
+    kernel_m, threads = max(settings.kernel_m, kernel_start_m), settings.threads
+    descent, neighbours = _Descent(settings, initial, kernel_m), Neighbours(surface, source, threads)
+    for _ in range(_MOST_MATCHES):
+        again = descent.by(neighbours.matches(descent.pose, max(settings.max_distance_m, 3 * descent.kernel_m)))
+        if not again:
+            break
+    return descent.outcome(len(source))
+
+
+class _Descent:
+    """Steps down from a pose, by matches that are made anew once the pose has moved too far."""
+
+    def __init__(self, settings: RegistrationSettings, pose: Array, kernel_m: float) -> None:
+        self.pose, self.kernel_m = pose, kernel_m
+        self._settings = settings
+        self._steps, self._converged = 0, False
+        self._matches: Matches
+        self._system: System
+
+    def by(self, matches: Matches) -> bool:
+        """Go down as far as the matches are good for; whether others may be better then."""
+        self._matches, levers_m, way, length = matches, matches.levers_m, np.zeros(6), np.inf
+        while self._steps < self._settings.max_iterations:
+            self._system = matches.system(self.kernel_m, way)
+            step = np.zeros(6)
+            if len(matches) >= 6:
+                step = newton_step(self._system.hessian, self._system.gradient, levers_m=levers_m)
+            way, self._steps = way + step, self._steps + 1
+            narrow = self.kernel_m == self._settings.kernel_m
+            self.kernel_m = max(self._settings.kernel_m, self.kernel_m / 2)
+            length, self._converged = _size(step), narrow and _is_small(step)
+            if self._converged or length > _FAR or (narrow and length < 1 < _size(way)):
+                break
+        self.pose = self.pose @ se3.exp(way)
+        return self._steps < self._settings.max_iterations and _size(way) > 1
+
+    def outcome(self, points: int) -> Registration:
+        """Where it ended, of so many points."""
+        system, matches, settings = self._system, self._matches, self._settings
+        cost = _cost(system.distances, points, settings.kernel_m)
+        weight = max(float(system.weights.sum()), 1e-12)
+        sigma_m = float(np.sqrt((system.weights @ system.distances**2) / weight))
+        pose, matched = se3.orthonormalise(self.pose), len(matches) / max(points, 1)
+        return Registration(
+            pose, system.hessian, matches.levers_m, sigma_m, matched, cost, self._steps, self._converged
+        )
+
+
+def _size(way: Array) -> float:
+    """A way's length, where 1 is so far that other neighbours may be nearer."""
+    turn_rad, shift_m = _largest(way)
+    return max(turn_rad / _REMATCH_ROTATION_RAD, shift_m / _REMATCH_TRANSLATION_M)
+
+
+def _is_small(step: Array) -> bool:
+    turn_rad, shift_m = _largest(step)
+    return turn_rad < _ROTATION_CONVERGED_RAD and shift_m < _TRANSLATION_CONVERGED_M
+
+
+def _largest(way: Array) -> tuple[float, float]:
+    """The largest component of the turn and of the shift; six floats are quicker than arrays of them."""
+    sizes: list[float] = [abs(part) for part in way.tolist()]
+    return max(sizes[:3]), max(sizes[3:])
 
 
 def cost_at(
@@ -171,27 +158,10 @@ def cost_at(
 
     Points without a neighbour within ``reach_m``, by default three times the kernel, cost 1.
     """
-    matches = _match(surface, source, pose, 3 * kernel_m if reach_m is None else reach_m, threads)
-    return _cost(_linearise(matches, pose, kernel_m).residuals, len(source), kernel_m)
+    matches = Neighbours(surface, source, threads).matches(pose, 3 * kernel_m if reach_m is None else reach_m)
+    return _cost(matches.rows[6], len(source), kernel_m)
 
 
-def _cost(residuals: Array, points: int, kernel_m: float) -> float:
-    r2 = residuals**2
+def _cost(distances: Array, points: int, kernel_m: float) -> float:
+    r2 = distances**2
     return float((r2 / (kernel_m**2 + r2)).sum() + points - len(r2)) / max(points, 1)
-
-
-def _summary(
-    system: _Linearisation,
-    matches: _Matches,
-    points: int,
-    settings: RegistrationSettings,
-    pose: Array,
-    iterations: int,
-    converged: bool,
-) -> Registration:
-    r2 = system.residuals**2
-    cost = _cost(system.residuals, points, settings.kernel_m)
-    weight = max(float(system.weights.sum()), 1e-12)
-    sigma = float(np.sqrt((system.weights * r2).sum() / weight))
-    matched = len(r2) / max(points, 1)
-    return Registration(pose, system.hessian, matches.levers_m, sigma, matched, cost, iterations, converged)

@@ -14,8 +14,9 @@ from hybridlio.errors import DataError
 from hybridlio.estimates import Array, RelativePose
 from hybridlio.information import FLOOR_SIGMAS, covariance_of, degenerate_directions
 from hybridlio.local_map import LocalMap, LocalMapSettings
-from hybridlio.registration import Registration, RegistrationSettings, Surface, cost_at, register
+from hybridlio.registration import Registration, RegistrationSettings, cost_at, register
 from hybridlio.sensors import NS_PER_S, Frame, Scan
+from hybridlio.surface import Surface
 from hybridlio.voxel import voxel_average
 
 
