@@ -16,6 +16,7 @@ from hybridlio.simulation.path import SmoothPath
 from hybridlio.simulation.pose_files import path_along, read_lidar_poses
 from hybridlio.simulation.revisits import level_revisits
 from hybridlio.simulation.rig import LIDAR_HEIGHT_M, SCAN_RATE_HZ, T_IMU_LIDAR
+from hybridlio.simulation.rises import without_false_rises
 from hybridlio.simulation.roads import LANE_OFFSET_M, MANNERS, STEP_M, Road, drive, generate_centreline
 from hybridlio.simulation.traffic import MovingCar, traffic
 from hybridlio.simulation.vehicle import FINE_S, drive_path, lane_of
@@ -87,7 +88,8 @@ def _along_generated_road(config: SimulationConfig) -> Drive:
 
 
 def _along_poses(config: SimulationConfig) -> Drive:
-    lidar_poses = level_revisits(read_lidar_poses(config.require_poses(), config.poses_frame))
+    recorded = read_lidar_poses(config.require_poses(), config.poses_frame)
+    lidar_poses = level_revisits(without_false_rises(recorded))
     path = path_along(lidar_poses)
     seconds = len(lidar_poses) / SCAN_RATE_HZ
     if config.length_m is not None:
