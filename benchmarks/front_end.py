@@ -15,6 +15,7 @@ import json
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -56,7 +57,8 @@ def shaken(reference: Array, rotation_deg: float, translation_m: float) -> Array
 @torch.no_grad()
 def steps_left(network: OdometryNetwork, shard: Shard, reference: Array, initial: Array) -> list[tuple[float, float]]:
     """Degrees and metres left before, and after each of the network's steps, over all pairs of a shard."""
-    pairs, poses = Pairs([shard], network.settings), []
+    # of every pair, also those whose last velocity nobody knows: it does not matter here
+    pairs, poses = Pairs([shard], replace(network.settings, velocity=False)), []
     rows = [pairs.where(i)[1] - 1 for i in range(len(pairs))]
     for i, row in enumerate(rows):
         given = pairs.batch([i]).network

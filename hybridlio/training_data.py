@@ -1,7 +1,8 @@
 """Recordings as shards: each is prepared once, kept, and found again by what it was made from.
 
 What training needs of an initial pose or of the last velocity comes from an odometry run over the recording, by
-scan matching: never from its reference, which serves validation alone.
+scan matching: never from its reference, which serves validation alone. Where scans do not tell how far a step went, as
+on an open field, the run goes on by the IMU alone and its speed soon is anybody's guess: there is no velocity then.
 """
 
 from __future__ import annotations
@@ -40,8 +41,9 @@ from hybridlio.sensors import Scan
 
 Progress = Callable[[str, int, int], None]
 
-_VERSION = 1  # of what is put into shards; another one prepares recordings anew
+_VERSION = 2  # of what is put into shards; another one prepares recordings anew
 _UNSURE_TRANSLATION_M = 0.5  # an initial pose as unsure as this is none
+_UNSURE_STEP_M = 0.05  # a step that scans tell no better gives no velocity
 
 
 @dataclass(frozen=True)
@@ -206,12 +208,13 @@ def _prepare(
 ) -> None:
     initial: dict[int, Array] = {}
     steps: dict[int, Array] = {}
+    sure: set[int] = set()
     source, half = _source(sequence, initial_pose), 1.0
     first = _readable(sequence, 0)
     distorted = first is not None and first.time_offsets_ns is not None
     if needs_odometry(recipe.network) or distorted:
         half = 0.5
-        initial, steps = _odometry(sequence, source, lambda done: show(done // 2) if show else None)
+        initial, steps, sure = _odometry(sequence, source, lambda done: show(done // 2) if show else None)
     if distorted:
         sequence = replace(sequence, load_scan=partial(_compensated, sequence, steps))
     prepare_shard(
@@ -221,7 +224,7 @@ def _prepare(
         recipe.network.geometry,
         recipe.network.imu_samples,
         initial=(lambda frame: initial.get(frame.index)) if initial else None,
-        step=(lambda frame: steps.get(frame.index)) if steps else None,
+        step=(lambda frame: steps.get(frame.index) if frame.index in sure else None) if steps else None,
         made_by=f"initial poses by {source}" if initial else "",
         progress=lambda done, total: show(round(total * (1 - half) + done * half)) if show else None,
     )
@@ -229,19 +232,20 @@ def _prepare(
 
 def _odometry(
     sequence: Sequence, source: str, show: Callable[[int], None]
-) -> tuple[dict[int, Array], dict[int, Array]]:
-    """Initial poses and steps ``T_k_k1`` by the number of the scan that they lead to, as odometry finds them."""
+) -> tuple[dict[int, Array], dict[int, Array], set[int]]:
+    """Initial poses and steps ``T_k_k1`` by the number of the scan that they lead to, and which steps scans tell."""
     config = Config(initial_pose=source, residual="scan-matching")
     run = run_odometry(sequence, Odometry(config=config), lambda done, _total, _metres: show(done))
     if run.stopped is not None:
         raise run.stopped
     initial = {e.index: e.initial.pose for e in run.estimates if e.initial is not None and _sure(e.initial)}
     steps = {e.index: e.step.pose for e in run.estimates if e.step is not None}
-    return initial, steps
+    sure = {e.index for e in run.estimates if e.relative is not None and _sure(e.relative, _UNSURE_STEP_M)}
+    return initial, steps, sure
 
 
-def _sure(initial: RelativePose) -> bool:
-    return initial.ok and float(np.sqrt(initial.covariance[3:, 3:].trace())) <= _UNSURE_TRANSLATION_M
+def _sure(pose: RelativePose, limit_m: float = _UNSURE_TRANSLATION_M) -> bool:
+    return pose.ok and float(np.sqrt(pose.covariance[3:, 3:].trace())) <= limit_m
 
 
 def _compensated(sequence: Sequence, steps: dict[int, Array], k: int) -> Scan:

@@ -8,14 +8,18 @@ compute in half.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from hybridlio.learned import se3
 from hybridlio.projection import MapGeometry
 
 _FAR = (1 << 63) - 1
 _INDEX_BITS = 32
+_DEG = 180.0 / math.pi
 
 
 @torch.no_grad()
@@ -26,8 +30,8 @@ def cells(points: Tensor, geometry: MapGeometry) -> tuple[Tensor, Tensor]:
     """
     x, y, z = points.unbind(1)
     depth = (x * x + y * y + z * z).sqrt()
-    row = (geometry.fov_up_deg - torch.rad2deg(torch.asin(z / depth))) / geometry.row_deg
-    column = (180.0 - torch.rad2deg(torch.atan2(y, x))) / geometry.column_deg
+    row = (geometry.fov_up_deg - _DEG * torch.asin(z / depth)) / geometry.row_deg
+    column = (180.0 - _DEG * torch.atan2(y, x)) / geometry.column_deg
     inside = (row >= 0) & (row < geometry.rows) & (depth < torch.inf)  # NaN compares false
     flat = row.long() * geometry.columns + column.long() % geometry.columns
     return torch.where(inside, flat, 0), inside
@@ -87,15 +91,17 @@ def normal_map(vertices: Tensor) -> Tensor:
 
     The definition is that of :func:`hybridlio.projection.normal_map`.
     """
-    depth = vertices.square().sum(-3).sqrt()
-    arms = []
-    valid = depth > 0
-    for down, right in ((1, 0), (0, -1), (-1, 0), (0, 1)):
-        neighbour, its_depth = _shifted(vertices, down, right), _shifted(depth, down, right)
-        valid = valid & (its_depth > 0)
-        arms.append(torch.exp(-0.5 * (its_depth - depth).abs())[..., None, :, :] * (neighbour - vertices))
-    up, right_, below, left = arms
-    total = cross(up - below, right_ - left, dim=-3)  # the four cyclic products in one
+    depth = vertices.square().sum(-3, keepdim=True).sqrt()
+    around = torch.cat([vertices, depth], dim=-3)
+    # the way to the next cell, weighed; seen from there, the way back is the same
+    to_right = _weighed(torch.roll(around, -1, dims=-1) - around)
+    to_below = _weighed(around[..., 1:, :] - around[..., :-1, :])
+    there = depth[..., 0, :, :] > 0
+    beside = torch.roll(there, 1, dims=-1) & torch.roll(there, -1, dims=-1)
+    valid = functional.pad(there[..., 2:, :] & there[..., :-2, :], (0, 0, 1, 1)) & beside & there
+    upwards = functional.pad(-to_below[..., :-1, :] - to_below[..., 1:, :], (0, 0, 1, 1))
+    # the four cyclic products in one
+    total = cross(upwards, to_right + torch.roll(to_right, 1, dims=-1), dim=-3)
     length = total.square().sum(-3).sqrt()
     valid = valid & (length > 0)
     sign = torch.where((total * vertices).sum(-3) > 0, -1.0, 1.0)
@@ -103,13 +109,9 @@ def normal_map(vertices: Tensor) -> Tensor:
     return torch.where(valid[..., None, :, :], unit, 0.0)
 
 
-def _shifted(values: Tensor, down: int, right: int) -> Tensor:
-    """Values ``(..., H, W)`` moved by rows and columns; columns wrap around, rows that nothing moves into are 0."""
-    moved = torch.roll(values, (down, right), dims=(-2, -1))
-    if down:
-        edge = 0 if down > 0 else -1
-        moved[..., edge, :] = 0.0
-    return moved
+def _weighed(difference: Tensor) -> Tensor:
+    """Differences ``(..., 3, H, W)`` of vertices by that of their ranges, which is their fourth channel."""
+    return torch.exp(-0.5 * difference[..., 3:, :, :].abs()) * difference[..., :3, :, :]
 
 
 def cross(a: Tensor, b: Tensor, dim: int) -> Tensor:

@@ -82,7 +82,8 @@ def prepare_shard(
         geometry: the cells that ``prepare`` gives.
         imu_samples: S.
         initial: gives the initial pose ``T_k_k1`` of a frame, or None where there is none.
-        step: gives the step ``T_k_k1`` to a frame as odometry found it, or None where it did not.
+        step: gives the step ``T_k_k1`` to a frame as odometry found it, or None where it did not: a pair without a
+            last velocity is left out of the training of a network that is told of it.
         made_by: kept in the shard's description.
         progress: called with scans done and scans in all.
 

@@ -20,6 +20,7 @@ from torch.nn import functional
 from hybridlio.learned import maps, se3
 from hybridlio.learned.residual_network import CircularConv
 from hybridlio.learned.settings import NetworkSettings
+from hybridlio.projection import MapGeometry
 
 _KERNELS_M = (0.4, 0.05)  # of the first and the last step, before training
 _KERNEL_GAIN = 10.0  # Adam's steps are as large for one number as for a layer's weights
@@ -42,8 +43,9 @@ class SeenPoints:
         seen: ``(B, 1, N)`` which cells hold a point.
         planes: ``(B, 4, N)`` the normal n of each cell and n·v, which is infinite where there is no normal.
         rough: ``(B, 1, N)`` of :func:`_roughness`; None without weights to be told of it.
-        as_last, as_current: ``(B, N, C)`` and ``(B, C, N)`` what the cells contribute to the weights of points that
-            fall into them, and of their own points; None without weights.
+        as_last, as_current: ``(B, n, C)`` what the n coarse cells contribute to the weights of points that fall into
+            them, and of their own points; None without weights.
+        coarse: ``(N,)`` which coarse cell each point's own cell is a part of.
     """
 
     points: Tensor
@@ -52,6 +54,7 @@ class SeenPoints:
     rough: Tensor | None = None
     as_last: Tensor | None = None
     as_current: Tensor | None = None
+    coarse: Tensor | None = None
 
 
 class ProjectiveSteps(nn.Module):
@@ -76,7 +79,8 @@ class ProjectiveSteps(nn.Module):
             return points
         rough = _roughness(vertices, normals)
         as_last, as_current = self.weights.look(vertices, normals, rough, seen)
-        return replace(points, rough=rough.flatten(2), as_last=as_last, as_current=as_current)
+        coarse = self.weights.coarse
+        return replace(points, rough=rough.flatten(2), as_last=as_last, as_current=as_current, coarse=coarse)
 
     def forward(self, last: SeenPoints, current: SeenPoints, pose: Tensor) -> list[Tensor]:
         """Poses ``T_k_k1`` ``(B, 4, 4)`` after each step.
@@ -132,27 +136,18 @@ class PointWeights(nn.Module):
         self.logit = nn.Linear(channels, 1)
         for parameter in self.logit.parameters():
             nn.init.zeros_(parameter)
-        self.size = settings.geometry.rows, settings.geometry.columns
+        self.register_buffer("_coarse", _coarse_cells(settings.geometry), persistent=False)
+
+    @property
+    def coarse(self) -> Tensor:
+        """``(H·W,)`` the coarse cell that each cell of a map is a part of."""
+        return self.get_buffer("_coarse")
 
     def look(self, vertices: Tensor, normals: Tensor, rough: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-        """What a scan's cells contribute, as those of the last scan ``(B, N, C)`` and of the current ``(B, C, N)``."""
+        """What a scan's coarse cells contribute ``(B, n, C)``, as the last scan's and as the current one's."""
         inputs = torch.cat([vertices / self.scale_m, normals, rough, seen.to(vertices.dtype)], dim=1)
-        features = self.features(inputs)
-        batch, channels, rows, columns = features.shape
-        flat = features.flatten(2)
-        as_last = self.of_last(flat.transpose(1, 2)).reshape(batch * rows, columns, channels)
-        as_current = (self.of_current.weight @ flat).reshape(batch * channels * rows, columns, 1)
-        return (
-            self._fine(as_last, batch, channels).flatten(1, 2),
-            self._fine(as_current, batch * channels, 1).reshape(batch, channels, -1),
-        )
-
-    def _fine(self, coarse: Tensor, images: int, channels: int) -> Tensor:
-        """Rows ``(images·h, w, C)`` of coarse cells as maps ``(images, H, W, C)``, each for the cells it covers."""
-        rows, columns = len(coarse) // images, coarse.shape[1]
-        wide = coarse.reshape(images, rows, 1, columns, 1, channels).expand(-1, -1, _COARSE, -1, _COARSE, -1)
-        fine = wide.reshape(images, rows * _COARSE, columns * _COARSE, channels)
-        return fine[:, : self.size[0], : self.size[1]]
+        features = self.features(inputs).flatten(2).transpose(1, 2)
+        return self.of_last(features), self.of_current(features)
 
     def forward(
         self, last: SeenPoints, current: SeenPoints, cell: Tensor, distance: Tensor, kernel_m: Tensor
@@ -162,26 +157,33 @@ class PointWeights(nn.Module):
         assert last.as_last is not None
         assert current.rough is not None
         assert current.as_current is not None
+        assert current.coarse is not None
         size = distance.abs()
         compared = (size / kernel_m.detach()).clamp(max=5.0)
         rough = last.rough.gather(2, cell[:, None])
         point = torch.cat([size / _DISTANCE_M, compared, rough, current.rough], dim=1)
         batch, cells, channels = last.as_last.shape
-        # rows of a table are fetched faster than channels one by one
+        # rows of a table are fetched, and worked on, faster than channels one by one
         first = torch.arange(0, batch * cells, cells, device=cell.device)[:, None]
-        there = (
-            last.as_last.reshape(-1, channels).index_select(0, (cell + first).flatten()).reshape(batch, -1, channels)
-        )
-        weight = self.of_point.weight.expand(batch, -1, -1)
-        hidden = torch.relu(torch.baddbmm(current.as_current, weight, point) + there.transpose(1, 2))
-        return torch.sigmoid(self.logit.weight @ hidden + self.logit.bias)
+        fallen_into = (self.coarse.index_select(0, cell.flatten()).reshape(cell.shape) + first).flatten()
+        there = last.as_last.reshape(-1, channels).index_select(0, fallen_into).reshape(batch, -1, channels)
+        both = there + current.as_current.index_select(1, current.coarse)
+        weight = self.of_point.weight.t().expand(batch, -1, -1)
+        hidden = torch.relu(torch.baddbmm(both, point.transpose(1, 2), weight))
+        return torch.sigmoid(self.logit(hidden)).transpose(1, 2)
+
+
+def _coarse_cells(geometry: MapGeometry) -> Tensor:
+    """``(H·W,)`` the coarse cell that each cell is a part of, both counted row by row."""
+    rows, columns = (torch.arange(n) // _COARSE for n in (geometry.rows, geometry.columns))
+    return (rows[:, None] * (int(columns[-1]) + 1) + columns).flatten()
 
 
 def _thinned(scan: SeenPoints, by: int) -> SeenPoints:
     """Every so-manieth point, laid out anew; what belongs to cells, not points, stays."""
-    rough, own = (None if x is None else x[..., ::by].contiguous() for x in (scan.rough, scan.as_current))
+    rough, coarse = (None if x is None else x[..., ::by].contiguous() for x in (scan.rough, scan.coarse))
     points, seen = scan.points[..., ::by].contiguous(), scan.seen[..., ::by].contiguous()
-    return replace(scan, points=points, seen=seen, rough=rough, as_current=own)
+    return replace(scan, points=points, seen=seen, rough=rough, coarse=coarse)
 
 
 def _roughness(vertices: Tensor, normals: Tensor) -> Tensor:

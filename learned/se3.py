@@ -106,7 +106,10 @@ def identity(count: int, like: Tensor) -> Tensor:
 def exp(xi: Tensor) -> Tensor:
     """Poses ``(..., 4, 4)`` of tangent vectors ``(..., 6)`` (rad, m); inverse of :func:`log`."""
     rotvec, v = xi[..., :3], xi[..., 3:]
-    return make(so3_exp(rotvec), (so3_left_jacobian(rotvec) @ v[..., None])[..., 0])
+    a, b, c = _coefficients(rotvec)
+    K, eye = hat(rotvec), _eye(rotvec)
+    squared = K @ K
+    return make(eye + a * K + b * squared, ((eye + b * K + c * squared) @ v[..., None])[..., 0])
 
 
 def log(T: Tensor) -> Tensor:

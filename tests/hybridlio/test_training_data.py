@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybridlio import se3
+from hybridlio import se3, training_data
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.errors import ConfigError, DataError
 from hybridlio.learned.settings import NetworkSettings, Recipe
 from hybridlio.projection import MAP_GEOMETRIES
+from hybridlio.run import run_odometry
 from hybridlio.training_data import DataOptions, shard_name, shards_of, training_pairs
 
 NETWORK = NetworkSettings(geometry=MAP_GEOMETRIES["16-beam"])
@@ -63,6 +64,20 @@ def test_the_velocity_is_that_of_the_step_that_odometry_found(tiny_drive, given)
     ahead = np.array([T[:3, :3].T @ T[:3, 3] for T in true]) / 0.1
     assert np.allclose(given.velocity_m_s[3:], ahead[1:-1], atol=0.3)
     assert not np.allclose(given.velocity_m_s[3:], ahead[1:-1], atol=1e-4)
+
+
+def test_a_step_that_scans_do_not_tell_gives_no_velocity(tiny_drive, tmp_path, monkeypatch):
+    def half_blind(*args):
+        run = run_odometry(*args)
+        lost = [replace(e, relative=e.relative.wider(added=np.eye(6))) if e.index == 4 else e for e in run.estimates]
+        return replace(run, estimates=lost)
+
+    monkeypatch.setattr(training_data, "run_odometry", half_blind)
+    shard = shards_of([tiny_drive], MOVING, DataOptions(tmp_path))[0]
+    known = np.isfinite(shard.velocity_m_s).all(axis=1)
+    assert not known[5]  # at the scan that the fourth step leads to
+    assert known[2:5].all()
+    assert known[6:].all()
 
 
 def test_another_drive_other_cells_or_another_source_have_another_name(tiny_drive):
