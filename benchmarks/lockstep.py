@@ -23,6 +23,7 @@ from hybridlio.datasets.sequence import Sequence
 Open = Callable[[], Sequence]  # given to processes, so picklable
 
 _MB = 2**20
+_LOST_M = 1e6
 
 
 @dataclass
@@ -120,6 +121,8 @@ def _serve(talk: Connection, make: Make, opened: Open, threads: int, spawned_s: 
             begin, begin_cpu = time.perf_counter(), time.process_time()
             answer = step(frame)
             ms, cpu_ms = 1e3 * (time.perf_counter() - begin), 1e3 * (time.process_time() - begin_cpu)
+            if np.abs(answer.pose).max() > _LOST_M:
+                raise OverflowError("diverged")
         except Exception as error:
             talk.send(f"{type(error).__name__}: {error}")
             continue

@@ -67,8 +67,8 @@ def drift_of(judgement: Evaluation) -> tuple[float | None, float | None]:
 
 
 def accuracy(one: Pass, sequence: Sequence) -> Figures:
-    """How well, as far as the recording's references bear it."""
-    if len(one.answers) < 2:
+    """How well, as far as the recording's references bear it; nothing of a system that did not reach the end."""
+    if len(one.answers) < 2 or one.error is not None:
         return {}
     trajectory, out = trajectory_of(one), {}
     judgement = judged(trajectory, sequence)

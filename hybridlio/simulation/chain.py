@@ -139,6 +139,24 @@ def _relative(
     return out
 
 
+def _inertial(
+    path: SmoothPath, until_s: float, rate_hz: float, noise: ImuNoise, rng: np.random.Generator
+) -> tuple[ImuSamples, Array, Array, Array]:
+    """Samples up to ``until_s`` with biases and white noise; the gyroscope's and accelerometer's biases; gravity."""
+    times = np.arange(round(until_s * rate_hz) + 1) / rate_hz
+    gyro, accel = ideal_imu(path, times)
+    gyro_bias = _walk(rng, len(times), noise.gyro_bias_sigma_rad_s, noise.gyro_walk_rad_s2_sqrt_hz, rate_hz)
+    accel_bias = _walk(rng, len(times), noise.accel_bias_sigma_m_s2, noise.accel_walk_m_s3_sqrt_hz, rate_hz)
+    gyro = gyro + gyro_bias + noise.gyro_rad_s_sqrt_hz * np.sqrt(rate_hz) * rng.standard_normal(gyro.shape)
+    accel = accel + accel_bias + noise.accel_m_s2_sqrt_hz * np.sqrt(rate_hz) * rng.standard_normal(accel.shape)
+    # gravity's magnitude differs from place to place, as the start-up's prior says
+    gravity = np.array([0.0, 0.0, -9.81 + GRAVITY_MAGNITUDE_SIGMA_M_S2 * rng.standard_normal()])
+    R_imu = path.motion(times).poses[:, :3, :3]
+    accel = accel + np.einsum("nji,j->ni", R_imu, GRAVITY_M_S2 - gravity)
+    stamps = START_NS + np.round(times * NS_PER_S).astype(np.int64)
+    return ImuSamples(stamps, gyro, accel), gyro_bias, accel_bias, gravity
+
+
 def make_chain(
     seed: int,
     steps: int = 60,
@@ -171,22 +189,10 @@ def make_chain(
     """
     rng = np.random.default_rng(seed)
     path = path or vehicle_path(rng, steps * 0.1 + 0.2, speed)
-    true = true_noise or imu_noise
     scan_s = np.arange(steps + 1) * 0.1
-    imu_s = np.arange(round(scan_s[-1] * imu_hz) + 1) / imu_hz
-    gyro, accel = ideal_imu(path, imu_s)
-    gyro_bias = _walk(rng, len(imu_s), true.gyro_bias_sigma_rad_s, true.gyro_walk_rad_s2_sqrt_hz, imu_hz)
-    accel_bias = _walk(rng, len(imu_s), true.accel_bias_sigma_m_s2, true.accel_walk_m_s3_sqrt_hz, imu_hz)
-    gyro = gyro + gyro_bias + true.gyro_rad_s_sqrt_hz * np.sqrt(imu_hz) * rng.standard_normal(gyro.shape)
-    accel = accel + accel_bias + true.accel_m_s2_sqrt_hz * np.sqrt(imu_hz) * rng.standard_normal(accel.shape)
-    # gravity's magnitude differs from place to place, as the start-up's prior says
-    gravity = np.array([0.0, 0.0, -9.81 + GRAVITY_MAGNITUDE_SIGMA_M_S2 * rng.standard_normal()])
-    R_imu = path.motion(imu_s).poses[:, :3, :3]
-    accel = accel + np.einsum("nji,j->ni", R_imu, GRAVITY_M_S2 - gravity)
-    imu = ImuSamples(START_NS + np.round(imu_s * NS_PER_S).astype(np.int64), gyro, accel)
+    imu, gyro_bias, accel_bias, gravity = _inertial(path, scan_s[-1], imu_hz, true_noise or imu_noise, rng)
     motion = path.motion(scan_s)
     R0 = motion.poses[0, :3, :3]
-    poses = se3.between(motion.poses[0], motion.poses)
     lidar = motion.poses @ T_imu_lidar
     stamps = START_NS + np.round(scan_s * NS_PER_S).astype(np.int64)
     calibration = Calibration(T_imu_lidar)
@@ -197,7 +203,7 @@ def make_chain(
         frames,
         relative,
         start_state(int(stamps[0]), frames[1].imu, imu_noise),
-        poses,
+        se3.between(motion.poses[0], motion.poses),
         se3.between(lidar[0], lidar),
         motion.velocity_m_s @ R0,
         accel_bias[at],

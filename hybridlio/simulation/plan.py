@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 DEFAULT_SECONDS = 60.0
 _MARGIN_S = 1.0
 _BEHIND_M, _AHEAD_M = 70.0, 130.0
+_STRETCHES = (1.0, 1.3, 1.7, 2.2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,27 +65,39 @@ def _ground(land: Height, centreline: Road, config: SimulationConfig) -> Ground:
 
 
 def _along_generated_road(config: SimulationConfig) -> Drive:
-    rng = np.random.default_rng([config.seed, 1])
     seconds = config.seconds or DEFAULT_SECONDS
     length = config.length_m or 1.1 * config.speed_m_s * (seconds + 2 * _MARGIN_S)
-    # bends and stops halve the speed; two round trips and more fit in any drive of a minute
-    round_trip = float(np.clip(0.25 * length, 220.0, 700.0)) if config.loops else None
-    centreline = generate_centreline(rng, length + _BEHIND_M + _AHEAD_M, config.scene, round_trip)
-    flat = 0.3 if config.scene == "corridor" else 1.0
-    land = waves(np.random.default_rng([config.seed, 3]), 12, (90.0, 500.0), 0.025 * flat)
-    ground = _ground(land, centreline, config)
-    lane = lane_of(centreline, rng)
     most = 4 * length / config.speed_m_s + 60.0 if config.length_m else seconds
     ticks = np.arange(round(-_MARGIN_S / FINE_S), round((most + _MARGIN_S) / FINE_S) + 1)
     times = np.asarray(ticks * FINE_S, dtype=np.float64)
-    manner = MANNERS[config.driving]
-    s = _BEHIND_M + drive(lane, _BEHIND_M, config.speed_m_s, times, config.start_moving, rng, manner)
-    if config.length_m:
+    for stretch in _STRETCHES:
+        centreline, lane, ground, s = _driven(config, length, stretch, times)
         driven = s - s[round(_MARGIN_S / FINE_S)]
+        if (driven[-1] > config.length_m) if config.length_m else (s[-1] < lane.length_m - STEP_M):
+            break
+    if config.length_m:
         seconds = max(float(times[min(int(np.searchsorted(driven, config.length_m)), len(times) - 101)]), 0.2)
     used = slice(0, round((seconds + 2 * _MARGIN_S) / FINE_S) + 1)
     path = drive_path(lane, s[used], times[used], ground)
     return _furnished(config, path, centreline, lane, ground, seconds)
+
+
+def _driven(config: SimulationConfig, length: float, stretch: float, times: Array) -> tuple[Road, Road, Ground, Array]:
+    """A road for ``length`` metres of driving, its right-hand lane, the ground, and how far along one is at ``times``.
+
+    Rounded corners shorten a road, by how much only its bends tell: ``stretch`` makes it longer.
+    """
+    rng = np.random.default_rng([config.seed, 1])
+    # bends and stops halve the speed; two round trips and more fit in any drive of a minute
+    round_trip = float(np.clip(0.25 * length, 220.0, 700.0)) if config.loops else None
+    centreline = generate_centreline(rng, stretch * length + _BEHIND_M + _AHEAD_M, config.scene, round_trip)
+    flat = 0.3 if config.scene == "corridor" else 1.0
+    land = waves(np.random.default_rng([config.seed, 3]), 12, (90.0, 500.0), 0.025 * flat)
+    ground = _ground(land, centreline, config)
+    lane = lane_of(centreline, rng)
+    manner = MANNERS[config.driving]
+    s = _BEHIND_M + drive(lane, _BEHIND_M, config.speed_m_s, times, config.start_moving, rng, manner)
+    return centreline, lane, ground, s
 
 
 def _along_poses(config: SimulationConfig) -> Drive:

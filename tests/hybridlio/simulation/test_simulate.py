@@ -104,6 +104,16 @@ def test_a_drive_of_a_given_length_is_that_long():
     assert np.linalg.norm(np.diff(position, axis=0), axis=1).sum() == pytest.approx(150.0, abs=3.0)
 
 
+@pytest.mark.parametrize(("seed", "scene"), [(3, "town"), (2, "field"), (9, "field")])
+def test_a_drive_in_loops_is_as_long_as_asked_and_does_not_wait_at_a_roads_end(seed: int, scene: str):
+    settings = {"seed": seed, "scene": scene, "loops": True, "length_m": 600.0, "traffic_per_km": 0.0}
+    drive = plan(SimulationConfig.model_validate(settings))
+    position = drive.path.poses(drive.scan_times_s)[:, :3, 3]
+    steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
+    assert steps.sum() == pytest.approx(600.0, rel=0.01)
+    assert steps[-50:].sum() > 1.0
+
+
 def test_a_misspelt_or_impossible_setting_is_refused():
     for wrong in ({"second": 3.0}, {"lidar": "vlp-17"}, {"seconds": -1.0}, {"scene": "moon"}, {"seed": -1}):
         with pytest.raises(ValidationError):
