@@ -125,7 +125,9 @@ def small_gicp_odometry(_: Sequence, threads: int) -> Step:
         if voxels is None:
             voxels = small_gicp.GaussianVoxelMap(1.0)
         else:
-            found = small_gicp.align(voxels, cloud, pose @ last_step, num_threads=threads).T_target_source
+            # its answer is as little a rotation as its start is, and from step to step that more than doubles
+            start = se3.orthonormalise(pose @ last_step)
+            found = se3.orthonormalise(small_gicp.align(voxels, cloud, start, num_threads=threads).T_target_source)
             last_step, pose = se3.between(pose, found), found
         voxels.insert(cloud, pose)
         return Answer(pose, frame.scan.stamp_ns)
