@@ -7,8 +7,9 @@ import gtsam
 from hybridlio.errors import ConfigError
 from hybridlio.estimates import RelativePose, State
 from hybridlio.graph import factors
+from hybridlio.graph.inertial_steps import InertialSteps
 from hybridlio.graph.online import WARM_UP_STEPS, IncrementalBackend
-from hybridlio.sensors import Calibration, Frame, ImuNoise
+from hybridlio.sensors import Frame
 
 _AT_ONCE = 20  # so many scans are forgotten together, as it takes sorting all that are left
 
@@ -20,7 +21,7 @@ class FixedLagBackend(IncrementalBackend):
     is the same to a hundredth of its standard deviation.
 
     Args:
-        calibration, imu_noise: as there.
+        steps: as there.
         lag_scans: how many scans stay in the graph at least.
 
     Raises:
@@ -29,8 +30,8 @@ class FixedLagBackend(IncrementalBackend):
 
     name = "fixed-lag"
 
-    def __init__(self, calibration: Calibration, imu_noise: ImuNoise, lag_scans: int = 100) -> None:
-        super().__init__(calibration, imu_noise)
+    def __init__(self, steps: InertialSteps, lag_scans: int = 100) -> None:
+        super().__init__(steps)
         if lag_scans < WARM_UP_STEPS:
             raise ConfigError(f"fixed-lag: a lag of {lag_scans} scans is too short, take {WARM_UP_STEPS} or more")
         self._lag = lag_scans

@@ -10,25 +10,30 @@ from hybridlio import se3
 from hybridlio.errors import GraphError
 from hybridlio.estimates import RelativePose, State
 from hybridlio.graph import factors
+from hybridlio.graph.inertial_steps import InertialSteps
 from hybridlio.graph.marginals import step_covariance
-from hybridlio.graph.preintegration import bias_of, covers, preintegrate
+from hybridlio.graph.preintegration import bias_of
 from hybridlio.graph.scans import Scans
 from hybridlio.graph.solver import incremental_solver, reason
-from hybridlio.sensors import NS_PER_S, Calibration, Frame, ImuNoise
+from hybridlio.sensors import NS_PER_S, Frame
 
 # While tilt, speed and biases are still found, every step solves the few poses there are anew.
 WARM_UP_STEPS = 20
 
 
 class IncrementalBackend:
-    """Every scan a pose; consecutive ones joined by the IMU's samples and by the relative pose of the front end."""
+    """Every scan a pose; consecutive ones joined by the IMU's samples and by the relative pose of the front end.
+
+    Args:
+        steps: sums up the samples between scans.
+    """
 
     name = "incremental"
 
-    def __init__(self, calibration: Calibration, noise: ImuNoise) -> None:
-        self._T_imu_lidar = calibration.T_imu_lidar
-        self._T_lidar_imu = se3.inverse(calibration.T_imu_lidar)
-        self._noise = noise
+    def __init__(self, steps: InertialSteps) -> None:
+        self._steps = steps
+        self._T_imu_lidar = steps.T_imu_lidar
+        self._T_lidar_imu = se3.inverse(steps.T_imu_lidar)
         self._k = 0
 
     def start(self, state: State) -> None:
@@ -48,8 +53,7 @@ class IncrementalBackend:
             DataError: a pose relative to a keyframe names a scan that there is not.
         """
         state, stamp_ns = self._state, frame.scan.stamp_ns
-        usable = state.has_imu and covers(frame.imu, state.stamp_ns, stamp_ns)
-        pim = preintegrate(frame.imu, state, self._noise) if usable else None
+        pim = self._steps.sum(frame, state)
         graph = factors.step_factors(self._k, state, relative, pim, stamp_ns, self._T_imu_lidar, self._scans)
         values, guess = gtsam.Values(), self._guess(frame, relative, pim)
         factors.insert_step(values, self._k, state, guess, relative, self._scans)

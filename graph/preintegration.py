@@ -1,4 +1,4 @@
-"""IMU preintegration (Forster et al., "On-Manifold Preintegration", TRO 2017) by GTSAM; the initial pose from it."""
+"""IMU preintegration (Forster et al., "On-Manifold Preintegration", TRO 2017) by GTSAM."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import numpy as np
 
 from hybridlio import se3
 from hybridlio.errors import DataError
-from hybridlio.estimates import Array, RelativePose, State
-from hybridlio.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples
+from hybridlio.estimates import Array, State
+from hybridlio.sensors import NS_PER_S, ImuNoise, ImuSamples
 
 # What a vehicle can do between two samples that linear interpolation does not see. At 100 Hz it is below the sensor's
 # own noise; at 10 Hz, or across a gap, it is what the uncertainty consists of.
 _JERK_M_S3 = 5.0
 _ANGULAR_ACCELERATION_RAD_S2 = 0.5
-_LARGEST_ACCELERATION_M_S2 = 4.0
-_LARGEST_RATE_RAD_S = 0.6
+LARGEST_ACCELERATION_M_S2 = 4.0
+LARGEST_RATE_RAD_S = 0.6
 
 
 def sampling_noise(noise: ImuNoise, gap_s: float) -> tuple[float, float]:
@@ -24,8 +24,8 @@ def sampling_noise(noise: ImuNoise, gap_s: float) -> tuple[float, float]:
     Adds to the sensor's own noise the motion that samples so far apart cannot show, growing with the gap up to the
     accelerations and rates a vehicle reaches; constant over the gap, so its density is the deviation times √gap.
     """
-    accel = min(_JERK_M_S3 * gap_s / 4, _LARGEST_ACCELERATION_M_S2) * np.sqrt(gap_s)
-    gyro = min(_ANGULAR_ACCELERATION_RAD_S2 * gap_s / 4, _LARGEST_RATE_RAD_S) * np.sqrt(gap_s)
+    accel = min(_JERK_M_S3 * gap_s / 4, LARGEST_ACCELERATION_M_S2) * np.sqrt(gap_s)
+    gyro = min(_ANGULAR_ACCELERATION_RAD_S2 * gap_s / 4, LARGEST_RATE_RAD_S) * np.sqrt(gap_s)
     return float(np.hypot(noise.accel_m_s2_sqrt_hz, accel)), float(np.hypot(noise.gyro_rad_s_sqrt_hz, gyro))
 
 
@@ -93,56 +93,3 @@ def predict_step(pim: gtsam.PreintegratedCombinedMeasurements, state: State) -> 
     noise = pim.preintMeasCov()[:6, :6]
     covariance = J @ state.covariance @ J.T + by_gravity @ state.gravity_covariance @ by_gravity.T + noise
     return step, (covariance + covariance.T) / 2
-
-
-class Preintegration:
-    """Initial pose from the IMU, starting at the graph's velocity, tilt and biases."""
-
-    name = "preintegration"
-
-    def __init__(self, calibration: Calibration, noise: ImuNoise) -> None:
-        self._T_imu_lidar = calibration.T_imu_lidar
-        self._noise = noise
-        self._stamp_ns = 0
-        self._turning_rad_s: Array = np.zeros(3)  # of the last step that was estimated, in the IMU's frame
-
-    def predict(self, frame: Frame, state: State) -> RelativePose:
-        """Integrate the frame's samples from ``state``.
-
-        Where samples are missing it carries the state's velocity on, and says so in ``ok`` and the covariance.
-
-        Raises:
-            DataError: the recording has no IMU samples at all.
-        """
-        if not state.has_imu:
-            raise DataError(
-                f"frame {frame.index}: no IMU samples; choose another initial pose, such as constant-velocity, "
-                "or a recording with IMU"
-            )
-        self._stamp_ns = state.stamp_ns
-        if not covers(frame.imu, state.stamp_ns, frame.scan.stamp_ns):
-            return self._coast(frame, state)
-        step, covariance = predict_step(preintegrate(frame.imu, state, self._noise), state)
-        return self._between_lidars(step, covariance, from_imu=True)
-
-    def _coast(self, frame: Frame, state: State) -> RelativePose:
-        """On at the state's velocity and the last step's turn, as unsure as a vehicle is free to change both."""
-        dt_s = (frame.scan.stamp_ns - state.stamp_ns) / NS_PER_S
-        R_imu_world = state.T_world_imu[:3, :3].T
-        step = se3.exp(np.r_[self._turning_rad_s, R_imu_world @ state.velocity_m_s] * dt_s)
-        by_velocity = R_imu_world @ state.covariance[6:9, 6:9] @ R_imu_world.T * dt_s**2
-        sigmas = np.r_[np.full(3, _LARGEST_RATE_RAD_S * dt_s), np.full(3, _LARGEST_ACCELERATION_M_S2 * dt_s**2 / 2)]
-        covariance = np.diag(sigmas**2) + np.pad(by_velocity, (3, 0))
-        return self._between_lidars(step, covariance, ok=False)
-
-    def _between_lidars(self, step: Array, covariance: Array, ok: bool = True, from_imu: bool = False) -> RelativePose:
-        """A step of the IMU as one of the lidar."""
-        T_lidar_imu = se3.inverse(self._T_imu_lidar)
-        pose = T_lidar_imu @ step @ self._T_imu_lidar
-        covariance = se3.rotate_covariance(covariance, T_lidar_imu)
-        return RelativePose(pose, covariance, source=self.name, ok=ok, from_imu=from_imu)
-
-    def correct(self, frame: Frame, estimate: RelativePose) -> None:
-        """Remember the turn, for times without samples; all else the graph's state carries."""
-        dt_s = (frame.scan.stamp_ns - self._stamp_ns) / NS_PER_S
-        self._turning_rad_s = self._T_imu_lidar[:3, :3] @ se3.so3_log(estimate.pose[:3, :3]) / dt_s

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import small_gicp
 
 from hybridlio import se3
 from hybridlio.estimates import Array
+from hybridlio.map_cells import MapCells
 from hybridlio.surface import Surface
 
 
@@ -41,8 +41,7 @@ class LocalMap:
 
     def __init__(self, settings: LocalMapSettings) -> None:
         self._settings = settings
-        self._cells = small_gicp.IncrementalVoxelMapNormal(settings.voxel_m)
-        self._cells.set_lru(settings.horizon_keyframes, max(1, settings.horizon_keyframes // 6))
+        self._cells = MapCells(settings.voxel_m, settings.horizon_keyframes, settings.neighbours, settings.threads)
         self._keyframe: Array | None = None
         self.keyframes = 0
         self.surface: Surface | None = None
@@ -57,12 +56,9 @@ class LocalMap:
 
     def insert(self, points: Array, T_map_lidar: Array) -> None:
         """Take a scan's points ``(N, 3)``, lidar frame, as a keyframe at this pose and renew the surface."""
-        cloud = small_gicp.PointCloud(points)
-        small_gicp.estimate_normals(cloud, None, self._settings.neighbours, self._settings.threads)
-        self._cells.insert(cloud, T_map_lidar)
+        self._cells.insert(points, T_map_lidar, self.surface)
         self._keyframe = T_map_lidar
         self.keyframes += 1
-        points, normals = self._cells.voxel_points()[:, :3], self._cells.voxel_normals()[:, :3]
-        near = ((points - T_map_lidar[:3, 3]) ** 2).sum(axis=1) < self._settings.radius_m**2
-        near &= np.abs(normals).sum(axis=1) > 0.5  # small_gicp leaves a normal zero where there are too few neighbours
-        self.surface = Surface(points[near], normals[near], self._settings.threads)
+        away = self._cells.points - T_map_lidar[:3, 3]
+        near = np.einsum("ij,ij->i", away, away) < self._settings.radius_m**2
+        self.surface = Surface(self._cells.points[near], self._cells.normals[near], self._settings.threads)

@@ -161,7 +161,6 @@ class Odometry:
         )
         self._residual = RESIDUAL_SOURCES[residual](setup) if isinstance(residual, str) else residual
         self._backend = BACKENDS[backend](setup) if isinstance(backend, str) else backend
-        self._preintegration = INITIAL_POSE_SOURCES["preintegration"](setup)
         self._witness = Witness()
         self._residual.start(frame)
         self._first = frame
@@ -197,9 +196,7 @@ class Odometry:
         self, frame: Frame, initial: RelativePose, measured: RelativePose, state: State
     ) -> tuple[RelativePose, Agreement]:
         """Down-weight or reject what the IMU contradicts."""
-        predicted: RelativePose | None = initial
-        if initial.source != self._preintegration.name:
-            predicted = self._preintegration.predict(frame, state) if state.has_imu else None
+        predicted = self._setup.inertial_steps.predicted(frame, state) if state.has_imu else None
         relative, agreement = self._witness.judge(measured, predicted, initial)
         if agreement.verdict == "rejected" and isinstance(self._residual, TakesBack):
             self._residual.take_back(initial)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 from hybridlio.errors import ConfigError
@@ -15,6 +15,7 @@ from hybridlio.errors import ConfigError
 if TYPE_CHECKING:  # the command line lists the names, and must start quickly
     from hybridlio.config import Config
     from hybridlio.estimates import Backend, InitialPoseSource, ResidualSource
+    from hybridlio.graph.inertial_steps import InertialSteps
     from hybridlio.recent_scans import PairSource
     from hybridlio.sensors import Calibration, ImuNoise
 
@@ -27,11 +28,18 @@ class Setup:
     calibration: Calibration
     imu_noise: ImuNoise
 
+    @cached_property
+    def inertial_steps(self) -> InertialSteps:
+        """One for all, so that each step's samples are summed up once."""
+        from hybridlio.graph.inertial_steps import InertialSteps
+
+        return InertialSteps(self.calibration, self.imu_noise)
+
 
 def _preintegration(setup: Setup) -> InitialPoseSource:
-    from hybridlio.graph.preintegration import Preintegration
+    from hybridlio.graph.inertial_initial_pose import Preintegration
 
-    return Preintegration(setup.calibration, setup.imu_noise)
+    return Preintegration(setup.inertial_steps)
 
 
 def _kalman(setup: Setup) -> InitialPoseSource:
@@ -99,13 +107,13 @@ def _no_residual(_: Setup) -> ResidualSource:
 def _incremental(setup: Setup) -> Backend:
     from hybridlio.graph.online import IncrementalBackend
 
-    return IncrementalBackend(setup.calibration, setup.imu_noise)
+    return IncrementalBackend(setup.inertial_steps)
 
 
 def _fixed_lag(setup: Setup) -> Backend:
     from hybridlio.graph.fixed_lag import FixedLagBackend
 
-    return FixedLagBackend(setup.calibration, setup.imu_noise)
+    return FixedLagBackend(setup.inertial_steps)
 
 
 def _no_backend(setup: Setup) -> Backend:

@@ -180,3 +180,21 @@ def test_the_configuration_loads_no_pytorch():
     code = "import sys; from hybridlio.config import Config; Config(); print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False"]
+
+
+def test_odometry_without_imu_and_graph_does_without_gtsam():
+    code = """
+import sys
+import numpy as np
+from hybridlio.config import Config
+from hybridlio.odometry import Odometry
+from hybridlio.sensors import Frame, ImuSamples, Scan
+
+points = np.random.default_rng(0).uniform(-9, 9, (3000, 3)).astype(np.float32)
+points[np.arange(3000), np.arange(3000) % 3] = 9
+odometry = Odometry("constant-velocity", "scan-matching", "none")
+for k in range(3):
+    odometry.step(Frame(k, Scan(k * 10**8, points), ImuSamples.empty()))
+print("gtsam" in sys.modules)
+"""
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"

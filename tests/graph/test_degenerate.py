@@ -11,6 +11,7 @@ import numpy as np
 from hybridlio import se3
 from hybridlio.estimates import State
 from hybridlio.graph.fixed_lag import FixedLagBackend
+from hybridlio.graph.inertial_steps import InertialSteps
 
 OPEN_M = 10.0  # what scan matching says of a direction that it cannot see
 
@@ -24,7 +25,7 @@ def through_a_corridor(chain: Callable[..., Any], seed: int, steps: int) -> tupl
     for k in range(30, 30 + steps):
         relative = drive.relative[k]
         drive.relative[k] = replace(relative, pose=relative.pose @ slip, covariance=relative.covariance + unknown)
-    backend = FixedLagBackend(drive.calibration, drive.noise)
+    backend = FixedLagBackend(InertialSteps(drive.calibration, drive.noise))
     backend.start(drive.start)
     return drive, [backend.update(f, r) for f, r in zip(drive.frames[1:], drive.relative, strict=True)]
 

@@ -12,6 +12,7 @@ import pytest
 from hybridlio import se3
 from hybridlio.errors import ConfigError
 from hybridlio.graph.fixed_lag import FixedLagBackend
+from hybridlio.graph.inertial_steps import InertialSteps
 from hybridlio.graph.online import IncrementalBackend
 from hybridlio.sensors import Calibration, ImuNoise, ImuSamples
 
@@ -32,8 +33,8 @@ def test_the_newest_state_is_the_incremental_backends(
     chain: Callable[..., Any], with_imu: bool, drift_share: float | None
 ) -> None:
     drive = chain(seed=5, steps=150, drift_share=drift_share)
-    lagged = FixedLagBackend(drive.calibration, drive.noise, lag_scans=30)
-    whole = IncrementalBackend(drive.calibration, drive.noise)
+    lagged = FixedLagBackend(InertialSteps(drive.calibration, drive.noise), lag_scans=30)
+    whole = IncrementalBackend(InertialSteps(drive.calibration, drive.noise))
     drive_through(lagged, drive, with_imu)
     drive_through(whole, drive, with_imu)
     sigmas = np.sqrt(np.diag(whole._state.covariance))[:6]
@@ -50,7 +51,7 @@ def test_the_newest_state_is_the_incremental_backends(
 
 def test_memory_stops_growing_at_the_lag(chain: Callable[..., Any]) -> None:
     drive = chain(seed=6, steps=120, drift_share=0.1)
-    sizes = drive_through(FixedLagBackend(drive.calibration, drive.noise, lag_scans=40), drive)
+    sizes = drive_through(FixedLagBackend(InertialSteps(drive.calibration, drive.noise), lag_scans=40), drive)
     assert sizes[20] > sizes[10]
     assert max(sizes) == max(sizes[-20:]) <= 5 * 62 < 5 * 120
     assert min(sizes[60:]) >= 5 * 40
@@ -58,4 +59,4 @@ def test_memory_stops_growing_at_the_lag(chain: Callable[..., Any]) -> None:
 
 def test_a_lag_shorter_than_the_start_needs_is_refused() -> None:
     with pytest.raises(ConfigError, match="too short"):
-        FixedLagBackend(Calibration(), ImuNoise(), lag_scans=5)
+        FixedLagBackend(InertialSteps(Calibration(), ImuNoise()), lag_scans=5)

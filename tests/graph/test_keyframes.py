@@ -16,6 +16,7 @@ from hybridlio.errors import DataError
 from hybridlio.estimates import KeyframePose, RelativePose
 from hybridlio.graph import factors, solver
 from hybridlio.graph.fixed_lag import FixedLagBackend
+from hybridlio.graph.inertial_steps import InertialSteps
 from hybridlio.graph.offline import smooth
 from hybridlio.graph.online import IncrementalBackend
 from hybridlio.graph.scans import Scans
@@ -116,7 +117,7 @@ def judged(drives: list[Any]) -> tuple[float, float, float]:
     """ANEES of poses and of steps, and the root mean square position error in metres."""
     poses, steps, metres = [], [], []
     for drive in drives:
-        backend = IncrementalBackend(drive.calibration, drive.noise)
+        backend = IncrementalBackend(InertialSteps(drive.calibration, drive.noise))
         backend.start(drive.start)
         for k, (frame, relative) in enumerate(zip(drive.frames[1:], drive.relative, strict=True), 1):
             state = backend.update(frame, relative)
@@ -171,9 +172,9 @@ def test_what_old_scans_are_forgotten_by_is_safe_wherever_they_are_linearised_an
     low = {kind: 1e-4 * change for kind, change in solver._RELINEARISE.items()}
     monkeypatch.setattr(solver, "_RELINEARISE", low)
     drive = chain(seed=9, steps=110, drift_share=1 - SHARED, back=back)
-    lagged = FixedLagBackend(drive.calibration, drive.noise, lag_scans=30)
+    lagged = FixedLagBackend(InertialSteps(drive.calibration, drive.noise), lag_scans=30)
     states = drive_through(lagged, drive)
-    whole = drive_through(IncrementalBackend(drive.calibration, drive.noise), drive)
+    whole = drive_through(IncrementalBackend(InertialSteps(drive.calibration, drive.noise)), drive)
     assert lagged._isam.getLinearizationPoint().size() <= 5 * 51
     sigmas = np.sqrt(np.diag(whole[-1].covariance)[:6])
     assert (np.abs(errors(states[-1:], drive) - errors(whole[-1:], drive)) < 0.1 * sigmas).all()

@@ -18,9 +18,10 @@ from hybridlio.consistency import Anees, anees
 from hybridlio.errors import GraphError
 from hybridlio.estimates import RelativePose, State
 from hybridlio.graph import factors
+from hybridlio.graph.inertial_initial_pose import Preintegration
+from hybridlio.graph.inertial_steps import InertialSteps
 from hybridlio.graph.offline import smooth
 from hybridlio.graph.online import IncrementalBackend
-from hybridlio.graph.preintegration import Preintegration
 from hybridlio.graph.scans import Scans
 from hybridlio.sensors import Calibration, Frame, ImuNoise, ImuSamples, Scan
 from hybridlio.simulation.path import SmoothPath
@@ -34,7 +35,7 @@ NEVER_TRUE = RelativePose(se3.exp(np.array([0.2, -0.3, 0.5, 5.0, -3.0, 2.0])), 1
 
 def run(chain: Any) -> tuple[IncrementalBackend, list[State], list[RelativePose]]:
     """The chain through the backend: states at all scans but the first, and the steps to them."""
-    backend = IncrementalBackend(chain.calibration, chain.noise)
+    backend = IncrementalBackend(InertialSteps(chain.calibration, chain.noise))
     backend.start(chain.start)
     states, steps = [], []
     for frame, relative in zip(chain.frames[1:], chain.relative, strict=True):
@@ -208,7 +209,7 @@ def test_a_straight_road_of_a_thousand_poses_with_imu_is_solved_without_touching
             return getattr(self._solver, name)
 
     monkeypatch.setattr(online, "incremental_solver", Counting)
-    backend = IncrementalBackend(Calibration(), ImuNoise())
+    backend = IncrementalBackend(InertialSteps(Calibration(), ImuNoise()))
     backend.start(start_state(10**17, straight_frame(1).imu, ImuNoise()))
     for k in range(1, 1001):
         end = backend.update(straight_frame(k), STRAIGHT)
@@ -243,7 +244,7 @@ def test_online_and_offline_agree_on_the_newest_pose(chain: Callable[..., Any]):
 
 def warmed_up(chain: Callable[..., Any], steps: int = 30) -> tuple[Any, IncrementalBackend, State]:
     drive = chain(12, steps=steps + 1)
-    backend = IncrementalBackend(drive.calibration, drive.noise)
+    backend = IncrementalBackend(InertialSteps(drive.calibration, drive.noise))
     backend.start(drive.start)
     for frame, relative in zip(drive.frames[1:-1], drive.relative[:-1], strict=True):
         state = backend.update(frame, relative)
@@ -252,7 +253,7 @@ def warmed_up(chain: Callable[..., Any], steps: int = 30) -> tuple[Any, Incremen
 
 def test_a_relative_pose_made_from_the_imu_leaves_the_estimate_as_the_imu_alone_has_it(chain: Callable[..., Any]):
     drive, backend, before = warmed_up(chain)
-    predicted = Preintegration(drive.calibration, drive.noise).predict(drive.frames[-1], before)
+    predicted = Preintegration(InertialSteps(drive.calibration, drive.noise)).predict(drive.frames[-1], before)
     backend.update(drive.frames[-1], predicted)
     step = backend.last_step()
     assert sigmas_off(se3.log(se3.between(predicted.pose, step.pose)), predicted.covariance) < 0.02
@@ -261,7 +262,7 @@ def test_a_relative_pose_made_from_the_imu_leaves_the_estimate_as_the_imu_alone_
 
 def test_the_same_pose_from_elsewhere_is_information(chain: Callable[..., Any]):
     drive, backend, before = warmed_up(chain)
-    predicted = Preintegration(drive.calibration, drive.noise).predict(drive.frames[-1], before)
+    predicted = Preintegration(InertialSteps(drive.calibration, drive.noise)).predict(drive.frames[-1], before)
     backend.update(drive.frames[-1], replace(predicted, from_imu=False))
     assert (np.diag(backend.last_step().covariance) < 0.7 * np.diag(predicted.covariance)).all()
 

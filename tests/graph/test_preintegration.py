@@ -14,7 +14,9 @@ from scipy.spatial.transform import Rotation
 from hybridlio import se3
 from hybridlio.errors import DataError
 from hybridlio.estimates import State
-from hybridlio.graph.preintegration import Preintegration, covers, predict_step, preintegrate, sampling_noise
+from hybridlio.graph.inertial_initial_pose import Preintegration
+from hybridlio.graph.inertial_steps import InertialSteps
+from hybridlio.graph.preintegration import covers, predict_step, preintegrate, sampling_noise
 from hybridlio.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples, Scan
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.imu import ideal_imu
@@ -209,7 +211,7 @@ def at_rest(start_s: float, end_s: float) -> ImuSamples:
 def test_the_prediction_is_of_the_lidar_not_of_the_imu():
     mount = se3.make(Rotation.from_euler("z", 90, degrees=True).as_matrix(), [1.0, 0.0, 0.5])
     state, frame = straight(1, mount)
-    predicted = Preintegration(Calibration(mount), NOISE).predict(frame(at_rest(0.0, 0.1)), state)
+    predicted = Preintegration(InertialSteps(Calibration(mount), NOISE)).predict(frame(at_rest(0.0, 0.1)), state)
     np.testing.assert_allclose(predicted.pose, se3.make(np.eye(3), [0.0, -1.0, 0.0]), atol=1e-9)
     assert (predicted.source, predicted.ok, predicted.from_imu) == ("preintegration", True, True)
 
@@ -221,7 +223,7 @@ def test_the_prediction_is_of_the_lidar_not_of_the_imu():
 )
 def test_where_samples_are_missing_it_coasts_and_says_so(imu: ImuSamples):
     state, frame = straight(1)
-    source = Preintegration(Calibration(), NOISE)
+    source = Preintegration(InertialSteps(Calibration(), NOISE))
     coasted, sure = source.predict(frame(imu), state), source.predict(frame(at_rest(0.0, 0.1)), state)
     assert not coasted.ok
     assert not coasted.from_imu
@@ -232,7 +234,7 @@ def test_where_samples_are_missing_it_coasts_and_says_so(imu: ImuSamples):
 def test_coasting_goes_on_with_the_last_turn():
     mount = se3.make(Rotation.from_euler("z", 90, degrees=True).as_matrix(), [1.0, 0.0, 0.5])
     state, frame = straight(1, mount)
-    source = Preintegration(Calibration(mount), NOISE)
+    source = Preintegration(InertialSteps(Calibration(mount), NOISE))
     known = source.predict(frame(at_rest(0.0, 0.1)), state)
     turn = se3.so3_exp([0.01, -0.02, 0.05])
     source.correct(frame(at_rest(0.0, 0.1)), replace(known, pose=se3.make(turn, known.pose[:3, 3])))
@@ -241,7 +243,7 @@ def test_coasting_goes_on_with_the_last_turn():
 
 
 def test_longer_coasting_is_less_sure():
-    source = Preintegration(Calibration(), NOISE)
+    source = Preintegration(InertialSteps(Calibration(), NOISE))
     sigmas = []
     for steps in (1, 3, 10):
         state, frame = straight(steps)
@@ -251,8 +253,23 @@ def test_longer_coasting_is_less_sure():
 
 def test_a_recording_without_imu_is_told_what_to_choose_instead():
     state, frame = straight(1)
+    source = Preintegration(InertialSteps(Calibration(), NOISE))
     with pytest.raises(DataError, match=r"frame 3: no IMU samples; .*constant-velocity"):
-        Preintegration(Calibration(), NOISE).predict(frame(ImuSamples.empty()), replace(state, has_imu=False))
+        source.predict(frame(ImuSamples.empty()), replace(state, has_imu=False))
+
+
+def test_samples_are_summed_up_once_for_the_same_step_and_anew_for_another():
+    steps, (state, frame) = InertialSteps(Calibration(), NOISE), straight(1)
+    asked = frame(at_rest(0.0, 0.1))
+    first = steps.sum(asked, state)
+    assert first is not None
+    assert steps.sum(replace(asked, index=7), state) is first
+    assert steps.predicted(asked, state) is steps.predicted(asked, state)
+    other = replace(state, accel_bias_m_s2=np.array([0.1, 0.0, 0.0]))
+    assert steps.sum(asked, other) is not first
+    assert steps.sum(replace(asked, imu=at_rest(0.0, 0.1)), state) is not first
+    assert steps.sum(asked, replace(state, has_imu=False)) is None
+    assert steps.predicted(frame(ImuSamples.empty()), state) is None
 
 
 def test_one_sample_cannot_be_summed_up():

@@ -13,7 +13,8 @@ from hybridlio.agreement import START_STEPS
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.dead_reckoning import DeadReckoning
 from hybridlio.estimates import Array, RelativePose, State
-from hybridlio.graph.preintegration import Preintegration
+from hybridlio.graph.inertial_initial_pose import Preintegration
+from hybridlio.graph.inertial_steps import InertialSteps
 from hybridlio.odometry import Odometry
 from hybridlio.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples, Scan
 from hybridlio.startup import start_state
@@ -115,7 +116,7 @@ def test_a_prediction_from_the_state_knows_the_speed_however_unsure_the_heading(
     assert state.has_imu
     np.testing.assert_allclose(state.velocity_m_s, [20.0, 0, 0], atol=1e-9)
     imu = still.between(2 * PERIOD_NS, 3 * PERIOD_NS)
-    predicted = Preintegration(Calibration(), ImuNoise()).predict(frame(3, imu), state)
+    predicted = Preintegration(InertialSteps(Calibration(), ImuNoise())).predict(frame(3, imu), state)
     np.testing.assert_allclose(predicted.pose[:3, 3], [2.0, 0, 0], atol=1e-6)
     assert np.sqrt(predicted.covariance[4, 4]) < 0.05
 

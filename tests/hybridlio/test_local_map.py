@@ -1,8 +1,10 @@
 import numpy as np
 import pytest
+import small_gicp
 
 from hybridlio import se3
 from hybridlio.local_map import LocalMap, LocalMapSettings
+from hybridlio.map_cells import MOST
 
 SETTINGS = LocalMapSettings(threads=1)
 
@@ -90,6 +92,37 @@ def test_a_place_not_seen_for_the_horizon_is_forgotten(rng: np.random.Generator)
         local_map.insert(floor(rng), at(100.0 + k))
     assert local_map.surface is not None
     assert local_map.surface.points[:, 0].min() > 80.0
+
+
+def test_a_cell_takes_in_ten_points_and_none_beside_another(rng: np.random.Generator):
+    local_map = LocalMap(SETTINGS)
+    first, again = floor(rng, 3.0, count=60), floor(rng, 3.0, count=400)
+    local_map.insert(first, at(0.0))
+    assert local_map.surface is not None
+    before = local_map.surface.points
+    local_map.insert(again, at(0.0))
+    after = local_map.surface.points
+    _, counts = np.unique(np.floor(after / SETTINGS.voxel_m), axis=0, return_counts=True)
+    assert counts.max() == MOST
+    assert len(after) > len(before)  # there was room
+    np.testing.assert_array_equal(after[: len(before)], before)
+    apart = np.linalg.norm(after[len(before) :, None] - before, axis=2)
+    assert apart.min() >= 0.1
+
+
+def test_normals_are_of_the_scan_whose_points_they_are(rng: np.random.Generator):
+    """The same as fitting planes to all of the scan's points by small_gicp."""
+    points = np.concatenate([floor(rng), floor(rng)[:, [2, 0, 1]]]) + 0.01 * rng.standard_normal((8000, 3))
+    local_map = LocalMap(LocalMapSettings(threads=1, voxel_m=0.5))
+    local_map.insert(points, np.eye(4))
+    cloud = small_gicp.PointCloud(points)
+    small_gicp.estimate_normals(cloud, None, LocalMapSettings().neighbours, 1)
+    surface = local_map.surface
+    assert surface is not None
+    index, distance2 = small_gicp.KdTree(points, 1).batch_knn_search(surface.points, 1, 1)
+    np.testing.assert_array_equal(distance2, 0.0)
+    cosines = np.abs(np.einsum("ij,ij->i", surface.normals, cloud.normals()[index[:, 0], :3]))
+    assert np.mean(cosines > 1 - 1e-6) > 0.999  # but where the plane is anyone's guess
 
 
 def test_the_nearest_of_the_surface_is_the_nearest(rng: np.random.Generator):
