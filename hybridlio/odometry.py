@@ -17,11 +17,11 @@ from hybridlio.errors import ConfigError, DataError, EstimationError
 from hybridlio.estimates import Array, Backend, InitialPoseSource, RelativePose, ResidualSource, State, TakesBack
 from hybridlio.keyframes import KeyframeMaker
 from hybridlio.record import Record
-from hybridlio.sensors import Calibration, Frame, GpsFix, ImuNoise, ImuSamples
+from hybridlio.record_maker import RecordMaker, joined
+from hybridlio.sensors import Calibration, Frame, ImuNoise, ImuSamples
 from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES, Setup, check_names
 from hybridlio.startup import start_state
 from hybridlio.sweep import compensation_noise, sweep_motion
-from hybridlio.trajectory import Trajectory
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,9 +83,7 @@ class Odometry:
         check_names(*self._chosen)
         self._state: State | None = None
         self._first: Frame | None = None
-        self._estimates: list[Estimate] = []
-        self._imu: list[ImuSamples] = []
-        self._gps: list[GpsFix] = []
+        self._made = RecordMaker()
         self._keyframes = KeyframeMaker(config.keyframes)
 
     def step(self, frame: Frame) -> Estimate:
@@ -95,17 +93,17 @@ class Odometry:
             DataError: frames out of order, or a first scan without points.
             ConfigError: IMU samples without extrinsics.
         """
-        self._gps.extend(frame.gps)
+        self._made.heard(frame.gps)
         if frame.calibration is None and len(frame.imu):
             raise ConfigError(
                 f"frame {frame.index} carries IMU samples but no calibration: set Frame.calibration (T_imu_lidar)"
             )
         if self._first is None:
             return self._keep(self._begin(frame))
-        if frame.scan.stamp_ns <= self._estimates[-1].stamp_ns:
+        if frame.scan.stamp_ns <= self._made.last_ns:
             raise DataError(f"frame {frame.index}: its stamp is not after the last frame's; give frames in order")
         state = self._state if self._state is not None else self._start(frame)
-        self._imu.append(frame.imu)
+        self._made.felt(frame.imu)
         seconds: dict[str, float] = {}
         with _timed(seconds, "initial pose"):
             initial = self._initial_pose.predict(frame, state)
@@ -120,7 +118,7 @@ class Odometry:
             self._initial_pose.correct(frame, step)
         pose, covariance = self._lidar_pose(self._state)
         with _timed(seconds, "keyframes"):
-            self._keyframes.offer(len(self._estimates), self._compensated, pose)
+            self._keyframes.offer(len(self._made), self._compensated, pose)
         return self._keep(
             Estimate(frame.index, frame.scan.stamp_ns, pose, covariance, initial, relative, step, seconds, agreement)
         )  # fmt: skip
@@ -133,23 +131,8 @@ class Odometry:
         """
         if self._state is None:
             raise EstimationError("a record needs at least two frames; call step for more")
-        steps = self._estimates[1:]
-        stamps = np.array([e.stamp_ns for e in self._estimates])
-        online = Trajectory(
-            stamps, np.array([e.pose for e in self._estimates]), np.array([e.covariance for e in self._estimates])
-        )
-        return Record(
-            online=online,
-            initial=tuple(e.initial for e in steps if e.initial is not None),
-            relative=tuple(e.relative for e in steps if e.relative is not None),
-            # a step that failed or was interrupted may have added more
-            imu=_joined(self._imu).between(self._start_state.stamp_ns, int(stamps[-1])),
-            gps=tuple(fix for fix in self._gps if fix.stamp_ns <= stamps[-1]),
-            start=self._start_state,
-            calibration=self._setup.calibration,
-            imu_noise=self._setup.imu_noise,
-            keyframes=self._keyframes.keyframes(),
-        )
+        setup = self._setup
+        return self._made.record(self._start_state, setup.calibration, setup.imu_noise, self._keyframes.keyframes())
 
     def _begin(self, frame: Frame) -> Estimate:
         """Take the first frame: it defines the origin."""
@@ -174,13 +157,13 @@ class Odometry:
         near = ImuSamples.empty() if not len(first.imu) else first.imu.between(
             first.scan.stamp_ns - 10**9, first.scan.stamp_ns
         )  # fmt: skip
-        self._start_state = start_state(first.scan.stamp_ns, _joined([near, frame.imu]), self._setup.imu_noise)
+        self._start_state = start_state(first.scan.stamp_ns, joined([near, frame.imu]), self._setup.imu_noise)
         self._backend.start(self._start_state)
         return self._start_state
 
     def _refine(self, frame: Frame, initial: RelativePose, state: State, seconds: dict[str, float]) -> RelativePose:
         """Compensate the scan's motion, where its points carry times, and refine the initial pose."""
-        turned: Array = np.zeros((6, 6))
+        turned = None
         with _timed(seconds, "motion compensation"):
             if frame.scan.time_offsets_ns is not None:
                 turned = compensation_noise(frame.scan, self._setup.imu_noise)
@@ -190,7 +173,7 @@ class Odometry:
         self._compensated = frame.scan
         with _timed(seconds, "residual"):
             relative = self._residual.refine(frame, initial)
-        return relative.wider(added=turned) if relative.ok else relative
+        return relative if turned is None or not relative.ok else relative.wider(added=turned)
 
     def _compare(
         self, frame: Frame, initial: RelativePose, measured: RelativePose, state: State
@@ -216,24 +199,15 @@ class Odometry:
         return T_lidar_imu @ state.T_world_imu @ T_imu_lidar, covariance
 
     def _keep(self, estimate: Estimate) -> Estimate:
-        self._estimates.append(estimate)
+        initial, relative = estimate.initial, estimate.relative
+        step = None if initial is None or relative is None else (initial, relative)
+        self._made.add(estimate.stamp_ns, estimate.pose, estimate.covariance, step)
         return estimate
 
 
 def _setup(config: Config, frame: Frame) -> Setup:
     noise = config.imu_noise or frame.imu_noise or ImuNoise()
     return Setup(config, frame.calibration or Calibration(), noise)
-
-
-def _joined(parts: list[ImuSamples]) -> ImuSamples:
-    """Samples of consecutive intervals as one; those on a common border once."""
-    parts = [part for part in parts if len(part)]
-    if not parts:
-        return ImuSamples.empty()
-    stamps, first = np.unique(np.concatenate([part.stamps_ns for part in parts]), return_index=True)
-    gyro = np.concatenate([part.gyro_rad_s for part in parts])[first]
-    accel = np.concatenate([part.accel_m_s2 for part in parts])[first]
-    return ImuSamples(stamps, gyro, accel)
 
 
 @contextmanager

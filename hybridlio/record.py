@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybridlio.errors import DataError
-from hybridlio.estimates import KeyframePose, RelativePose, State
+from hybridlio.estimates import RelativePose, State
 from hybridlio.files import writing_whole
 from hybridlio.geodesy import GeodeticPoint
 from hybridlio.keyframes import Keyframes
+from hybridlio.record_steps import keyframe_arrays, relative_arrays, relatives, with_keyframes
 from hybridlio.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.trajectory import Trajectory
 
@@ -124,61 +125,6 @@ class Record:
             raise DataError(f"{path}: not a record of a run ({error}); run `hybridlio odometry` again") from error
 
 
-def _relative_arrays(prefix: str, steps: tuple[RelativePose, ...]) -> dict[str, Any]:
-    return {
-        f"{prefix}_poses": np.array([s.pose for s in steps]).reshape(-1, 4, 4),
-        f"{prefix}_covariances": np.array([s.covariance for s in steps]).reshape(-1, 6, 6),
-        f"{prefix}_sources": np.array([s.source for s in steps], dtype=np.str_),
-        f"{prefix}_ok": np.array([s.ok for s in steps], dtype=bool),
-        f"{prefix}_from_imu": np.array([s.from_imu for s in steps], dtype=bool),
-        f"{prefix}_drifts": np.array([np.full((6, 6), np.nan) if s.drift is None else s.drift for s in steps]).reshape(
-            -1, 6, 6
-        ),
-        f"{prefix}_degenerate_step": np.array(
-            [k for k, s in enumerate(steps) for _ in range(len(s.degenerate))], dtype=np.int64
-        ),
-        f"{prefix}_degenerate": np.concatenate([s.degenerate for s in steps] + [np.empty((0, 6))]),
-    }
-
-
-def _keyframe_arrays(steps: tuple[RelativePose, ...]) -> dict[str, Any]:
-    found = [(row, keyframe) for row, step in enumerate(steps) for keyframe in step.keyframes]
-    return {
-        "keyframe_step": np.array([row for row, _ in found], dtype=np.int64),
-        "keyframe_stamps_ns": np.array([keyframe.stamp_ns for _, keyframe in found], dtype=np.int64),
-        "keyframe_poses": np.array([keyframe.pose for _, keyframe in found]).reshape(-1, 4, 4),
-        "keyframe_covariances": np.array([keyframe.covariance for _, keyframe in found]).reshape(-1, 6, 6),
-    }
-
-
-def _with_keyframes(steps: tuple[RelativePose, ...], arrays: Mapping[str, Any]) -> tuple[RelativePose, ...]:
-    """The steps with what :func:`_keyframe_arrays` holds; the first version had none."""
-    if int(arrays["version"]) == 1:
-        return steps
-    columns = (arrays[f"keyframe_{name}"] for name in ("step", "stamps_ns", "poses", "covariances"))
-    found: dict[int, list[KeyframePose]] = {}
-    for row, stamp, pose, covariance in zip(*columns, strict=True):
-        found.setdefault(int(row), []).append(KeyframePose(int(stamp), pose, covariance))
-    return tuple(replace(step, keyframes=tuple(found.get(row, ()))) for row, step in enumerate(steps))
-
-
-def _relatives(prefix: str, arrays: Mapping[str, Any]) -> tuple[RelativePose, ...]:
-    at, directions = arrays[f"{prefix}_degenerate_step"], arrays[f"{prefix}_degenerate"]
-    columns = (arrays[f"{prefix}_{name}"] for name in ("poses", "covariances", "sources", "ok", "from_imu", "drifts"))
-    return tuple(
-        RelativePose(
-            pose,
-            covariance,
-            str(source),
-            directions[at == k],
-            bool(ok),
-            bool(from_imu),
-            None if np.isnan(drift).any() else drift,
-        )
-        for k, (pose, covariance, source, ok, from_imu, drift) in enumerate(zip(*columns, strict=True))
-    )
-
-
 def _to_arrays(record: Record) -> dict[str, Any]:
     arrays: dict[str, Any] = {
         "version": FORMAT_VERSION,
@@ -201,8 +147,8 @@ def _to_arrays(record: Record) -> dict[str, Any]:
     if record.origin is not None:
         arrays["gps_origin"] = np.array(record.origin)
     arrays |= {f"start_{f.name}": getattr(record.start, f.name) for f in fields(State)}
-    steps = _relative_arrays("initial", record.initial) | _relative_arrays("relative", record.relative)
-    return arrays | steps | _keyframe_arrays(record.relative)
+    steps = relative_arrays("initial", record.initial) | relative_arrays("relative", record.relative)
+    return arrays | steps | keyframe_arrays(record.relative)
 
 
 def _from_arrays(arrays: Mapping[str, Any]) -> Record:
@@ -214,8 +160,8 @@ def _from_arrays(arrays: Mapping[str, Any]) -> Record:
     gps = zip(arrays["gps_stamps_ns"], arrays["gps_positions_m"], arrays["gps_covariances_m2"], strict=True)
     return Record(
         online=Trajectory(arrays["stamps_ns"], arrays["online_poses"], arrays["online_covariances"]),
-        initial=_relatives("initial", arrays),
-        relative=_with_keyframes(_relatives("relative", arrays), arrays),
+        initial=relatives("initial", arrays),
+        relative=with_keyframes(relatives("relative", arrays), arrays),
         imu=ImuSamples(arrays["imu_stamps_ns"], arrays["gyro_rad_s"], arrays["accel_m_s2"]),
         gps=tuple(GpsFix(int(stamp), position, covariance, origin) for stamp, position, covariance in gps),
         start=State(**start),
