@@ -60,6 +60,7 @@ def covariance_of(
     scale: float,
     levers_m: Array | None = None,
     normal_noise: float = NORMAL_NOISE,
+    floor_sigmas: Array = FLOOR_SIGMAS,
 ) -> Array:
     """``scale·σ²·H⁻¹`` ``(6, 6)``, rad² and m², rotation first; 10 m where the matches say nothing.
 
@@ -69,12 +70,13 @@ def covariance_of(
         scale: how much larger it is than independent residuals would make it: points on one surface share its error.
         levers_m: of :func:`lever_arms`.
         normal_noise: of a point's information, how much its normal's noise pretends.
+        floor_sigmas: ``(6,)`` rad, m: no direction is known better.
     """
     values, vectors, to_tangent = scaled_spectrum(information, levers_m)
     known = values - normal_noise * np.trace(information[3:, 3:])
     variance = np.minimum(scale * sigma_m**2 / np.maximum(known, 1e-9), _UNKNOWN_SIGMA_M**2)
     root = vectors * np.sqrt(variance) * to_tangent[:, None]
-    return np.asarray(root @ root.T + np.diag(FLOOR_SIGMAS**2))
+    return np.asarray(root @ root.T + np.diag(floor_sigmas**2))
 
 
 def newton_step(

@@ -33,8 +33,10 @@ CHI2_99, _CHI2_90 = 16.8, 10.6  # of six degrees of freedom
 _LONGEST_STEP_M = 0.5
 _UNKNOWN_SIGMA_M = 10.0
 _NORMAL_NOISE = 5e-3  # planes of one scan, averaged over voxels, are noisier than those of a map
-# The loss's minimum is off by what its clouds are: averages of rings that lie elsewhere in each scan. Rad, m.
-_SYSTEMATIC = np.diag(np.r_[np.full(3, 3e-4), np.full(3, 1.5e-3)] ** 2)
+# The loss's minimum is off, beside noise, by what its clouds are: averages of rings that lie elsewhere in each scan. The
+# road's decide roll, pitch and height. Rad, m, for a lidar whose rings lie about z.
+_SYSTEMATIC = np.diag(np.array([3e-4, 3e-4, 3e-5, 1.5e-3, 1.5e-3, 1.2e-3]) ** 2)
+_FLOOR_SIGMAS = np.r_[np.full(3, 2e-5), np.full(3, 3e-4)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,25 +71,33 @@ class Judged:
     def noise(self, scale: float) -> Array:
         """``(6, 6)`` of what the points leave open: ``scale·σ²·H⁻¹``, and 10 m along what they do not constrain."""
         loose = self._loose() * _UNKNOWN_SIGMA_M
-        known = covariance_of(self.information, self.sigma_m, scale, self.levers_m, _NORMAL_NOISE)
+        known = covariance_of(self.information, self.sigma_m, scale, self.levers_m, _NORMAL_NOISE, _FLOOR_SIGMAS)
         return known + loose @ loose.T
 
     def covariance(self, scale: float) -> Array:
-        """``(6, 6)`` of the pose: what the points leave open, and how far off the minimum of the loss it is.
+        """``(6, 6)`` of the pose, from what the points leave open and how far off the minimum of the loss it is.
 
-        A network's answer is not that minimum. The way to it is an error that the loss can see; it is added as its
-        outer product. Nor is the minimum the truth: where the pose is taken from there, that is added.
+        The pose and the minimum err by themselves: both by noise, the minimum by what is systematic in it too. How much
+        of the way between them is the pose's error follows from these variances, as in a Kalman filter whose pose
+        stays where it is: that part of the way counts by its outer product, all of it where they do not explain it. A
+        pose that was taken from the minimum errs as that does.
         """
-        systematic = _SYSTEMATIC if self.refined else np.zeros((6, 6))
-        return self.noise(scale) + np.outer(self.step, self.step) + systematic
+        noise, step = self.noise(scale), self.step
+        if self.refined:
+            return noise + _SYSTEMATIC + np.outer(step, step)
+        if self.is_off(scale):
+            return noise + np.outer(step, step)
+        gain = noise @ np.linalg.inv(self.spread(scale))
+        left = noise - gain @ noise
+        return (left + left.T) / 2 + np.outer(gain @ step, gain @ step) + self._loose() @ self._loose().T
 
     def is_off(self, scale: float) -> bool:
         """Whether the minimum of the loss is farther away than noise and what is systematic in it explain."""
         return bool(self.step @ np.linalg.solve(self.spread(scale), self.step) > _CHI2_90)
 
     def spread(self, scale: float) -> Array:
-        """``(6, 6)`` within which the loss cannot tell poses apart: noise, and what is systematic in its minimum."""
-        return self.noise(scale) + _SYSTEMATIC
+        """``(6, 6)`` of the way between an answer and the minimum of the loss: the noise of both, and its bias."""
+        return 2 * self.noise(scale) + _SYSTEMATIC
 
     def constrained(self, xi: Array) -> Array:
         """A tangent vector ``(6,)`` without its parts along what the points do not constrain."""
