@@ -33,8 +33,8 @@ CHI2_99, _CHI2_90 = 16.8, 10.6  # of six degrees of freedom
 _LONGEST_STEP_M = 0.5
 _UNKNOWN_SIGMA_M = 10.0
 _NORMAL_NOISE = 5e-3  # planes of one scan, averaged over voxels, are noisier than those of a map
-# The loss's minimum is off, beside noise, by what its clouds are: averages of rings that lie elsewhere in each scan. The
-# road's decide roll, pitch and height. Rad, m, for a lidar whose rings lie about z.
+# The loss's minimum is off, beside noise, by what its clouds are: averages of rings that lie elsewhere in each scan.
+# Those on the road decide roll, pitch and height. Rad, m, for a lidar whose rings lie about z.
 _SYSTEMATIC = np.diag(np.array([3e-4, 3e-4, 3e-5, 1.5e-3, 1.5e-3, 1.2e-3]) ** 2)
 _FLOOR_SIGMAS = np.r_[np.full(3, 2e-5), np.full(3, 3e-4)]
 
