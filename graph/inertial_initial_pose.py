@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 
 from hybridlio import se3
-from hybridlio.errors import DataError
 from hybridlio.estimates import Array, RelativePose, State
 from hybridlio.graph.inertial_steps import PREINTEGRATION, InertialSteps
 from hybridlio.graph.preintegration import LARGEST_ACCELERATION_M_S2, LARGEST_RATE_RAD_S
+from hybridlio.initial_pose import ConstantVelocity
 from hybridlio.sensors import NS_PER_S, Frame
+
+_log = logging.getLogger(__name__)
 
 
 class Preintegration:
@@ -24,22 +28,24 @@ class Preintegration:
     def __init__(self, steps: InertialSteps) -> None:
         self._steps = steps
         self._stamp_ns = 0
+        self._without_imu: ConstantVelocity | None = None
         self._turning_rad_s: Array = np.zeros(3)  # of the last step that was estimated, in the IMU's frame
 
     def predict(self, frame: Frame, state: State) -> RelativePose:
         """Integrate the frame's samples from ``state``.
 
-        Where samples are missing it carries the state's velocity on, and says so in ``ok`` and the covariance.
-
-        Raises:
-            DataError: the recording has no IMU samples at all.
+        Where samples are missing it carries the state's velocity on, and says so in ``ok`` and the covariance. Before
+        the first samples, no state has a velocity: it carries the last step on.
         """
-        if not state.has_imu:
-            raise DataError(
-                f"frame {frame.index}: no IMU samples; choose another initial pose, such as constant-velocity, "
-                "or a recording with IMU"
-            )
         self._stamp_ns = state.stamp_ns
+        if not state.has_imu:
+            if self._without_imu is None:
+                _log.warning(
+                    "frame %d: no IMU samples so far; until there are, initial poses by constant velocity", frame.index
+                )
+                self._without_imu = ConstantVelocity()
+            return self._without_imu.predict(frame, state)
+        self._without_imu = None
         predicted = self._steps.predicted(frame, state)
         return self._coast(frame, state) if predicted is None else predicted
 
@@ -56,4 +62,6 @@ class Preintegration:
     def correct(self, frame: Frame, estimate: RelativePose) -> None:
         """Remember the turn, for times without samples; all else the graph's state carries."""
         dt_s = (frame.scan.stamp_ns - self._stamp_ns) / NS_PER_S
+        if self._without_imu is not None:
+            self._without_imu.correct(frame, estimate)
         self._turning_rad_s = self._steps.T_imu_lidar[:3, :3] @ se3.so3_log(estimate.pose[:3, :3]) / dt_s

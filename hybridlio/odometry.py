@@ -16,6 +16,7 @@ from hybridlio.deskew import constant_twist, deskew
 from hybridlio.errors import ConfigError, DataError, EstimationError
 from hybridlio.estimates import Array, Backend, InitialPoseSource, RelativePose, ResidualSource, State, TakesBack
 from hybridlio.keyframes import KeyframeMaker
+from hybridlio.late_imu import take_up_imu
 from hybridlio.record import Record
 from hybridlio.record_maker import RecordMaker, joined
 from hybridlio.sensors import Calibration, Frame, ImuNoise, ImuSamples
@@ -103,6 +104,8 @@ class Odometry:
         if frame.scan.stamp_ns <= self._made.last_ns:
             raise DataError(f"frame {frame.index}: its stamp is not after the last frame's; give frames in order")
         state = self._state if self._state is not None else self._start(frame)
+        if self._state is not None and not state.has_imu and len(frame.imu):
+            state = self._take_up_imu(frame, state)
         self._made.felt(frame.imu)
         seconds: dict[str, float] = {}
         with _timed(seconds, "initial pose"):
@@ -160,6 +163,11 @@ class Odometry:
         self._start_state = start_state(first.scan.stamp_ns, joined([near, frame.imu]), self._setup.imu_noise)
         self._backend.start(self._start_state)
         return self._start_state
+
+    def _take_up_imu(self, frame: Frame, state: State) -> State:
+        """Start the graph again, once there are samples to tell where down is."""
+        self._start_state, self._state = take_up_imu(self._backend, self.record(), frame, state)
+        return self._state
 
     def _refine(self, frame: Frame, initial: RelativePose, state: State, seconds: dict[str, float]) -> RelativePose:
         """Compensate the scan's motion, where its points carry times, and refine the initial pose."""

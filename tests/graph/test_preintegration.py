@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from hybridlio import se3
 from hybridlio.errors import DataError
-from hybridlio.estimates import State
+from hybridlio.estimates import RelativePose, State
 from hybridlio.graph.inertial_initial_pose import Preintegration
 from hybridlio.graph.inertial_steps import InertialSteps
 from hybridlio.graph.preintegration import covers, predict_step, preintegrate, sampling_noise
@@ -251,11 +251,17 @@ def test_longer_coasting_is_less_sure():
     assert (np.diff(sigmas, axis=0) > 0).all()
 
 
-def test_a_recording_without_imu_is_told_what_to_choose_instead():
+def test_before_the_first_samples_the_last_step_is_carried_on_and_it_says_so_once(caplog: pytest.LogCaptureFixture):
     state, frame = straight(1)
+    state, blank = replace(state, has_imu=False), frame(ImuSamples.empty())
     source = Preintegration(InertialSteps(Calibration(), NOISE))
-    with pytest.raises(DataError, match=r"frame 3: no IMU samples; .*constant-velocity"):
-        source.predict(frame(ImuSamples.empty()), replace(state, has_imu=False))
+    np.testing.assert_array_equal(source.predict(blank, state).pose, np.eye(4))
+    moved = RelativePose(se3.exp(np.array([0.0, 0.0, 0.05, 1.0, 0.0, 0.0])), np.eye(6), "test")
+    source.correct(blank, moved)
+    np.testing.assert_allclose(source.predict(blank, state).pose, moved.pose, atol=1e-12)
+    assert [r.getMessage() for r in caplog.records if "no IMU samples so far" in r.getMessage()] == [
+        "frame 3: no IMU samples so far; until there are, initial poses by constant velocity"
+    ]
 
 
 def test_samples_are_summed_up_once_for_the_same_step_and_anew_for_another():

@@ -235,13 +235,6 @@ def test_an_unknown_name_is_refused_at_once(kind: str, by: str):
         Odometry(**{kind: "lidar-dreams"}) if by == "argument" else Odometry(config=Config(**{kind: "lidar-dreams"}))
 
 
-def test_without_imu_preintegration_says_what_to_choose(frames: list[Frame]):
-    odometry = quick()
-    odometry.step(replace(frames[0], imu=ImuSamples.empty()))
-    with pytest.raises(DataError, match="no IMU samples; choose another initial pose"):
-        odometry.step(replace(frames[1], imu=ImuSamples.empty()))
-
-
 # ---------------------------------------------------------------------------------------------- what is chosen
 
 
