@@ -82,6 +82,7 @@ def accuracy(one: Pass, sequence: Sequence) -> Figures:
             out["against forward speed [%]"] = 100 * (trajectory.length_m / driven_m - 1)
         else:
             out["moved though standing [m]"] = trajectory.length_m
+            out["ended away from the start [m]"] = float(np.linalg.norm(trajectory.poses[-1, :3, 3]))
     return out
 
 
