@@ -67,29 +67,36 @@ class Matches:
 
 
 @torch.no_grad()
-def nearest(queries: Tensor, targets: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
+def nearest(
+    queries: Tensor, targets: Tensor, there: Tensor, max_distance_m: float = float("inf")
+) -> tuple[Tensor, Tensor]:
     """Index and distance ``(B, N)`` of the nearest of the targets to each query.
 
     Args:
         queries: ``(B, N, 3)`` metres.
         targets: ``(B, M, 3)``.
         there: ``(B, M)`` which targets count; where none does, distances are infinite.
+        max_distance_m: those farther away may be given as infinitely far, which saves a CPU looking for them.
     """
     if queries.device.type == "cpu":
-        pairs = [_by_tree(q, t, h) for q, t, h in zip(queries, targets, there, strict=True)]
+        pairs = [_by_tree(q, t, h, max_distance_m) for q, t, h in zip(queries, targets, there, strict=True)]
     else:
         pairs = [_by_distances(q, t, h) for q, t, h in zip(queries, targets, there, strict=True)]
     return torch.stack([index for index, _ in pairs]), torch.stack([distance for _, distance in pairs])
 
 
-def _by_tree(queries: Tensor, targets: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
+def _by_tree(queries: Tensor, targets: Tensor, there: Tensor, limit_m: float = float("inf")) -> tuple[Tensor, Tensor]:
     rows = np.flatnonzero(there.numpy())
     if not len(rows):
         return torch.zeros(len(queries), dtype=torch.int64), torch.full((len(queries),), torch.inf)
     asked = queries.detach().numpy()
     finite = np.isfinite(asked).all(axis=1)
-    distance, index = cKDTree(targets.numpy()[rows]).query(np.where(finite[:, None], asked, 0.0))
+    tree = cKDTree(targets.numpy()[rows], balanced_tree=False)
+    distance, index = tree.query(
+        np.where(finite[:, None], asked, 0.0), distance_upper_bound=limit_m, workers=torch.get_num_threads()
+    )
     distance[~finite] = np.inf
+    index[index == len(rows)] = 0  # none as near
     return torch.from_numpy(rows[index]), torch.from_numpy(distance.astype(np.float32))
 
 
@@ -104,7 +111,8 @@ def _by_distances(queries: Tensor, targets: Tensor, there: Tensor) -> tuple[Tens
 
 def match_nearest(pose: Tensor, last: Clouds, current: Clouds, max_distance_m: float = float("inf")) -> Matches:
     """Each point of the current clouds, moved by the pose ``(B, 4, 4)``, with the nearest of the last ones."""
-    index, distance = nearest(se3.transform(pose.detach(), current.points), last.points, last.there)
+    moved = se3.transform(pose.detach(), current.points)
+    index, distance = nearest(moved, last.points, last.there, max_distance_m)
     rows = index[..., None].expand(-1, -1, 3)
     target, normals = last.points.gather(1, rows), last.normals.gather(1, rows)
     near = current.there & (distance < max_distance_m) & normals.any(-1)

@@ -36,7 +36,11 @@ _NORMAL_NOISE = 5e-3  # planes of one scan, averaged over voxels, are noisier th
 # The loss's minimum is off, beside noise, by what its clouds are: averages of rings that lie elsewhere in each scan.
 # Those on the road decide roll, pitch and height. Rad, m, for a lidar whose rings lie about z.
 _SYSTEMATIC = np.diag(np.array([3e-4, 3e-4, 3e-5, 1.5e-3, 1.5e-3, 1.2e-3]) ** 2)
-_FLOOR_SIGMAS = np.r_[np.full(3, 2e-5), np.full(3, 3e-4)]
+# Nearer poses than this are never told apart by the loss alone, whatever its noise.
+_INDISTINCT = np.diag(np.r_[np.full(3, 3e-4), np.full(3, 1.5e-3)] ** 2)
+# No direction is known better. Heights are left vaguer than simulated scans would have them: real beams' elevations are
+# off, and an IMU's word on heaving, which few samples catch, is soon too sure beside them.
+_FLOOR_SIGMAS = np.array([2e-5, 2e-5, 2e-5, 3e-4, 3e-4, 1e-3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +91,7 @@ class Judged:
             return noise + _SYSTEMATIC + np.outer(step, step)
         if self.is_off(scale):
             return noise + np.outer(step, step)
-        gain = noise @ np.linalg.inv(self.spread(scale))
+        gain = noise @ np.linalg.inv(2 * noise + _SYSTEMATIC)
         left = noise - gain @ noise
         return (left + left.T) / 2 + np.outer(gain @ step, gain @ step) + self._loose() @ self._loose().T
 
@@ -96,8 +100,8 @@ class Judged:
         return bool(self.step @ np.linalg.solve(self.spread(scale), self.step) > _CHI2_90)
 
     def spread(self, scale: float) -> Array:
-        """``(6, 6)`` of the way between an answer and the minimum of the loss: the noise of both, and its bias."""
-        return 2 * self.noise(scale) + _SYSTEMATIC
+        """``(6, 6)`` within which the loss cannot tell poses apart."""
+        return self.noise(scale) + _INDISTINCT
 
     def constrained(self, xi: Array) -> Array:
         """A tangent vector ``(6,)`` without its parts along what the points do not constrain."""

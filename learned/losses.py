@@ -77,16 +77,18 @@ def gauss_newton(matches: Matches, pose: Tensor, settings: LossSettings) -> Gaus
         R = pose[:, :3, :3]
         distances = _distances(matches, se3.transform(pose, matches.source), settings)
         ((of_rotation, of_translation), curvature) = _jacobians(matches, R, settings), _curvature(distances, settings)
-        J = torch.cat([of_rotation, of_translation], dim=-1)
+        J = torch.cat([of_rotation, of_translation], dim=-1).flatten(1, 2)
         weights = curvature * matches.weight[..., None]
-        both = _with_both_normals(matches)
-        difference = se3.rotate(pose, matches.source_normals) - matches.target_normals
-        # d(R Exp(ω) n)/dω = −R [n]×
-        J_normal = -R[:, None] @ se3.hat(matches.source_normals)
-        H = settings.alpha * torch.einsum("bnc,bnci,bncj->bij", weights, J, J)
-        g = settings.alpha * torch.einsum("bnc,bnci,bnc->bi", weights, J, distances)
-        H[:, :3, :3] += 2 * settings.lambda_ * torch.einsum("bn,bnci,bncj->bij", both, J_normal, J_normal)
-        g[:, :3] += 2 * settings.lambda_ * torch.einsum("bn,bnci,bnc->bi", both, J_normal, difference)
+        weighted = (J * weights.flatten(1)[..., None]).transpose(1, 2)
+        H = settings.alpha * (weighted @ J)
+        g = settings.alpha * (weighted @ distances.flatten(1)[..., None])[..., 0]
+        # d(R Exp(ω) n)/dω = −R [n]×: the sum of its squares is |n|²·1 − n nᵀ, of its products with d that of n × Rᵀd
+        n, both = matches.source_normals, _with_both_normals(matches)[..., None]
+        in_source = (se3.rotate(pose, n) - matches.target_normals) @ R
+        outer = (n * both).transpose(1, 2) @ n
+        sizes = outer.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None]
+        H[:, :3, :3] += 2 * settings.lambda_ * (sizes * torch.eye(3, dtype=R.dtype, device=R.device) - outer)
+        g[:, :3] += 2 * settings.lambda_ * (both * torch.linalg.cross(n, in_source)).sum(1)
         spread = (weights * distances.square()).sum((1, 2)) / weights.sum((1, 2)).clamp(min=1e-12)
         at_zero = _curvature(torch.zeros_like(distances[:1, :1, :1]), settings)
         information = H / (at_zero.item() * (settings.alpha or 1.0))
