@@ -173,7 +173,8 @@ class PointWeights(nn.Module):
         hidden = there.add_(current.as_current.index_select(1, current.coarse))  # in place: memory is what takes time
         weight = self.of_point.weight.t().expand(batch, -1, -1)
         hidden = hidden.baddbmm_(point.transpose(1, 2), weight).relu_()
-        return self.logit(hidden).sigmoid_().transpose(1, 2)
+        weights: Tensor = self.logit(hidden)
+        return weights.sigmoid_().transpose(1, 2)
 
 
 def _coarse_cells(geometry: MapGeometry) -> Tensor:
