@@ -53,3 +53,38 @@ def test_hard_cases_are_held_against_the_normal_one(tmp_path):
         assert ours["end_sigma_m"] > 0
         assert "end_sigma_m" not in systems["small_gicp"][0]
     assert "small_gicp" in (tmp_path / "imu-gap.md").read_text()
+
+
+def test_small_gicps_odometry_still_stands_after_sixty_times_the_same_scan(tiny_drive):
+    program = (
+        "import sys; sys.path.insert(0, sys.argv[1]); import numpy as np; from pathlib import Path;"
+        "from systems import small_gicp_odometry; from hybridlio.datasets.registry import open_sequence;"
+        "sequence = open_sequence(Path(sys.argv[2])); step = small_gicp_odometry(sequence, 1);"
+        "poses = [step(sequence[0]).pose for _ in range(60)]; print(np.abs(poses[-1] - np.eye(4)).max())"
+    )
+    command = [sys.executable, "-c", program, str(ROOT / "benchmarks"), str(tiny_drive)]
+    done = subprocess.run(
+        command, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) < 0.01
+
+
+def test_a_system_that_diverges_is_named_and_not_judged(tiny_drive, tmp_path):
+    program = (
+        "import sys; sys.path.insert(0, sys.argv[1]); import peers, systems, lockstep; from functools import partial;"
+        "from pathlib import Path; import numpy as np\n"
+        "def make(sequence, threads):\n"
+        "    return lambda frame: systems.Answer(np.eye(4) * 50.0**frame.index, frame.scan.stamp_ns)\n"
+        "if __name__ == '__main__':\n"
+        "    again = partial(peers.opened, Path(sys.argv[2]), None, None)\n"
+        "    found = lockstep.run_in_lockstep({'wild': make}, again, 10, 1)['wild']\n"
+        "    print(found.error, peers.accuracy(found, again()))\n"
+    )
+    (tmp_path / "wild.py").write_text(program)
+    command = [sys.executable, str(tmp_path / "wild.py"), str(ROOT / "benchmarks"), str(tiny_drive)]
+    done = subprocess.run(
+        command, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "scan 4: OverflowError: diverged {}"
