@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from hybridlio import se3
-from hybridlio.estimates import RelativePose
+from hybridlio.estimates import Array, RelativePose
 
 Verdict = Literal["untested", "agrees", "down-weighted", "rejected", "trusted again"]
 
@@ -47,8 +47,7 @@ def chi2_of(measured: RelativePose, predicted: RelativePose, times: float = 1.0)
 
     The difference is ``Log(measured⁻¹·predicted)``; so small that both covariances hold in one tangent space.
     """
-    error = se3.log(se3.between(measured.pose, predicted.pose))
-    return float(error @ np.linalg.solve(times * measured.covariance + predicted.covariance, error))
+    return _chi2(_difference(measured, predicted), times * measured.covariance + predicted.covariance)
 
 
 def widening(measured: RelativePose, predicted: RelativePose, chi2: float = GATE) -> float:
@@ -56,15 +55,28 @@ def widening(measured: RelativePose, predicted: RelativePose, chi2: float = GATE
 
     Solved by bisection in its logarithm: the difference falls as the covariance grows, towards zero.
     """
+    error = _difference(measured, predicted)
+
+    def is_too_far(log_times: float) -> bool:
+        return _chi2(error, np.exp(log_times) * measured.covariance + predicted.covariance) > chi2
+
     low, high = 0.0, 1.0
-    if chi2_of(measured, predicted) <= chi2:
+    if not is_too_far(low):
         return 1.0
-    while chi2_of(measured, predicted, np.exp(high)) > chi2:
+    while is_too_far(high):
         low, high = high, 2 * high
     for _ in range(40):
         middle = (low + high) / 2
-        low, high = (middle, high) if chi2_of(measured, predicted, np.exp(middle)) > chi2 else (low, middle)
+        low, high = (middle, high) if is_too_far(middle) else (low, middle)
     return float(np.exp(high))
+
+
+def _difference(measured: RelativePose, predicted: RelativePose) -> Array:
+    return se3.log(se3.between(measured.pose, predicted.pose))
+
+
+def _chi2(error: Array, covariance: Array) -> float:
+    return float(error @ np.linalg.solve(covariance, error))
 
 
 class Witness:

@@ -6,7 +6,7 @@ Each is made when it is asked for, so that only what is used is imported.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
@@ -75,13 +75,16 @@ def _scan_matching(setup: Setup) -> ResidualSource:
     return _with_recent_scans(ScanMatching(settings), setup)
 
 
-def _network(setup: Setup) -> ResidualSource:
+def _network_alone(setup: Setup) -> PairSource:
     from hybridlio.learned.network_residual import NetworkResidual
     from hybridlio.preparation import prepare
     from hybridlio.recipes import preparation_for
 
-    source = NetworkResidual(lambda recipe: partial(prepare, options=preparation_for(recipe)), setup.config.network)
-    return _with_recent_scans(source, setup)
+    return NetworkResidual(lambda recipe: partial(prepare, options=preparation_for(recipe)), setup.config.network)
+
+
+def _network(setup: Setup) -> ResidualSource:
+    return _with_recent_scans(_network_alone(setup), setup)
 
 
 def _with_recent_scans(source: PairSource, setup: Setup) -> ResidualSource:
@@ -91,11 +94,9 @@ def _with_recent_scans(source: PairSource, setup: Setup) -> ResidualSource:
 
 
 def _network_then_scan_matching(setup: Setup) -> ResidualSource:
-    from hybridlio.recent_scans import RecentScansSettings
     from hybridlio.residual_chain import ResidualChain
 
-    alone = replace(setup, config=setup.config.model_copy(update={"recent_scans": RecentScansSettings()}))
-    return ResidualChain(_network(alone), _scan_matching(setup))
+    return ResidualChain(_network_alone(setup), _scan_matching(setup))
 
 
 def _no_residual(_: Setup) -> ResidualSource:
