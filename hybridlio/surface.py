@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from hybridlio.estimates import Array
 from hybridlio.information import lever_arms
 
+_QUERIES_A_THREAD = 2000  # half a millisecond
+
 
 @dataclass(frozen=True, eq=False)
 class System:
@@ -92,7 +94,7 @@ class Surface:
 
     def nearest(self, queries: Array, threads: int) -> tuple[Array, Array]:
         """Index ``(N,)`` and squared distance ``(N,)`` of each query's nearest point."""
-        index, distance2 = self._tree.batch_knn_search(queries, 1, threads)
+        index, distance2 = self._tree.batch_knn_search(queries, 1, _worth(threads, queries))
         return index[:, 0].astype(np.int64), distance2[:, 0]
 
     def two_nearest(self, queries: Array, threads: int) -> tuple[NDArray[np.int64], Array]:
@@ -100,7 +102,7 @@ class Surface:
 
         The way is half of what the second nearest is farther away; infinite of a surface of one point.
         """
-        index, distance2 = self._tree.batch_knn_search(queries, min(2, len(self.points)), threads)
+        index, distance2 = self._tree.batch_knn_search(queries, min(2, len(self.points)), _worth(threads, queries))
         distance = np.sqrt(distance2)
         free = np.full(len(queries), np.inf) if len(self.points) < 2 else (distance[:, 1] - distance[:, 0]) / 2
         return index[:, 0].astype(np.int64), free
@@ -108,6 +110,11 @@ class Surface:
     def planes(self, index: NDArray[np.int64]) -> Array:
         """``(N, 4)`` of the points: normal n, and n·v."""
         return self._planes.take(index, axis=0)  # much quicker than brackets
+
+
+def _worth(threads: int, queries: Array) -> int:
+    """So many threads as gain more than waiting for each other costs, which on a busy machine is milliseconds."""
+    return max(1, min(threads, len(queries) // _QUERIES_A_THREAD))
 
 
 class Neighbours:
