@@ -14,11 +14,13 @@ from hybridlio.graph.inertial_steps import InertialSteps
 from hybridlio.graph.marginals import step_covariance
 from hybridlio.graph.preintegration import bias_of
 from hybridlio.graph.scans import Scans
-from hybridlio.graph.solver import incremental_solver, reason
+from hybridlio.graph.solver import eager_solver, incremental_solver, reason
 from hybridlio.sensors import NS_PER_S, Frame
 
-# While tilt, speed and biases are still found, every step solves the few poses there are anew.
+# While tilt, speed and biases are still found, every step linearises anew what it moves of the few poses there are; and
+# the very first, when nothing is known, solve them anew by damped steps.
 WARM_UP_STEPS = 20
+_FIRST_STEPS = 5
 
 
 class IncrementalBackend:
@@ -98,12 +100,19 @@ class IncrementalBackend:
             self._isam.update(graph, values, [], order)
             return
         self._graph.push_back(graph)
-        self._values.insert(values)
-        params = gtsam.LevenbergMarquardtParams()
-        params.setLinearSolverType("MULTIFRONTAL_QR")
-        self._values = gtsam.LevenbergMarquardtOptimizer(self._graph, self._values, params).optimize()
-        self._isam = incremental_solver()
-        self._isam.update(self._graph, self._values)
+        if self._k < _FIRST_STEPS:
+            self._values.insert(values)
+            params = gtsam.LevenbergMarquardtParams()
+            params.setLinearSolverType("MULTIFRONTAL_QR")
+            self._values = gtsam.LevenbergMarquardtOptimizer(self._graph, self._values, params).optimize()
+            self._isam = eager_solver()
+            self._isam.update(self._graph, self._values)
+            return
+        self._isam.update(graph, values)
+        if self._k == WARM_UP_STEPS - 1:
+            self._values = self._isam.calculateEstimate()
+            self._isam = incremental_solver()
+            self._isam.update(self._graph, self._values)
 
     def _order(self, relative: RelativePose, new: gtsam.Values) -> gtsam.KeyGroupMap | None:
         """Scan by scan from the oldest that a step reaches back to; None for one that reaches to the last scan only.

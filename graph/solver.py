@@ -12,6 +12,7 @@ from hybridlio.estimates import Array
 # A change of the newest pose hardly moves the oldest: below this change (rad, m, m/s) it is not carried on to older
 # variables, which would make each update cost as much as the run is long. The newest are always solved in full.
 _WILDFIRE_THRESHOLD = 1.0
+_EAGER = 1e-3
 _RELINEARISE = {
     "x": np.r_[np.full(3, 0.02), np.full(3, 1.0)],  # pose: rad, m
     "m": np.r_[np.full(3, 0.02), np.full(3, 1.0)],  # pose on scan matching's own path
@@ -27,6 +28,14 @@ _RELINEARISE = {
 def incremental_solver() -> gtsam.ISAM2:
     """An empty iSAM2 for graphs of poses ``x`` and ``m``, velocities ``v``, biases ``b``, gravity ``g`` …"""
     return gtsam.ISAM2(make_isam_params(_RELINEARISE, _WILDFIRE_THRESHOLD))
+
+
+def eager_solver() -> gtsam.ISAM2:
+    """As :func:`incremental_solver`, but every update linearises all that moves anew: for a graph of few scans."""
+    everything = {kind: np.full_like(change, _EAGER) for kind, change in _RELINEARISE.items()}
+    params = make_isam_params(everything, _EAGER)
+    params.relinearizeSkip = 1
+    return gtsam.ISAM2(params)
 
 
 def make_isam_params(relinearise: Mapping[str, Array], wildfire_threshold: float) -> gtsam.ISAM2Params:
