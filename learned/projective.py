@@ -44,7 +44,8 @@ class SeenPoints:
         planes: ``(B, 4, N)`` the normal n of each cell and n·v, which is infinite where there is no normal.
         rough: ``(B, 1, N)`` of :func:`_roughness`; None without weights to be told of it.
         as_last, as_current: ``(B, n, C)`` what the n coarse cells contribute to the weights of points that fall into
-            them, and of their own points; None without weights.
+            them, and of their own points; None without weights. Of a scan that is thinned ``as_current`` is each
+            point's, ``(B, N, C)``.
         coarse: ``(N,)`` which coarse cell each point's own cell is a part of.
     """
 
@@ -160,7 +161,6 @@ class PointWeights(nn.Module):
         assert last.as_last is not None
         assert current.rough is not None
         assert current.as_current is not None
-        assert current.coarse is not None
         size = distance.abs()
         compared = (size / kernel_m.detach()).clamp(max=5.0)
         rough = last.rough.gather(2, cell[:, None])
@@ -170,9 +170,9 @@ class PointWeights(nn.Module):
         first = torch.arange(0, batch * cells, cells, device=cell.device)[:, None]
         fallen_into = (self.coarse.index_select(0, cell.flatten()).reshape(cell.shape) + first).flatten()
         there = last.as_last.reshape(-1, channels).index_select(0, fallen_into).reshape(batch, -1, channels)
-        hidden = there.add_(current.as_current.index_select(1, current.coarse))  # in place: memory is what takes time
-        weight = self.of_point.weight.t().expand(batch, -1, -1)
-        hidden = hidden.baddbmm_(point.transpose(1, 2), weight).relu_()
+        of_point = torch.bmm(self.of_point.weight.expand(batch, -1, -1), point).transpose(1, 2)
+        # in place, since fetching memory is what takes time
+        hidden = there.add_(current.as_current).add_(of_point).relu_()
         weights: Tensor = self.logit(hidden)
         return weights.sigmoid_().transpose(1, 2)
 
@@ -184,10 +184,13 @@ def _coarse_cells(geometry: MapGeometry) -> Tensor:
 
 
 def _thinned(scan: SeenPoints, by: int) -> SeenPoints:
-    """Every so-manieth point, laid out anew; what belongs to cells, not points, stays."""
+    """Every so-manieth point, laid out anew, with what it contributes itself; what belongs to cells stays."""
     rough, coarse = (None if x is None else x[..., ::by].contiguous() for x in (scan.rough, scan.coarse))
     points, seen = scan.points[..., ::by].contiguous(), scan.seen[..., ::by].contiguous()
-    return replace(scan, points=points, seen=seen, rough=rough, coarse=coarse)
+    own = scan.as_current
+    if own is not None and coarse is not None:
+        own = own.index_select(1, coarse)
+    return replace(scan, points=points, seen=seen, rough=rough, as_current=own, coarse=coarse)
 
 
 def _roughness(vertices: Tensor, normals: Tensor) -> Tensor:
