@@ -14,8 +14,11 @@ Array = NDArray[np.float64]
 # Normals are off by a few hundredths of a radian, so points on one plane alone seem to say something of motion along
 # it: this much of a point's information, per point, is that noise.
 NORMAL_NOISE = 2e-3
+# Edges of smooth walls were seen to pretend up to three times this. What says less may be that, or a few trunks.
+WEAK_NORMAL_NOISE = 8e-3
 FLOOR_SIGMAS = np.r_[np.full(3, 5e-5), np.full(3, 1e-3)]  # rad, m: no single step is known better
-_UNKNOWN_SIGMA_M = 10.0
+UNKNOWN_SIGMA_M = 10.0
+_HALF = 0.5  # an eigenvector lies in what is held, or at a right angle to it
 
 
 def lever_arms(points: Array) -> Array:
@@ -61,6 +64,7 @@ def covariance_of(
     levers_m: Array | None = None,
     normal_noise: float = NORMAL_NOISE,
     floor_sigmas: Array = FLOOR_SIGMAS,
+    held: Array | None = None,
 ) -> Array:
     """``scale·σ²·H⁻¹`` ``(6, 6)``, rad² and m², rotation first; 10 m where the matches say nothing.
 
@@ -71,12 +75,23 @@ def covariance_of(
         levers_m: of :func:`lever_arms`.
         normal_noise: of a point's information, how much its normal's noise pretends.
         floor_sigmas: ``(6,)`` rad, m: no direction is known better.
+        held: ``(6, D)`` directions, orthonormal in the units of :func:`scaled_spectrum`, that have no part in it.
     """
     values, vectors, to_tangent = scaled_spectrum(information, levers_m)
+    free = np.ones(6, dtype=bool)
+    if held is not None and held.shape[1]:
+        values, vectors, free = _without(held, information, to_tangent)
     known = values - normal_noise * np.trace(information[3:, 3:])
-    variance = np.minimum(scale * sigma_m**2 / np.maximum(known, 1e-9), _UNKNOWN_SIGMA_M**2)
+    variance = free * np.minimum(scale * sigma_m**2 / np.maximum(known, 1e-9), UNKNOWN_SIGMA_M**2)
     root = vectors * np.sqrt(variance) * to_tangent[:, None]
     return np.asarray(root @ root.T + np.diag(floor_sigmas**2))
+
+
+def _without(held: Array, information: Array, to_tangent: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Eigenvalues and eigenvectors of the scaled Hessian beside ``held``, and which of them are not held."""
+    beside = np.eye(6) - held @ held.T
+    values, vectors = np.linalg.eigh(beside @ (information * np.outer(to_tangent, to_tangent)) @ beside)
+    return values, vectors, np.abs(held.T @ vectors).max(axis=0) < _HALF
 
 
 def newton_step(
@@ -85,12 +100,18 @@ def newton_step(
     limit_m: float = np.inf,
     levers_m: Array | None = None,
     normal_noise: float = NORMAL_NOISE,
+    held: Array | None = None,
 ) -> Array:
     """The step ``(6,)`` to the minimum of the quadratic, at most ``limit_m``, and none along degenerate directions.
+
+    ``held`` ``(6, D)``, orthonormal in the units of :func:`scaled_spectrum`, says along which instead.
 
     (Zhang, Kaess, Singh, "On degeneracy of optimization-based state estimation problems", ICRA 2016.)
     """
     values, vectors, scale = scaled_spectrum(information, levers_m)
-    inverse = np.where(strong_directions(information, values, normal_noise), 1 / np.maximum(values, 1e-12), 0.0)
+    strong = strong_directions(information, values, normal_noise)
+    if held is not None and held.shape[1]:
+        values, vectors, strong = _without(held, information, scale)
+    inverse = np.where(strong, 1 / np.maximum(values, 1e-12), 0.0)
     reduced = -(vectors @ (inverse * (vectors.T @ (scale * gradient))))
     return np.asarray(scale * reduced * min(1.0, limit_m / max(float(np.linalg.norm(reduced)), 1e-12)))

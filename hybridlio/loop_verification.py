@@ -17,10 +17,10 @@ import small_gicp
 
 from hybridlio import se3
 from hybridlio.estimates import Array
-from hybridlio.information import covariance_of, degenerate_directions
+from hybridlio.information import WEAK_NORMAL_NOISE, covariance_of, degenerate_directions
 from hybridlio.keyframes import Keyframes
 from hybridlio.odometry_chain import Index, OdometryChain
-from hybridlio.registration import Registration, RegistrationSettings, cost_at, register
+from hybridlio.registration import Registration, RegistrationSettings, fit_at, register
 from hybridlio.surface import Surface
 from hybridlio.voxel import voxel_average
 
@@ -179,7 +179,7 @@ class Verifier:
         sparse, settings = source.points[::_SPARSE], self._settings.registration
         steps = [se3.exp(np.array([0.0, 0.0, 0.0, x, y, 0.0])) for x, y in product(_AHEAD_M, _LEFT_M)]
         starts = [guess @ step for guess in guesses for step in steps]
-        starts.sort(key=lambda T: cost_at(surface, sparse, T, _COARSE_KERNEL_M, settings.threads))
+        starts.sort(key=lambda T: fit_at(surface, sparse, T, _COARSE_KERNEL_M, settings.threads).cost)
         coarse = replace(settings, max_iterations=_COARSE_ITERATIONS)
         tries = [register(surface, sparse, T, coarse, _COARSE_KERNEL_M) for T in starts[:_LIKELY]]
         return min(tries, key=lambda found: found.cost).pose
@@ -188,7 +188,7 @@ class Verifier:
         settings, points = self._settings.registration, source.standing
         _, distance2 = surface.nearest(se3.transform(found.pose, points), settings.threads)
         reach_m = settings.max_distance_m
-        cost = cost_at(surface, points, found.pose, settings.kernel_m, settings.threads, reach_m)
+        cost = fit_at(surface, points, found.pose, settings.kernel_m, settings.threads, reach_m).cost
         return _Fit(float((distance2 < reach_m**2).mean()), cost)
 
     def _wrong(self, found: Registration, fit: _Fit) -> str:
@@ -196,7 +196,8 @@ class Verifier:
             return f"only {fit.matched:.0%} of the points match"
         if fit.cost > self._settings.max_cost:
             return f"the surfaces do not fit (cost {fit.cost:.2f})"
-        return "a direction is not held" if len(degenerate_directions(found.hessian)) else ""
+        loose = degenerate_directions(found.hessian, found.levers_m, WEAK_NORMAL_NOISE)
+        return "a direction is not held" if len(loose) else ""
 
     def _differ(self, there: Registration, back: Registration) -> str:
         gap = se3.log(there.pose @ back.pose)

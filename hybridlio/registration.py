@@ -10,12 +10,13 @@ distances are linear.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from hybridlio import se3
 from hybridlio.estimates import Array
-from hybridlio.information import newton_step
+from hybridlio.information import WEAK_NORMAL_NOISE, newton_step
 from hybridlio.surface import Matches, Neighbours, Surface, System
 
 _ROTATION_CONVERGED_RAD = 2e-5
@@ -45,6 +46,23 @@ class RegistrationSettings:
     threads: int = 2
 
 
+class Fit(NamedTuple):
+    """How well points lie on a surface.
+
+    Attributes:
+        cost: mean robust cost over all points, between 0 and 1; unmatched points cost 1.
+        matched: share of points with a neighbour near enough.
+    """
+
+    cost: float
+    matched: float
+
+    @property
+    def misfit(self) -> float:
+        """Mean robust cost of the matched points alone."""
+        return (self.cost - (1 - self.matched)) / max(self.matched, 1e-12)
+
+
 @dataclass(frozen=True, eq=False)
 class Registration:
     """The outcome.
@@ -70,14 +88,24 @@ class Registration:
     iterations: int
     converged: bool
 
+    @property
+    def fit(self) -> Fit:
+        """How well the points lie there."""
+        return Fit(self.cost, self.matched)
+
 
 def register(
-    surface: Surface, source: Array, initial: Array, settings: RegistrationSettings, kernel_start_m: float = 0.0
+    surface: Surface,
+    source: Array,
+    initial: Array,
+    settings: RegistrationSettings,
+    kernel_start_m: float = 0.0,
+    held: Array | None = None,
 ) -> Registration:
     """Find the pose that lays ``source`` on ``surface``.
 
-    Directions that the points hardly constrain (:func:`hybridlio.information.degenerate_directions`) stay as in
-    ``initial``.
+    Directions that the points constrain little stay as in ``initial``; :func:`hybridlio.observability.observe` finds
+    out which of them the points see nevertheless.
 
     Args:
         surface: points with normals.
@@ -85,9 +113,10 @@ def register(
         initial: ``(4, 4)`` pose to start from.
         settings: kernel, distances, limits.
         kernel_start_m: a wider kernel to begin with, halved at every step; for an uncertain ``initial``.
+        held: ``(6, D)`` directions that stay, of :func:`hybridlio.information.newton_step`, instead of the weak ones.
     """
     kernel_m, threads = max(settings.kernel_m, kernel_start_m), settings.threads
-    descent, neighbours = _Descent(settings, initial, kernel_m), Neighbours(surface, source, threads)
+    descent, neighbours = _Descent(settings, initial, kernel_m, held), Neighbours(surface, source, threads)
     for _ in range(_MOST_MATCHES):
         again = descent.by(neighbours.matches(descent.pose, max(settings.max_distance_m, 3 * descent.kernel_m)))
         if not again:
@@ -98,9 +127,9 @@ def register(
 class _Descent:
     """Steps down from a pose, by matches that are made anew once the pose has moved too far."""
 
-    def __init__(self, settings: RegistrationSettings, pose: Array, kernel_m: float) -> None:
+    def __init__(self, settings: RegistrationSettings, pose: Array, kernel_m: float, held: Array | None) -> None:
         self.pose, self.kernel_m = pose, kernel_m
-        self._settings = settings
+        self._settings, self._held = settings, held
         self._steps, self._converged = 0, False
         self._matches: Matches
         self._system: System
@@ -112,7 +141,8 @@ class _Descent:
             self._system = matches.system(self.kernel_m, way)
             step = np.zeros(6)
             if len(matches) >= 6:
-                step = newton_step(self._system.hessian, self._system.gradient, levers_m=levers_m)
+                system = self._system
+                step = newton_step(system.hessian, system.gradient, np.inf, levers_m, WEAK_NORMAL_NOISE, self._held)
             way, self._steps = way + step, self._steps + 1
             narrow = self.kernel_m == self._settings.kernel_m
             self.kernel_m = max(self._settings.kernel_m, self.kernel_m / 2)
@@ -151,15 +181,15 @@ def _largest(way: Array) -> tuple[float, float]:
     return max(sizes[:3]), max(sizes[3:])
 
 
-def cost_at(
+def fit_at(
     surface: Surface, source: Array, pose: Array, kernel_m: float, threads: int, reach_m: float | None = None
-) -> float:
-    """Mean robust cost, between 0 and 1, of ``source`` at a pose, without a step from there.
+) -> Fit:
+    """How well ``source`` lies at a pose, without a step from there.
 
-    Points without a neighbour within ``reach_m``, by default three times the kernel, cost 1.
+    Neighbours farther than ``reach_m``, by default three times the kernel, do not count.
     """
     matches = Neighbours(surface, source, threads).matches(pose, 3 * kernel_m if reach_m is None else reach_m)
-    return _cost(matches.rows[6], len(source), kernel_m)
+    return Fit(_cost(matches.rows[6], len(source), kernel_m), len(matches) / max(len(source), 1))
 
 
 def _cost(distances: Array, points: int, kernel_m: float) -> float:

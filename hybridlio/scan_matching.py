@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
@@ -12,9 +13,10 @@ import numpy as np
 from hybridlio import se3
 from hybridlio.errors import DataError
 from hybridlio.estimates import Array, RelativePose
-from hybridlio.information import FLOOR_SIGMAS, covariance_of, degenerate_directions
+from hybridlio.information import FLOOR_SIGMAS
 from hybridlio.local_map import LocalMap, LocalMapSettings
-from hybridlio.registration import Registration, RegistrationSettings, cost_at, register
+from hybridlio.observability import Observed, observe
+from hybridlio.registration import Fit, Registration, RegistrationSettings, fit_at, register
 from hybridlio.sensors import NS_PER_S, Frame, Scan
 from hybridlio.surface import Surface
 from hybridlio.voxel import voxel_average
@@ -50,7 +52,7 @@ class ScanMatchingSettings:
     min_matched: float = 0.3
     covariance_scale: float = 6.0
     drift_share: float = 0.1
-    start_speeds_m_s: tuple[float, ...] = (0.0, -5.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0)
+    start_speeds_m_s: tuple[float, ...] = (0.0, -5.0, *(2.5 * i for i in range(1, 17)))
     start_rates_deg_s: tuple[float, ...] = (0.0, -50.0, 50.0, -100.0, 100.0)
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
     local_map: LocalMapSettings = field(default_factory=LocalMapSettings)
@@ -63,6 +65,8 @@ _SPARSE = 8  # one in so many points is enough to tell a metre from another
 _COARSE_ITERATIONS = 6
 _LIKELY = 12
 _COARSE_KERNEL_M = 0.5
+_REACH_M = 1.0
+_OVERLAP = 0.8  # of the most points that match: to lie on fewer is easier
 _LOST_COST = 0.6  # of the points' cost between 0 and 1: well above any that lie where they should
 _SHARE_OF_SAME_MAP = 1e-3
 _YOUNG_MAP = 5.0  # a map of one keyframe has ground only along that scan's rings, and guesses what lies between
@@ -147,15 +151,17 @@ class ScanMatching:
         dt_s = (frame.scan.stamp_ns - self._stamp_ns) / NS_PER_S
         self._stamp_ns = frame.scan.stamp_ns
         usable = len(seen.points) >= self._settings.min_points and self._map.surface is not None
-        found = self._register(seen.source, initial, dt_s) if usable else None
-        if found is None or found.matched < self._settings.min_matched:
-            return self._bridge(initial, len(seen.points), found)
+        observed = self._register(seen, initial, dt_s) if usable else None
+        if observed is None or observed.found.matched < self._settings.min_matched:
+            return self._bridge(initial, len(seen.points), observed)
+        found = observed.found
         before, self._before = self._path, self._path
         step = se3.between(before.T_map_lidar, found.pose)
-        self._path = _Path(found.pose, None if before.bridged else se3.log(step) / dt_s)
+        guessed = before.bridged or bool(len(observed.degenerate))
+        self._path = _Path(found.pose, None if guessed else se3.log(step) / dt_s)
         if self._settings.target == "last-scan" or self._map.wants(found.pose):
             self._waiting, self._path.map_changed = seen.points, True
-        return self._answer(step, found, before, len(seen.points))
+        return self._answer(step, observed, before, len(seen.points))
 
     def take_back(self, initial: RelativePose) -> None:
         """Leave the last scan out: the path goes on by ``initial``, and the map stays as it was."""
@@ -169,13 +175,14 @@ class ScanMatching:
             return replace(initial, ok=False)
         settings, sigma_m = self._settings.registration, float(np.sqrt(initial.covariance[3:, 3:].trace()))
         wide = min(max(settings.kernel_m, sigma_m), 1.0)
-        found = register(earlier.surface, current.source, initial.pose, settings, wide)
-        if found.matched < self._settings.min_matched:
+        observed = observe(earlier.surface, current.source, initial.pose, settings, wide)
+        if observed.found.matched < self._settings.min_matched:
             return replace(initial, ok=False)
-        return RelativePose(found.pose, self._covariance(found, 1), self.name, degenerate=_degenerate(found))
+        covariance = self._covariance(observed, 1)
+        return RelativePose(observed.found.pose, covariance, self.name, degenerate=observed.degenerate)
 
-    def _answer(self, step: Array, found: Registration, before: _Path, points: int) -> RelativePose:
-        covariance = self._covariance(found, self._keyframes)
+    def _answer(self, step: Array, observed: Observed, before: _Path, points: int) -> RelativePose:
+        covariance = self._covariance(observed, self._keyframes)
         drift = self._drift(covariance, before.map_changed)
         if drift is None:
             covariance = covariance + before.unsure  # the scan it is matched to lies before those that were bridged
@@ -184,8 +191,8 @@ class ScanMatching:
             covariance,
             source=self.name,
             drift=drift,
-            degenerate=_degenerate(found),
-            details=_details(found, points),
+            degenerate=observed.degenerate,
+            details=_details(observed.found, points),
         )
 
     @property
@@ -195,9 +202,8 @@ class ScanMatching:
             return 1
         return self._map.keyframes + (self._waiting is not None)
 
-    def _covariance(self, found: Registration, keyframes: int) -> Array:
-        scale = self._settings.covariance_scale * (1 + _YOUNG_MAP / keyframes)
-        return covariance_of(found.hessian, found.sigma_m, scale, found.levers_m)
+    def _covariance(self, observed: Observed, keyframes: int) -> Array:
+        return observed.covariance(self._settings.covariance_scale * (1 + _YOUNG_MAP / keyframes))
 
     def _drift(self, covariance: Array, map_changed: bool) -> Array | None:
         """What of a step's covariance adds up: at first much, for a map of few keyframes is as wrong as they are."""
@@ -224,7 +230,7 @@ class ScanMatching:
         self._map.insert(self._waiting, self._path.T_map_lidar)
         self._waiting = None
 
-    def _register(self, source: Array, initial: RelativePose, dt_s: float) -> Registration:
+    def _register(self, seen: SeenScan, initial: RelativePose, dt_s: float) -> Observed:
         surface, settings = self._map.surface, self._settings.registration
         assert surface is not None
         sigma_m = float(np.sqrt(initial.covariance[3:, 3:].trace()))
@@ -234,26 +240,31 @@ class ScanMatching:
         if sigma_m > _UNSURE_TRANSLATION_M:
             if self._path.twist is not None:  # who guesses no motion leaves it to this source to know the last one
                 moving = self._path.T_map_lidar @ se3.exp(self._path.twist * dt_s)
-                found = register(surface, source, moving, settings, _COARSE_KERNEL_M)
-                if found.matched >= self._settings.min_matched and found.cost < _LOST_COST:
-                    return found
-            turns = initial.covariance[:3, :3].trace() > _UNSURE_ROTATION_RAD**2
-            start = self._search(surface, source, start, dt_s, self._settings.start_rates_deg_s if turns else (0.0,))
-        return register(surface, source, start, settings, kernel_start_m)
+                observed = observe(surface, seen.source, moving, settings, _COARSE_KERNEL_M)
+                if observed.found.matched >= self._settings.min_matched and observed.found.cost < _LOST_COST:
+                    return observed
+            turns = bool(initial.covariance[:3, :3].trace() > _UNSURE_ROTATION_RAD**2)
+            start = self._search(surface, seen, start, dt_s, turns)
+        return observe(surface, seen.source, start, settings, kernel_start_m)
 
-    def _search(
-        self, surface: Surface, source: Array, start: Array, dt_s: float, rates_deg_s: tuple[float, ...]
-    ) -> Array:
-        """The best of several motions: all are judged by a few of the points, the likelier ones after a few steps."""
-        sparse, settings = source[::_SPARSE], self._settings.registration
-        motions = product(self._settings.start_speeds_m_s, np.deg2rad(rates_deg_s))
-        starts = [start @ se3.exp(np.array([0, 0, rate, speed, 0, 0]) * dt_s) for speed, rate in motions]
-        starts.sort(key=lambda T: cost_at(surface, sparse, T, _COARSE_KERNEL_M, settings.threads))
+    def _search(self, surface: Surface, seen: SeenScan, start: Array, dt_s: float, turns: bool) -> Array:
+        """The best of several motions: all are judged by few points, the likelier ones by all of them after some steps.
+
+        Where two scans see ground along other rings, most of it has no neighbour or has one by chance: what counts is
+        how well those points lie that have.
+        """
+        sparse, settings = seen.source[::_SPARSE], self._settings.registration
+        motions = product(self._settings.start_speeds_m_s, self._settings.start_rates_deg_s if turns else (0.0,))
+        starts = [start @ se3.exp(np.array([0, 0, np.deg2rad(rate), speed, 0, 0]) * dt_s) for speed, rate in motions]
+        fits = [fit_at(surface, sparse, T, _COARSE_KERNEL_M, settings.threads) for T in starts]
         coarse = replace(settings, max_iterations=_COARSE_ITERATIONS)
-        tries = [register(surface, sparse, T, coarse, _COARSE_KERNEL_M) for T in starts[:_LIKELY]]
-        return min(tries, key=lambda found: found.cost).pose
+        tries = [
+            register(surface, seen.source, starts[i], coarse, _COARSE_KERNEL_M).pose for i in _best(fits)[:_LIKELY]
+        ]
+        fits = [fit_at(surface, seen.points, T, settings.kernel_m, settings.threads, _REACH_M) for T in tries]
+        return tries[_best(fits)[0]]
 
-    def _bridge(self, initial: RelativePose, points: int, found: Registration | None) -> RelativePose:
+    def _bridge(self, initial: RelativePose, points: int, observed: Observed | None) -> RelativePose:
         self._before, self._path = self._path, self._path.carried_on(initial)
         return RelativePose(
             initial.pose,
@@ -262,12 +273,14 @@ class ScanMatching:
             ok=False,
             drift=self._drift(_FLOOR_COVARIANCE, map_changed=False),  # the map has not moved
             from_imu=initial.from_imu,
-            details=_details(found, points) if found else {"points": float(points)},
+            details=_details(observed.found, points) if observed else {"points": float(points)},
         )
 
 
-def _degenerate(found: Registration) -> Array:
-    return degenerate_directions(found.hessian, found.levers_m)
+def _best(fits: Sequence[Fit]) -> list[int]:
+    """Their numbers, the best first; those of much fewer points are left out."""
+    most = max(fit.matched for fit in fits)
+    return sorted((i for i, fit in enumerate(fits) if fit.matched > _OVERLAP * most), key=lambda i: fits[i].misfit)
 
 
 def _details(found: Registration, points: int) -> dict[str, float]:

@@ -1,0 +1,162 @@
+"""Whether a scan really says something of a direction of which its Hessian says little.
+
+Normals are estimates: on a smooth wall some lean to one side and some to the other, at its edges far, and each pretends
+to know a little of the way along it. A few trunks in an open field know no more by the Hessian's count. The difference
+shows a step away, where points find other neighbours: the cost of trunks rises, whereas leaning normals are no worse
+there than here. So the cost is looked at half a metre to either side, where all other directions have found their
+minimum anew; a parabola through the three says where the minimum is, and the scatter of the points' rises how surely.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridlio import se3
+from hybridlio.estimates import Array
+from hybridlio.information import (
+    UNKNOWN_SIGMA_M,
+    WEAK_NORMAL_NOISE,
+    covariance_of,
+    scaled_spectrum,
+    strong_directions,
+)
+from hybridlio.registration import Registration, RegistrationSettings, register
+from hybridlio.surface import Surface
+
+_STEP_M = 0.5  # more than neighbours lie apart, so that points find others there
+_STEPS = 6  # down the other directions, there
+_SEEN = 4.5  # times the scatter: between smooth walls the rise was at most 3.5 times that, in a field 6 and more
+_NEAR_M = 0.1  # a parabola through costs half a metre apart is good for so far
+_ROUNDS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """A registration, and what its points say of the directions that they constrain little.
+
+    Attributes:
+        found: the registration. Along what is not seen its pose is as it was guessed.
+        basis: ``(6, D)`` the weak directions, orthonormal in the units of
+            :func:`hybridlio.information.scaled_spectrum`; mostly there are none.
+        along: ``(D, 6)`` tangent vectors: how the pose changes for each metre that it is taken along one. Between walls
+            that bend it turns.
+        sigmas_m: ``(D,)`` how sure the points are of each, were they independent; infinite where they see nothing.
+    """
+
+    found: Registration
+    basis: Array
+    along: Array
+    sigmas_m: Array
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """``(D,)`` of which weak directions the points say something."""
+        return np.isfinite(self.sigmas_m)
+
+    @property
+    def degenerate(self) -> Array:
+        """``(U, 6)`` unit tangent directions that they say nothing of."""
+        unseen = self.along[~self.seen]
+        return np.asarray(unseen / np.linalg.norm(unseen, axis=1, keepdims=True))
+
+    def covariance(self, scale: float) -> Array:
+        """``(6, 6)`` rad² and m², rotation first: of the strong directions, and along the weak ones.
+
+        Args:
+            scale: how much larger it is than independent points would make it.
+        """
+        found = self.found
+        strong = covariance_of(found.hessian, found.sigma_m, scale, found.levers_m, held=self.basis)
+        weak = self.along * np.minimum(np.sqrt(scale) * self.sigmas_m, UNKNOWN_SIGMA_M)[:, None]
+        return np.asarray(strong + weak.T @ weak)
+
+
+def observe(
+    surface: Surface, source: Array, initial: Array, settings: RegistrationSettings, kernel_start_m: float = 0.0
+) -> Observed:
+    """Register by the strong directions; along a weak one go to the parabola's minimum, where the points see it at all.
+
+    Arguments are those of :func:`hybridlio.registration.register`.
+    """
+    found = register(surface, source, initial, settings, kernel_start_m)
+    values, vectors, to_tangent = scaled_spectrum(found.hessian, found.levers_m)
+    basis = vectors[:, ~strong_directions(found.hessian, values, WEAK_NORMAL_NOISE)]
+    if not basis.shape[1]:
+        return Observed(found, basis, np.empty((0, 6)), np.empty(0))
+    beside = _Beside(surface, source, settings, basis, to_tangent)
+    weak = beside.look(found)
+    for _ in range(_ROUNDS):
+        if not weak.way_m.any():
+            break
+        found = beside.register(found.pose @ se3.exp(weak.way_m @ weak.along), settings)
+        if np.abs(weak.way_m).max() < _NEAR_M:
+            break
+        weak = beside.look(found)
+    return Observed(found, basis, weak.along, weak.sigmas_m)
+
+
+@dataclass(frozen=True, eq=False)
+class _Weak:
+    """What was seen beside a pose: ways to the minima ``(D,)``, and as in :class:`Observed`."""
+
+    way_m: Array
+    along: Array
+    sigmas_m: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Beside:
+    """Looks at the costs beside a pose along ``basis``, where the strong directions have found their minimum anew."""
+
+    surface: Surface
+    source: Array
+    settings: RegistrationSettings
+    basis: Array
+    to_tangent: Array
+
+    def look(self, found: Registration) -> _Weak:
+        """At both sides of ``found``, along each weak direction."""
+        here, count = self._costs(found.pose), self.basis.shape[1]
+        weak = _Weak(np.empty(count), np.empty((count, 6)), np.empty(count))
+        for i, direction in enumerate((self.to_tangent[:, None] * self.basis).T):
+            back, rises_back = self._step(found.pose, here, -_STEP_M * direction)
+            ahead, rises_ahead = self._step(found.pose, here, _STEP_M * direction)
+            weak.along[i] = se3.log(se3.between(back, ahead)) / (2 * _STEP_M)
+            weak.way_m[i], weak.sigmas_m[i] = _minimum(rises_back, rises_ahead)
+        return weak
+
+    def register(self, pose: Array, settings: RegistrationSettings) -> Registration:
+        """Down the strong directions alone."""
+        return register(self.surface, self.source, pose, settings, held=self.basis)
+
+    def _step(self, pose: Array, here: Array, step: Array) -> tuple[Array, Array]:
+        """The pose a step away, and by how much the points' costs are higher there."""
+        there = self.register(pose @ se3.exp(step), replace(self.settings, max_iterations=_STEPS)).pose
+        rises = self._costs(there) - here
+        return there, np.asarray(rises[~np.isnan(rises)])
+
+    def _costs(self, pose: Array) -> Array:
+        """``(N,)`` robust cost of each point, between 0 and 1; NaN without a neighbour."""
+        moved = se3.transform(pose, self.source)
+        index, distance2 = self.surface.nearest(moved, self.settings.threads)
+        r2 = np.einsum("ij,ij->i", moved - self.surface.points[index], self.surface.normals[index]) ** 2
+        return np.where(distance2 < self.settings.max_distance_m**2, r2 / (self.settings.kernel_m**2 + r2), np.nan)
+
+
+def _minimum(back: Array, ahead: Array) -> tuple[float, float]:
+    """Metres to the parabola's minimum and their standard deviation; infinite where points do not see it.
+
+    Then, where costs clearly fall to one side, that side is where to look on.
+    """
+    rise, scatter = float(back.sum() + ahead.sum()), float(np.sqrt(back @ back + ahead @ ahead))
+    if rise <= _SEEN * scatter:
+        return _STEP_M * (_falls(ahead) - _falls(back)), np.inf
+    way_m = _STEP_M * float(back.sum() - ahead.sum()) / (2 * rise)
+    return float(np.clip(way_m, -_STEP_M, _STEP_M)), _STEP_M * scatter / (2 * rise)
+
+
+def _falls(rises: Array) -> bool:
+    return bool(rises.sum() < -_SEEN * np.sqrt(rises @ rises))

@@ -1,0 +1,124 @@
+"""Weak directions: what smooth walls pretend is not believed, what a few bushes tell is."""
+
+import numpy as np
+import pytest
+
+from hybridlio import se3
+from hybridlio.observability import Observed, observe
+from hybridlio.registration import RegistrationSettings
+from hybridlio.surface import Surface
+
+SETTINGS = RegistrationSettings(threads=1)
+TRUTH = se3.exp(np.array([0.002, -0.001, 0.01, 0.2, 0.1, 0.03]))
+Cloud = tuple[np.ndarray, np.ndarray]
+
+
+def ground(rng: np.random.Generator, count: int) -> Cloud:
+    xy = rng.uniform(-30, 30, (count, 2))
+    return np.column_stack([xy, np.full(count, -1.7)]), np.tile([0.0, 0.0, 1.0], (count, 1))
+
+
+def bushes(rng: np.random.Generator, where: np.ndarray, points: int) -> Cloud:
+    angle, height = rng.uniform(-np.pi, np.pi, (2, len(where), points))
+    normals = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
+    centres = np.concatenate([where, np.zeros((len(where), 1))], axis=1)[:, None]
+    surface = centres + 0.8 * normals + np.stack([0 * height, 0 * height, height / 3], axis=-1)
+    return surface.reshape(-1, 3), normals.reshape(-1, 3)
+
+
+def bend(rng: np.random.Generator, radius_m: float, count: int) -> Cloud:
+    """Two walls, four metres to either side of a circle that leaves the origin ahead, and the ground between."""
+    angle = rng.uniform(-25, 25, count) / radius_m
+    side = rng.choice([-1.0, 0.0, 1.0], count)
+    left = np.where(side == 0, rng.uniform(-4, 4, count), 4 * side)
+    height = np.where(side == 0, -1.7, rng.uniform(-1.7, 2, count))
+    inward = np.column_stack([-np.sin(angle), np.cos(angle), np.zeros(count)])
+    points = np.array([0.0, radius_m, 0.0]) - (radius_m - left)[:, None] * inward + height[:, None] * [0, 0, 1]
+    return points, np.where(side[:, None] == 0, [0.0, 0.0, 1.0], inward)
+
+
+def joined(*clouds: Cloud) -> Cloud:
+    return np.concatenate([c[0] for c in clouds]), np.concatenate([c[1] for c in clouds])
+
+
+def leaning(rng: np.random.Generator, cloud: Cloud, by: float) -> Surface:
+    """A surface whose normals are estimates: each leans by some hundredths of a radian, one in twenty by far more."""
+    points, normals = cloud
+    lean = by * np.where(rng.random(len(points)) < 0.05, 8.0, 1.0)
+    normals = normals + lean[:, None] * rng.standard_normal(points.shape)
+    return Surface(points, normals / np.linalg.norm(normals, axis=1, keepdims=True), 1)
+
+
+def scan(rng: np.random.Generator, cloud: Cloud, sigma_m: float = 0.02) -> np.ndarray:
+    points = cloud[0] + sigma_m * rng.standard_normal(cloud[0].shape)
+    return se3.transform(se3.inverse(TRUTH), points)
+
+
+def off_by(ahead_m: float, left_m: float = 0.0) -> np.ndarray:
+    return TRUTH @ se3.exp(np.array([0.0, 0.0, 0.0, ahead_m, left_m, 0.0]))
+
+
+def error(observed: Observed) -> np.ndarray:
+    return se3.log(se3.between(TRUTH, observed.found.pose))
+
+
+def in_a_field(rng: np.random.Generator, ahead_m: float, left_m: float = 0.0) -> Observed:
+    where = rng.uniform(-25, 25, (20, 2))
+    surface = leaning(rng, joined(ground(rng, 8000), bushes(rng, where, 60)), 0.03)
+    source = scan(rng, joined(ground(rng, 7000), bushes(rng, where, 16)))
+    return observe(surface, source, off_by(ahead_m, left_m), SETTINGS, 0.3)
+
+
+def test_between_bushes_all_around_nothing_is_weak(rng: np.random.Generator):
+    where = rng.uniform(-25, 25, (200, 2))
+    cloud = joined(ground(rng, 2000), bushes(rng, where, 12))
+    observed = observe(leaning(rng, cloud, 0.03), scan(rng, cloud), TRUTH, SETTINGS)
+    assert observed.basis.shape == (6, 0)
+    assert observed.degenerate.shape == (0, 6)
+
+
+@pytest.mark.parametrize("ahead_m", [0.0, 0.4, -0.4], ids="{} m off".format)
+def test_walls_whose_normals_lean_tell_nothing_of_the_way_along_them(rng: np.random.Generator, ahead_m: float):
+    surface = leaning(rng, bend(rng, 1e6, 4000), 0.03)
+    observed = observe(surface, scan(rng, bend(rng, 1e6, 2000)), off_by(ahead_m), SETTINGS)
+    (direction,) = observed.degenerate
+    assert abs(direction[3]) > 0.99
+    assert error(observed)[3] == pytest.approx(ahead_m, abs=0.02)  # where it was guessed
+    sigmas = np.sqrt(np.diag(se3.rotate_covariance(observed.covariance(1.0), TRUTH)))  # as the walls run
+    assert sigmas[3] == pytest.approx(10.0, rel=0.02)
+    assert (sigmas[[4, 5]] < 0.03).all()
+
+
+@pytest.mark.parametrize("off", [(0.3, -0.2), (-0.2, 0.25)], ids=str)
+def test_a_few_bushes_in_a_field_are_enough(rng: np.random.Generator, off: tuple[float, float]):
+    observed = in_a_field(rng, *off)
+    assert observed.basis.shape == (6, 3)  # ahead, sideways, the turn
+    assert observed.seen.all()
+    assert np.abs(error(observed)[3:5]).max() < 0.15
+    assert (np.sqrt(np.diag(observed.covariance(6.0)))[3:5] < 0.3).all()
+
+
+def test_their_errors_are_what_is_said_of_them(rng: np.random.Generator):
+    nees = []
+    for _ in range(25):
+        observed = in_a_field(rng, *rng.uniform(-0.2, 0.2, 2))
+        part = error(observed)[2:5]
+        nees.append(part @ np.linalg.solve(observed.covariance(6.0)[2:5, 2:5], part) / 3)
+    assert 0.05 < np.mean(nees) < 1.5
+
+
+def test_a_guess_beyond_the_basin_is_led_into_it(rng: np.random.Generator):
+    assert np.abs(error(in_a_field(rng, 0.6))[3:5]).max() < 0.15
+
+
+@pytest.mark.parametrize("radius_m", [60.0, -150.0])
+def test_the_way_along_a_bend_is_a_turn(rng: np.random.Generator, radius_m: float):
+    """An unknown way along it is an unknown turn: by 10 m on a radius of 60 m, a sixth of a radian."""
+    surface = leaning(rng, bend(rng, radius_m, 6000), 0.02)
+    observed = observe(surface, se3.transform(TRUTH, scan(rng, bend(rng, radius_m, 3000))), np.eye(4), SETTINGS)
+    assert not observed.seen.any()
+    turn = observed.along[0, 2] / observed.along[0, 3]
+    assert turn == pytest.approx(1 / radius_m, rel=0.2)
+    covariance = observed.covariance(1.0)
+    assert covariance[2, 3] / covariance[3, 3] == pytest.approx(1 / radius_m, rel=0.2)
+    assert np.linalg.eigvalsh(covariance)[0] > 0
