@@ -4,7 +4,7 @@
 
 `--simulated` shakes true relative poses and measures what the network leaves of the error. `--real` does the same on
 recordings without an exact reference, around what small_gicp finds between full scans. `--adapt` trains the weights on
-each of the real recordings, without labels, and measures on the others. `--long` chains the steps of LSTMs and network,
+each of two or more real recordings, without labels, and measures on the others. `--long` chains the steps of LSTMs and network,
 without a graph. `--time` takes the first two scans of the first recording given. Prints Markdown; -o keeps the figures.
 """
 
@@ -206,7 +206,7 @@ def main() -> None:
     steps = {s.info.name: gicp_steps(sequence) for sequence, s in real}
     rows = [row for _, s in real for row in accuracy_rows(network, s.info.name, s, steps[s.info.name], REAL_SIZES)]
     show("Real recordings", rows)
-    for _, one in real if options.adapt else []:
+    for _, one in real if options.adapt and len(real) > 1 else []:
         after = adapted(weights, one)
         others = [s for _, s in real if s is not one]
         rows = [r for s in others for r in accuracy_rows(after, s.info.name, s, steps[s.info.name], REAL_SIZES)]
