@@ -110,8 +110,8 @@ def run(frames: Iterator[Frame], odometry: Odometry) -> dict[str, Any]:
         stages.setdefault(CPU, []).append(1e3 * (time.process_time() - start))
         for stage, seconds in estimate.seconds.items():
             stages.setdefault(stage, []).append(1e3 * seconds)
-        if k and k % PART == 0:
-            memory[k] = resident_mib()
+        if (k + 1) % PART == 0:
+            memory[k + 1] = resident_mib()
     spent = {stage: np.array([0.0] * (k + 1 - len(ms)) + ms) for stage, ms in stages.items()}
     return {
         "first_ms": {stage: float(np.median(ms[:PART])) for stage, ms in spent.items()},

@@ -88,3 +88,26 @@ def test_a_system_that_diverges_is_named_and_not_judged(tiny_drive, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "scan 4: OverflowError: diverged {}"
+
+
+def test_laps_follow_each_other_without_a_gap():
+    program = (
+        "import sys; sys.path.insert(0, sys.argv[1]); import numpy as np; "
+        "from hybridlio.sensors import Frame, ImuSamples, Scan; import long_run;"
+        "stamps = 10**12 + np.arange(long_run.LAP + 1) * 10**8;"
+        "samples = lambda k: ImuSamples(np.arange(stamps[k] - 10**8, stamps[k] + 1, 10**7), *np.zeros((2, 11, 3)));"
+        "points = lambda k: np.full((1, 3), k, np.float32);"
+        "frames = [Frame(k, Scan(int(stamps[k]), points(k)), samples(k)) for k in range(len(stamps))];"
+        "lap = type('Lap', (list,), {'stamps_ns': stamps})(frames);"
+        "found = list(long_run.laps(lap, 2 * long_run.LAP + 2));"
+        "assert [f.index for f in found] == list(range(len(found)));"
+        "assert (np.diff([f.scan.stamp_ns for f in found]) == 10**8).all();"
+        "assert all(f.imu.stamps_ns[-1] == f.scan.stamp_ns for f in found);"
+        "seam = [int(f.scan.points[0, 0]) for f in found[long_run.LAP - 1 :][:4]];"
+        "assert seam == [long_run.LAP - 1, long_run.LAP, 1, 2]"
+    )
+    command = [sys.executable, "-c", program, str(ROOT / "benchmarks")]
+    done = subprocess.run(
+        command, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
