@@ -47,17 +47,21 @@ def estimate_normals(
             f"got {neighbours}, {threads}, {thin_m}, {support_m}"
         )
     points = np.asarray(points, dtype=np.float32).reshape(-1, 3)
-    normals = np.zeros_like(points)
-    finite = np.isfinite(points).all(axis=1)
-    if finite.any():
-        known = points[finite]
-        if thin_m:
-            labels, count = voxel_labels(known, thin_m)
-            fitted = _supported_fit(label_means(known, labels, count), neighbours, threads, support_m)[labels]
-        else:
-            fitted = _supported_fit(known, neighbours, threads, support_m)
-        normals[finite] = _towards_origin(fitted, known)
+    if np.isfinite(points).all():  # by far the common case, and cheaper than a flag a row
+        return _of_finite(points, neighbours, threads, thin_m, support_m)
+    normals, finite = np.zeros_like(points), np.isfinite(points).all(axis=1)
+    normals[finite] = _of_finite(points[finite], neighbours, threads, thin_m, support_m)
     return normals
+
+
+def _of_finite(points: Floats, neighbours: int, threads: int, thin_m: float, support_m: float) -> Floats:
+    if not len(points):
+        return np.zeros_like(points)
+    if not thin_m:
+        return _towards_origin(_supported_fit(points, neighbours, threads, support_m), points)
+    labels, count = voxel_labels(points, thin_m)
+    fitted = _supported_fit(label_means(points, labels, count), neighbours, threads, support_m)
+    return _towards_origin(fitted.take(labels, axis=0), points)
 
 
 def _supported_fit(places: Floats, neighbours: int, threads: int, support_m: float) -> Floats:
@@ -78,7 +82,7 @@ def _fit(points: Floats, neighbours: int, threads: int) -> Floats:
 
 def _towards_origin(normals: Floats, points: Floats) -> Floats:
     away = np.einsum("ij,ij->i", normals, points) > 0
-    return np.where(away[:, None], -normals, normals)
+    return normals * np.where(away, np.float32(-1), np.float32(1))[:, None]
 
 
 def _has_support(places: Floats, side_m: float) -> NDArray[np.bool_]:

@@ -37,6 +37,7 @@ class PreparationOptions:
         remove_ground: whether the loss cloud leaves ground out, as the paper does.
         ground: how ground is looked for.
         loss_points, loss_tolerance: the paper's K = 10,240 ± 100.
+        loss_voxel_m: first side tried for so many; the paper's 0.3 m.
         threads: for the neighbour search of the normals.
     """
 
@@ -51,6 +52,7 @@ class PreparationOptions:
     ground: GroundOptions = field(default_factory=GroundOptions)
     loss_points: int = 10240
     loss_tolerance: int = 100
+    loss_voxel_m: float = 0.3
     threads: int = 2
 
     def __post_init__(self) -> None:
@@ -120,7 +122,9 @@ class PreparedScan:
         """Points and normals for the loss: ground removed, averaged to ``loss_points`` ± ``loss_tolerance``."""
         keep = ~self.ground.mask if self.options.remove_ground else slice(None)
         options = self.options
-        return voxel_to_count(self.points[keep], self.normals[keep], options.loss_points, options.loss_tolerance)
+        return voxel_to_count(
+            self.points[keep], self.normals[keep], options.loss_points, options.loss_tolerance, options.loss_voxel_m
+        )
 
 
 def prepare(scan: Scan, options: PreparationOptions | None = None, motion: Trajectory | None = None) -> PreparedScan:

@@ -78,9 +78,9 @@ def _scan_matching(setup: Setup) -> ResidualSource:
 def _network_alone(setup: Setup) -> PairSource:
     from hybridlio.learned.network_residual import NetworkResidual
     from hybridlio.preparation import prepare
-    from hybridlio.recipes import preparation_for
+    from hybridlio.recipes import judging_for
 
-    return NetworkResidual(lambda recipe: partial(prepare, options=preparation_for(recipe)), setup.config.network)
+    return NetworkResidual(lambda recipe: partial(prepare, options=judging_for(recipe)), setup.config.network)
 
 
 def _network(setup: Setup) -> ResidualSource:
