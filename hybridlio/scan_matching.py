@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -16,8 +14,9 @@ from hybridlio.estimates import Array, RelativePose
 from hybridlio.information import FLOOR_SIGMAS
 from hybridlio.local_map import LocalMap, LocalMapSettings
 from hybridlio.observability import Observed, observe
-from hybridlio.registration import Fit, Registration, RegistrationSettings, fit_at, register
+from hybridlio.registration import Registration, RegistrationSettings
 from hybridlio.sensors import NS_PER_S, Frame, Scan
+from hybridlio.start_search import COARSE_KERNEL_M, best_start, motions
 from hybridlio.surface import Surface
 from hybridlio.voxel import voxel_average
 
@@ -60,13 +59,8 @@ class ScanMatchingSettings:
 
 _UNSURE_TRANSLATION_M = 0.5
 _UNSURE_ROTATION_RAD = 0.02
+_ADRIFT_M = 0.1  # a map of scans whose distances nobody knows so well shows everything several times
 _LEVER_M = 10.0  # half of the points are nearer: what an unsure rotation moves them by
-_SPARSE = 8  # one in so many points is enough to tell a metre from another
-_COARSE_ITERATIONS = 6
-_LIKELY = 12
-_COARSE_KERNEL_M = 0.5
-_REACH_M = 1.0
-_OVERLAP = 0.8  # of the most points that match: to lie on fewer is easier
 _LOST_COST = 0.6  # of the points' cost between 0 and 1: well above any that lie where they should
 _SHARE_OF_SAME_MAP = 1e-3
 _YOUNG_MAP = 5.0  # a map of one keyframe has ground only along that scan's rings, and guesses what lies between
@@ -124,6 +118,7 @@ class ScanMatching:
         self._path = _Path(np.eye(4))
         self._before = self._path
         self._waiting: Array | None = None  # points of a keyframe that goes into the map before the next scan
+        self._adrift = False  # nobody knows how far the last scan is from the map: another map starts there
         self._stamp_ns = 0
         self.seen: SeenScan | None = None
 
@@ -159,7 +154,8 @@ class ScanMatching:
         step = se3.between(before.T_map_lidar, found.pose)
         guessed = before.bridged or bool(len(observed.degenerate))
         self._path = _Path(found.pose, None if guessed else se3.log(step) / dt_s)
-        if self._settings.target == "last-scan" or self._map.wants(found.pose):
+        self._adrift = bool(len(observed.degenerate)) and _sigma_m(initial) > _ADRIFT_M
+        if self._settings.target == "last-scan" or self._adrift or self._map.wants(found.pose):
             self._waiting, self._path.map_changed = seen.points, True
         return self._answer(step, observed, before, len(seen.points))
 
@@ -225,7 +221,7 @@ class ScanMatching:
         """Put a keyframe that was not taken back into the map."""
         if self._waiting is None:
             return
-        if self._settings.target == "last-scan":
+        if self._settings.target == "last-scan" or self._adrift:
             self._map = LocalMap(self._settings.local_map)
         self._map.insert(self._waiting, self._path.T_map_lidar)
         self._waiting = None
@@ -233,36 +229,21 @@ class ScanMatching:
     def _register(self, seen: SeenScan, initial: RelativePose, dt_s: float) -> Observed:
         surface, settings = self._map.surface, self._settings.registration
         assert surface is not None
-        sigma_m = float(np.sqrt(initial.covariance[3:, 3:].trace()))
+        sigma_m = _sigma_m(initial)
         sideways_m = _LEVER_M * float(np.sqrt(initial.covariance[:3, :3].trace()))
         kernel_start_m = min(max(settings.kernel_m, sigma_m, sideways_m), 1.0)
         start = self._path.T_map_lidar @ initial.pose
         if sigma_m > _UNSURE_TRANSLATION_M:
             if self._path.twist is not None:  # who guesses no motion leaves it to this source to know the last one
                 moving = self._path.T_map_lidar @ se3.exp(self._path.twist * dt_s)
-                observed = observe(surface, seen.source, moving, settings, _COARSE_KERNEL_M)
+                observed = observe(surface, seen.source, moving, settings, COARSE_KERNEL_M)
                 if observed.found.matched >= self._settings.min_matched and observed.found.cost < _LOST_COST:
                     return observed
-            turns = bool(initial.covariance[:3, :3].trace() > _UNSURE_ROTATION_RAD**2)
-            start = self._search(surface, seen, start, dt_s, turns)
+            turns = initial.covariance[:3, :3].trace() > _UNSURE_ROTATION_RAD**2
+            rates_deg_s = self._settings.start_rates_deg_s if turns else (0.0,)
+            starts = [start @ step for step in motions(self._settings.start_speeds_m_s, rates_deg_s, dt_s)]
+            start = best_start(surface, seen.source, seen.points, starts, settings)
         return observe(surface, seen.source, start, settings, kernel_start_m)
-
-    def _search(self, surface: Surface, seen: SeenScan, start: Array, dt_s: float, turns: bool) -> Array:
-        """The best of several motions: all are judged by few points, the likelier ones by all of them after some steps.
-
-        Where two scans see ground along other rings, most of it has no neighbour or has one by chance: what counts is
-        how well those points lie that have.
-        """
-        sparse, settings = seen.source[::_SPARSE], self._settings.registration
-        motions = product(self._settings.start_speeds_m_s, self._settings.start_rates_deg_s if turns else (0.0,))
-        starts = [start @ se3.exp(np.array([0, 0, np.deg2rad(rate), speed, 0, 0]) * dt_s) for speed, rate in motions]
-        fits = [fit_at(surface, sparse, T, _COARSE_KERNEL_M, settings.threads) for T in starts]
-        coarse = replace(settings, max_iterations=_COARSE_ITERATIONS)
-        tries = [
-            register(surface, seen.source, starts[i], coarse, _COARSE_KERNEL_M).pose for i in _best(fits)[:_LIKELY]
-        ]
-        fits = [fit_at(surface, seen.points, T, settings.kernel_m, settings.threads, _REACH_M) for T in tries]
-        return tries[_best(fits)[0]]
 
     def _bridge(self, initial: RelativePose, points: int, observed: Observed | None) -> RelativePose:
         self._before, self._path = self._path, self._path.carried_on(initial)
@@ -277,10 +258,8 @@ class ScanMatching:
         )
 
 
-def _best(fits: Sequence[Fit]) -> list[int]:
-    """Their numbers, the best first; those of much fewer points are left out."""
-    most = max(fit.matched for fit in fits)
-    return sorted((i for i, fit in enumerate(fits) if fit.matched > _OVERLAP * most), key=lambda i: fits[i].misfit)
+def _sigma_m(pose: RelativePose) -> float:
+    return float(np.sqrt(pose.covariance[3:, 3:].trace()))
 
 
 def _details(found: Registration, points: int) -> dict[str, float]:
