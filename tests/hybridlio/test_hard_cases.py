@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from hybridlio import se3
+from hybridlio import scan_matching, se3
 from hybridlio.config import Config
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
@@ -18,6 +19,7 @@ from hybridlio.odometry import Odometry
 from hybridlio.run import Run, run_odometry
 from hybridlio.scan_matching import ScanMatching
 from hybridlio.simulation.faults import block_sector, drop_scans, imu_bias, imu_gap
+from hybridlio.start_search import best_start
 
 
 @pytest.fixture(scope="module")
@@ -75,13 +77,12 @@ def test_without_scans_and_samples_the_covariance_says_what_is_not_known(sequenc
 
 def test_who_guesses_no_motion_costs_one_search_at_the_start(sequence: Sequence, monkeypatch: pytest.MonkeyPatch):
     searches = []
-    search = ScanMatching._search
 
-    def counted(self: ScanMatching, *given: object) -> np.ndarray:
+    def counted(*given: Any) -> np.ndarray:
         searches.append(1)
-        return search(self, *given)  # type: ignore[arg-type]
+        return best_start(*given)
 
-    monkeypatch.setattr(ScanMatching, "_search", counted)
+    monkeypatch.setattr(scan_matching, "best_start", counted)
     run = ran(sequence.part(0, 10), initial_pose="identity")
     assert len(searches) == 1
     assert farthest_off_m(run) < 0.05
@@ -89,7 +90,7 @@ def test_who_guesses_no_motion_costs_one_search_at_the_start(sequence: Sequence,
 
 def test_after_a_scan_that_failed_the_motion_is_searched_anew(sequence: Sequence, monkeypatch: pytest.MonkeyPatch):
     searches = []
-    monkeypatch.setattr(ScanMatching, "_search", lambda _, __, ___, start, *____: searches.append(1) or start)
+    monkeypatch.setattr(scan_matching, "best_start", lambda _, __, ___, starts, *____: searches.append(1) or starts[0])
     matching = ScanMatching()
     matching.start(sequence[0])
     unsure = RelativePose(np.eye(4), np.diag(np.r_[np.full(3, 0.1), np.full(3, 2.0)] ** 2), "guess")
