@@ -169,6 +169,20 @@ def test_tree_and_chunked_distances_find_the_same_neighbours(monkeypatch):
     assert there[tree[0]].all()
 
 
+def test_a_limit_changes_nothing_but_neighbours_beyond_it():
+    generator = torch.Generator().manual_seed(2)
+    queries, targets = (torch.randn(1, n, 3, generator=generator) for n in (300, 200))
+    there = torch.rand(1, 200, generator=generator) > 0.3
+    index, distance = nearest(queries, targets, there)
+    limited_index, limited = nearest(queries, targets, there, 0.5)
+    near = distance < 0.5
+    assert 0 < near.sum() < 300
+    assert torch.equal(limited[near], distance[near])
+    assert torch.equal(limited_index[near], index[near])
+    assert torch.isinf(limited[~near]).all()
+    assert ((limited_index >= 0) & (limited_index < 200)).all()
+
+
 def test_without_targets_nothing_is_near():
     _, distance = nearest(torch.zeros(1, 4, 3), torch.zeros(1, 5, 3), torch.zeros(1, 5, dtype=torch.bool))
     assert torch.isinf(distance).all()
