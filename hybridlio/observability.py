@@ -5,6 +5,8 @@ to know a little of the way along it. A few trunks in an open field know no more
 shows a step away, where points find other neighbours: the cost of trunks rises, whereas leaning normals are no worse
 there than here. So the cost is looked at half a metre to either side, where all other directions have found their
 minimum anew; a parabola through the three says where the minimum is, and the scatter of the points' rises how surely.
+
+Who does not know to a few decimetres where to start may ask more: what the costs up to two metres off make likely.
 """
 
 from __future__ import annotations
@@ -31,6 +33,9 @@ _STEPS = 6  # down the other directions, there
 _SEEN = 4.5  # times the scatter: between smooth walls the rise was at most 3.5 times that, in a field 6 and more
 _NEAR_M = 0.1  # a parabola through costs half a metre apart is good for so far
 _ROUNDS = 4
+_OFFSETS_M = np.linspace(-2.0, 2.0, 9)
+_TEMPER = 1.5  # times the scatter of a rise that makes a place e times less likely: so σ was true between smooth walls
+_TOLD = 0.9  # a variance that is hardly less than that of knowing nothing tells nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,18 +48,16 @@ class Observed:
             :func:`hybridlio.information.scaled_spectrum`; mostly there are none.
         along: ``(D, 6)`` tangent vectors: how the pose changes for each metre that it is taken along one. Between walls
             that bend it turns.
-        sigmas_m: ``(D,)`` how sure the points are of each, were they independent; infinite where they see nothing.
+        seen: ``(D,)`` of which of them the points surely say something.
+        sigmas_m: ``(D,)`` standard deviation along each: of what is seen as if the points were independent, of what is
+            not as it is, 10 m where nothing is known.
     """
 
     found: Registration
     basis: Array
     along: Array
+    seen: NDArray[np.bool_]
     sigmas_m: Array
-
-    @property
-    def seen(self) -> NDArray[np.bool_]:
-        """``(D,)`` of which weak directions the points say something."""
-        return np.isfinite(self.sigmas_m)
 
     @property
     def degenerate(self) -> Array:
@@ -70,22 +73,30 @@ class Observed:
         """
         found = self.found
         strong = covariance_of(found.hessian, found.sigma_m, scale, found.levers_m, held=self.basis)
-        weak = self.along * np.minimum(np.sqrt(scale) * self.sigmas_m, UNKNOWN_SIGMA_M)[:, None]
+        sigmas_m = np.where(self.seen, np.sqrt(scale), 1.0) * self.sigmas_m
+        weak = self.along * np.minimum(sigmas_m, UNKNOWN_SIGMA_M)[:, None]
         return np.asarray(strong + weak.T @ weak)
 
 
 def observe(
-    surface: Surface, source: Array, initial: Array, settings: RegistrationSettings, kernel_start_m: float = 0.0
+    surface: Surface,
+    source: Array,
+    initial: Array,
+    settings: RegistrationSettings,
+    kernel_start_m: float = 0.0,
+    far: bool = False,
 ) -> Observed:
     """Register by the strong directions; along a weak one go to the parabola's minimum, where the points see it at all.
 
-    Arguments are those of :func:`hybridlio.registration.register`.
+    Args:
+        surface, source, initial, settings, kernel_start_m: as of :func:`hybridlio.registration.register`.
+        far: nobody knows ``initial`` to a few decimetres: along what is not seen, weigh the costs farther off.
     """
     found = register(surface, source, initial, settings, kernel_start_m)
     values, vectors, to_tangent = scaled_spectrum(found.hessian, found.levers_m)
     basis = vectors[:, ~strong_directions(found.hessian, values, WEAK_NORMAL_NOISE)]
     if not basis.shape[1]:
-        return Observed(found, basis, np.empty((0, 6)), np.empty(0))
+        return Observed(found, basis, np.empty((0, 6)), np.empty(0, dtype=bool), np.empty(0))
     beside = _Beside(surface, source, settings, basis, to_tangent)
     weak = beside.look(found)
     for _ in range(_ROUNDS):
@@ -95,7 +106,14 @@ def observe(
         if np.abs(weak.way_m).max() < _NEAR_M:
             break
         weak = beside.look(found)
-    return Observed(found, basis, weak.along, weak.sigmas_m)
+    seen = np.isfinite(weak.sigmas_m)
+    sigmas_m = np.where(seen, weak.sigmas_m, UNKNOWN_SIGMA_M)
+    if far and not seen.all():
+        ways_m = np.zeros(len(seen))
+        for i in np.flatnonzero(~seen):
+            ways_m[i], sigmas_m[i] = beside.weigh(found, weak.along[i])
+        found = beside.register(found.pose @ se3.exp(ways_m @ weak.along), settings)
+    return Observed(found, basis, weak.along, seen, sigmas_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +145,26 @@ class _Beside:
             weak.along[i] = se3.log(se3.between(back, ahead)) / (2 * _STEP_M)
             weak.way_m[i], weak.sigmas_m[i] = _minimum(rises_back, rises_ahead)
         return weak
+
+    def weigh(self, found: Registration, direction: Array) -> tuple[float, float]:
+        """Metres along ``direction`` to where the costs make it likely to be, and their standard deviation.
+
+        Each offset's likelihood falls with its rise over the rise's scatter. What the choice of offsets pretends to
+        know is taken out again, as of a product of two normal distributions.
+        """
+        here = self._costs(found.pose)
+        rises = [self._step(found.pose, here, offset_m * direction)[1] for offset_m in _OFFSETS_M]
+        depth = np.array([r.sum() / np.sqrt(r @ r + 1e-12) for r in rises]) / _TEMPER
+        weights = np.exp(depth.min() - depth)
+        weights /= weights.sum()
+        mean = float(weights @ _OFFSETS_M)
+        apart_m = _OFFSETS_M[1] - _OFFSETS_M[0]
+        variance = float(weights @ (_OFFSETS_M - mean) ** 2) + apart_m**2 / 12
+        unknown = float((_OFFSETS_M**2).mean())
+        if variance > _TOLD * unknown:
+            return 0.0, UNKNOWN_SIGMA_M
+        told = 1 / (1 / variance - 1 / unknown)
+        return mean / variance * told, float(np.sqrt(told))
 
     def register(self, pose: Array, settings: RegistrationSettings) -> Registration:
         """Down the strong directions alone."""

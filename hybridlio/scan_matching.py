@@ -59,7 +59,7 @@ class ScanMatchingSettings:
 
 _UNSURE_TRANSLATION_M = 0.5
 _UNSURE_ROTATION_RAD = 0.02
-_ADRIFT_M = 0.1  # a map of scans whose distances nobody knows so well shows everything several times
+_VAGUE_M = 0.1  # as far as ground's rings are seen to pull
 _LEVER_M = 10.0  # half of the points are nearer: what an unsure rotation moves them by
 _LOST_COST = 0.6  # of the points' cost between 0 and 1: well above any that lie where they should
 _SHARE_OF_SAME_MAP = 1e-3
@@ -154,7 +154,7 @@ class ScanMatching:
         step = se3.between(before.T_map_lidar, found.pose)
         guessed = before.bridged or bool(len(observed.degenerate))
         self._path = _Path(found.pose, None if guessed else se3.log(step) / dt_s)
-        self._adrift = bool(len(observed.degenerate)) and _sigma_m(initial) > _ADRIFT_M
+        self._adrift = bool(len(observed.degenerate)) and _is_vague(initial)
         if self._settings.target == "last-scan" or self._adrift or self._map.wants(found.pose):
             self._waiting, self._path.map_changed = seen.points, True
         return self._answer(step, observed, before, len(seen.points))
@@ -236,14 +236,14 @@ class ScanMatching:
         if sigma_m > _UNSURE_TRANSLATION_M:
             if self._path.twist is not None:  # who guesses no motion leaves it to this source to know the last one
                 moving = self._path.T_map_lidar @ se3.exp(self._path.twist * dt_s)
-                observed = observe(surface, seen.source, moving, settings, COARSE_KERNEL_M)
+                observed = observe(surface, seen.source, moving, settings, COARSE_KERNEL_M, far=True)
                 if observed.found.matched >= self._settings.min_matched and observed.found.cost < _LOST_COST:
                     return observed
             turns = initial.covariance[:3, :3].trace() > _UNSURE_ROTATION_RAD**2
             rates_deg_s = self._settings.start_rates_deg_s if turns else (0.0,)
             starts = [start @ step for step in motions(self._settings.start_speeds_m_s, rates_deg_s, dt_s)]
             start = best_start(surface, seen.source, seen.points, starts, settings)
-        return observe(surface, seen.source, start, settings, kernel_start_m)
+        return observe(surface, seen.source, start, settings, kernel_start_m, far=_is_vague(initial))
 
     def _bridge(self, initial: RelativePose, points: int, observed: Observed | None) -> RelativePose:
         self._before, self._path = self._path, self._path.carried_on(initial)
@@ -260,6 +260,11 @@ class ScanMatching:
 
 def _sigma_m(pose: RelativePose) -> float:
     return float(np.sqrt(pose.covariance[3:, 3:].trace()))
+
+
+def _is_vague(pose: RelativePose) -> bool:
+    """So that a map by such poses would show everything several times."""
+    return _sigma_m(pose) > _VAGUE_M
 
 
 def _details(found: Registration, points: int) -> dict[str, float]:

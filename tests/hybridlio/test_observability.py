@@ -122,3 +122,25 @@ def test_the_way_along_a_bend_is_a_turn(rng: np.random.Generator, radius_m: floa
     covariance = observed.covariance(1.0)
     assert covariance[2, 3] / covariance[3, 3] == pytest.approx(1 / radius_m, rel=0.2)
     assert np.linalg.eigvalsh(covariance)[0] > 0
+
+
+def test_who_starts_metres_off_is_told_what_the_costs_farther_off_make_likely(rng: np.random.Generator):
+    where = rng.uniform(-25, 25, (20, 2))
+    surface = leaning(rng, joined(ground(rng, 8000), bushes(rng, where, 60)), 0.03)
+    source = scan(rng, joined(ground(rng, 7000), bushes(rng, where, 16)))
+    near = observe(surface, source, off_by(1.6), SETTINGS)
+    far = observe(surface, source, off_by(1.6), SETTINGS, far=True)
+    assert abs(error(far)[3]) < 0.7 < abs(error(near)[3])
+    if not far.seen.all():
+        sigma_m = float(np.sqrt(far.covariance(1.0)[3, 3]))
+        assert abs(error(far)[3]) < 3 * sigma_m < 10
+
+
+def test_where_there_is_nothing_to_be_told_far_off_is_no_better(rng: np.random.Generator):
+    """Level ground without an end: every place on it is like any other."""
+    surface = leaning(rng, ground(rng, 12000), 0.01)
+    source = scan(rng, ground(rng, 3000))
+    inside = source[np.abs(source).max(axis=1) < 20]
+    observed = observe(surface, inside, off_by(0.5), SETTINGS, far=True)
+    assert len(observed.degenerate) == 3
+    assert (np.sqrt(np.diag(observed.covariance(1.0)))[3:5] > 1.5).all()
