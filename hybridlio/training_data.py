@@ -2,7 +2,7 @@
 
 What training needs of an initial pose or of the last velocity comes from an odometry run over the recording, by
 scan matching: never from its reference, which serves validation alone. Where scans do not tell how far a step went, as
-on an open field, the run goes on by the IMU alone and its speed soon is anybody's guess: there is no velocity then.
+between smooth walls, the run goes on by the IMU alone and its speed soon is anybody's guess: there is no velocity then.
 """
 
 from __future__ import annotations
