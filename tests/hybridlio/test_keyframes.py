@@ -145,3 +145,12 @@ def test_the_file_holds_plain_arrays_alone(rng: np.random.Generator, tmp_path: P
 def test_settings_that_mean_nothing_are_refused(wrong: dict[str, float]):
     with pytest.raises(ConfigError, match="keyframes:"):
         KeyframeSettings(**wrong)  # type: ignore[arg-type]
+
+
+def test_clouds_come_out_of_a_run_as_they_went_in(rng: np.random.Generator):
+    made, settings = KeyframeMaker(KeyframeSettings()), KeyframeSettings()
+    scans = [Scan(k, rng.uniform(-79, 79, (4000, 3)).astype(np.float32)) for k in range(3)]
+    for k, scan in enumerate(scans):
+        assert made.offer(k, scan, se3.make(np.eye(3), [10.0 * k, 0, 0]))
+    for scan, cloud in zip(scans, made.keyframes().clouds, strict=True):
+        np.testing.assert_array_equal(cloud, compact(scan.points, settings))
