@@ -5,7 +5,8 @@
 `--simulated` shakes true relative poses and measures what the network leaves of the error. `--real` does the same on
 recordings without an exact reference, around what small_gicp finds between full scans. `--adapt` trains the weights on
 each of two or more real recordings, without labels, and measures on the others. `--long` chains the steps of LSTMs and
-network, without a graph. `--time` takes the first two scans of the first recording given. Prints Markdown; -o keeps the figures.
+network, without a graph. `--time` takes the first two scans of the first recording given. Prints Markdown; -o keeps the
+figures.
 """
 
 from __future__ import annotations
