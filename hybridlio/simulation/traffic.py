@@ -13,6 +13,7 @@ from hybridlio import se3
 from hybridlio.simulation import street
 from hybridlio.simulation.ground import Ground
 from hybridlio.simulation.roads import LANE_OFFSET_M, Road
+from hybridlio.simulation.shapes import Mesh
 from hybridlio.simulation.world import RayScene
 
 Array = NDArray[np.float64]
@@ -20,6 +21,7 @@ Array = NDArray[np.float64]
 _CLEARANCE_M = 3.0
 _REACH_M = 90.0
 CAR_RADIUS_M = 5.5
+_SENSORS_M = 0.5  # around the recording car's IMU
 
 
 @dataclass(eq=False)
@@ -42,10 +44,15 @@ class MovingCar:
         return se3.make(R, np.stack([x, y, z], axis=-1))
 
     @property
-    def scene(self) -> RayScene:
+    def mesh(self) -> Mesh:
         """Its shape, in its own frame."""
+        return street.car(np.random.default_rng(self.shape_seed))
+
+    @property
+    def scene(self) -> RayScene:
+        """Its shape, ready for rays."""
         if self._scene is None:
-            self._scene = RayScene.of(street.car(np.random.default_rng(self.shape_seed)), np.zeros(3))
+            self._scene = RayScene.of(self.mesh, np.zeros(3))
         return self._scene
 
 
@@ -70,8 +77,9 @@ def traffic(
             shifted = times_s + rng.choice([-1, 1]) * rng.uniform(2.0, 6.0)
             s = np.where((shifted > times_s[0]) & (shifted < times_s[-1]), np.interp(shifted, times_s, ego_s), -1.0)
             motion = _motion(lane, s, 0.0, times_s, ground)
-        if motion is not None and _keeps_clear(motion, times_s, ego_xy):
-            cars.append(MovingCar(motion, (seed, 1000 + number)))
+        car = None if motion is None else MovingCar(motion, (seed, 1000 + number))
+        if car is not None and _keeps_clear(car, times_s, ego_xy):
+            cars.append(car)
     return cars
 
 
@@ -86,10 +94,16 @@ def _motion(road: Road, s: Array, left_m: float, times_s: Array, ground: Ground)
     return CubicSpline(times_s, np.column_stack([xy, ground.height(xy), heading]))
 
 
-def _keeps_clear(motion: CubicSpline, times_s: Array, ego_xy: Array) -> bool:
-    together = (times_s >= motion.x[0]) & (times_s <= motion.x[-1])
-    gap = np.linalg.norm(motion(times_s[together])[:, :2] - ego_xy[together], axis=1)
-    return bool(gap.min() > _CLEARANCE_M)
+def _keeps_clear(car: MovingCar, times_s: Array, ego_xy: Array) -> bool:
+    """Whether the recording car keeps away from the moving one's middle, and its sensors out of its outline."""
+    together = (times_s >= car.motion.x[0]) & (times_s <= car.motion.x[-1])
+    x, y, _, heading = car.motion(times_s[together]).T
+    off = ego_xy[together] - np.column_stack([x, y])
+    along = np.cos(heading) * off[:, 0] + np.sin(heading) * off[:, 1]
+    aside = np.cos(heading) * off[:, 1] - np.sin(heading) * off[:, 0]
+    half_length, half_width = np.abs(car.mesh.vertices[:, :2]).max(axis=0) + _SENSORS_M
+    inside = (np.abs(along) < half_length) & (np.abs(aside) < half_width)
+    return bool(np.hypot(along, aside).min() > _CLEARANCE_M and not inside.any())
 
 
 def in_reach(cars: Sequence[MovingCar], position: Array, time_s: float) -> list[MovingCar]:
