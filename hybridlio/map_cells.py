@@ -20,6 +20,8 @@ Index = NDArray[np.intp]
 MOST = 10  # points a cell
 _APART_M = 0.1
 _LEAST = 5  # neighbours that make a plane
+_RING_RAD = np.deg2rad(0.1)  # beams of spinning lidars are 0.3° apart and more
+_LEAST_OF_OTHERS = 2  # of ten
 
 
 class MapCells:
@@ -53,8 +55,8 @@ class MapCells:
         taken = _with_room(old, new, count)
         if known is not None and len(taken):
             taken = taken[known.nearest(moved[taken], self._threads)[1] >= _APART_M**2]
-        normals = _normals(points, taken, self._neighbours, self._threads) @ T_map_lidar[:3, :3].T
-        taken = taken[: len(normals)]
+        taken, normals = _with_planes(points, taken, self._neighbours, self._threads)
+        normals = normals @ T_map_lidar[:3, :3].T
         self._hit[(np.bincount(new, minlength=count) > 0)[old]] = self._insertions
         kept = self._hit > self._insertions - self._horizon
         self.points = np.concatenate([self.points[kept], moved[taken]])
@@ -73,12 +75,25 @@ def _with_room(old: Index, new: Index, count: int) -> Index:
     return np.sort(order[rank < free[cells]])
 
 
-def _normals(points: Array, wanted: Index, neighbours: int, threads: int) -> Array:
-    """Unit normals ``(len(wanted), 3)``, of least spread among the nearest points; none of too few points."""
+def _with_planes(points: Array, wanted: Index, neighbours: int, threads: int) -> tuple[Index, Array]:
+    """Those of ``wanted`` whose nearest points make a plane, and its normals ``(M, 3)``, of least spread."""
     neighbours = min(neighbours, len(points))
     if neighbours < _LEAST or not len(wanted):
-        return np.empty((0, 3))
+        return wanted[:0], np.empty((0, 3))
     index, _ = small_gicp.KdTree(points, threads).batch_knn_search(points[wanted], neighbours, threads)
     near = points[index]
+    several = _of_several_rings(near)
+    near = near[several]
     near -= near.mean(axis=1, keepdims=True)
-    return np.asarray(np.linalg.eigh(near.transpose(0, 2, 1) @ near)[1][:, :, 0])
+    return wanted[several], np.asarray(np.linalg.eigh(near.transpose(0, 2, 1) @ near)[1][:, :, 0])
+
+
+def _of_several_rings(near: Array) -> NDArray[np.bool_]:
+    """Whether points ``(M, K, 3)``, lidar frame, are of more than one beam.
+
+    One beam's points lie on a cone about the lidar's axis: whatever it hits, their plane is the cone's. On a far wall
+    its normal stands upright, and the next scan's ring would be pulled to the height of this one's.
+    """
+    elevation_rad = np.arcsin(near[..., 2] / np.maximum(np.linalg.norm(near, axis=-1), 1e-9))
+    others = np.abs(elevation_rad - np.median(elevation_rad, axis=1, keepdims=True)) > _RING_RAD
+    return np.asarray(others.sum(axis=1) >= _LEAST_OF_OTHERS)

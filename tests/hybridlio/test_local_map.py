@@ -150,3 +150,19 @@ def test_the_same_scans_give_the_same_bytes(threads: int):
     assert again is not None
     assert first.points.tobytes() == again.points.tobytes()
     assert first.normals.tobytes() == again.normals.tobytes()
+
+
+@pytest.mark.parametrize(("beams_deg", "planes"), [((1.0,), False), ((0.0, 1.0, 2.0), True)], ids=["one beam", "three"])
+def test_one_beams_points_make_no_plane(beams_deg: tuple[float, ...], planes: bool):
+    """Of a wall 20 m away one beam sees a line, level and slightly bent: the plane it lies in is not the wall."""
+    left = np.arange(-6.0, 6.0, 0.6)
+    rings = [
+        np.column_stack([np.full_like(left, 20.0), left, np.hypot(20.0, left) * np.tan(np.radians(b))])
+        for b in beams_deg
+    ]
+    local_map = LocalMap(SETTINGS)
+    local_map.insert(np.concatenate(rings), at(0.0))
+    assert local_map.surface is not None
+    assert (len(local_map.surface.normals) > 0) == planes
+    if planes:
+        assert (np.abs(local_map.surface.normals[:, 0]) > 0.999).mean() > 0.9
