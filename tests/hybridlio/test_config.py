@@ -41,7 +41,7 @@ def test_changed_settings_round_trip_through_yaml(tmp_path: Path):
 def test_the_yaml_names_every_setting_in_plain_values():
     tree = yaml.safe_load(config_to_yaml(Config()))
     assert set(tree) == set(Config.model_fields)
-    assert tree["scan_matching"]["registration"]["max_iterations"] == 15
+    assert tree["scan_matching"]["registration"]["max_iterations"] == Config().scan_matching.registration.max_iterations
     assert tree["scan_matching"]["local_map"]["voxel_m"] > 0
 
 
