@@ -218,7 +218,7 @@ def _run(job: Job) -> None:
     from hybridlio.run_outputs import write_run
 
     sequence = job.recording.open()
-    config = suited_to(sequence, job.config) if job.without_imu else job.config
+    config = suited_to(sequence, job.config, as_asked=not job.without_imu)
     run = run_odometry(sequence, Odometry(config=_limited(config, job.threads)))
     if isinstance(run.stopped, KeyboardInterrupt):
         raise run.stopped

@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 
 Progress = Callable[[int, int, float], None]
 
-_WITHOUT_IMU = "constant-velocity"
+_FROM_IMU, _WITHOUT_IMU = "preintegration", "constant-velocity"
 
 
 @dataclass(eq=False)
@@ -196,9 +196,22 @@ def _frame(run: Run, k: int) -> Frame:
         return run.sequence.without_scan(k)
 
 
-def suited_to(sequence: Sequence, config: Config) -> Config:
-    """The configuration, with an initial pose that needs no inertial data where the recording has none."""
-    if len(sequence.imu):
+def suited_to(sequence: Sequence, config: Config, as_asked: bool = False) -> Config:
+    """The configuration, with an initial pose that needs no inertial data where the recording has none.
+
+    Args:
+        sequence: the recording.
+        config: the settings.
+        as_asked: they are somebody's choice, and stay.
+
+    Raises:
+        DataError: preintegration was chosen, and there is nothing to integrate.
+    """
+    if len(sequence.imu) or (as_asked and config.initial_pose != _FROM_IMU):
         return config
+    if as_asked:
+        raise DataError(
+            f"{sequence.name}: no IMU samples for initial poses by {_FROM_IMU}; choose another, such as {_WITHOUT_IMU}"
+        )
     _log.warning("%s: no inertial data, so initial poses by %s", sequence.name, _WITHOUT_IMU)
     return config.model_copy(update={"initial_pose": _WITHOUT_IMU})

@@ -46,7 +46,8 @@ def odometry(
     chosen = common.settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
     estimator = Odometry(config=chosen)  # wrong names fail before the recording is opened
     recording = common.open_data(data, sequence, reader, raw_root, frames)
-    if initial_pose is None and config is None and (suited := suited_to(recording, chosen)) != chosen:
+    suited = suited_to(recording, chosen, as_asked=initial_pose is not None or config is not None)
+    if suited != chosen:
         chosen, estimator = suited, Odometry(config=suited)
     folder = new_run_folder(recording.name, out, overwrite)
     with progress("odometry") as tick:
