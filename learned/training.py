@@ -157,7 +157,8 @@ class _Run:
             write_whole(out / "recipe.json", json.dumps(to_dict(recipe), indent=2) + "\n")
         self.objective = place.joined(Objective(self.network, recipe.loss))
         self.steps_an_epoch = math.ceil(len(pairs) / settings.batch)
-        self.steps = self.steps_an_epoch * settings.epochs
+        whole = self.steps_an_epoch * settings.epochs
+        self.steps = min(whole, options.max_steps or whole)
 
     def train(
         self,
@@ -166,10 +167,9 @@ class _Run:
         validated: Callable[[int, Validation], None] | None,
     ) -> None:
         began, first = time.monotonic(), self.step
-        last = min(self.steps, self.options.max_steps or self.steps)
         self.network.train()
         try:
-            for indices, batch in self._batches(last):
+            for indices, batch in self._batches():
                 loss, po2pl = self._step(indices, batch)
                 seconds = time.monotonic() - began
                 self._after_step(loss, po2pl, (self.step - first) / seconds, progress)
@@ -182,13 +182,13 @@ class _Run:
                 self._save()
             raise
         self._save()
-        if self.step >= last and self.place.leads:
+        if self.step >= self.steps and self.place.leads:
             save_weights(self.out / WEIGHTS, self.network, self.recipe, self._told())
 
-    def _batches(self, last: int) -> Iterator[tuple[list[int], PairBatch]]:
+    def _batches(self) -> Iterator[tuple[list[int], PairBatch]]:
         """The pairs of each remaining step and this process's share of them, read one step ahead."""
         with ThreadPoolExecutor(1) as reader:
-            plan = self._plan(last)
+            plan = self._plan()
             ahead = next(plan, None)
             reading = reader.submit(self._read, ahead) if ahead else None
             while ahead is not None and reading is not None:
@@ -197,12 +197,12 @@ class _Run:
                 reading = reader.submit(self._read, ahead) if ahead else None
                 yield indices[1], batch
 
-    def _plan(self, last: int) -> Iterator[tuple[int, list[int]]]:
+    def _plan(self) -> Iterator[tuple[int, list[int]]]:
         epoch, skip = divmod(self.step, self.steps_an_epoch)
         step = self.step
-        while step < last:
+        while step < self.steps:
             for indices in epoch_order(self.recipe.optimiser, epoch, len(self.pairs))[skip:]:
-                if step >= last:
+                if step >= self.steps:
                     return
                 yield epoch, indices
                 step += 1

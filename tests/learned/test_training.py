@@ -183,3 +183,16 @@ def test_what_is_not_finite_is_null_in_the_log(tmp_path):
     log.write(1, loss=float("nan"), po2pl_m=None)
     log.close()
     assert read_log(tmp_path / "log.jsonl") == [{"step": 1, "loss": None, "po2pl_m": None}]
+
+
+def test_progress_counts_to_where_the_run_ends_not_its_schedule(rooms, tiny_recipe, tmp_path):
+    told = []
+    train(
+        tiny_recipe,
+        Pairs(rooms[:1], tiny_recipe.network),
+        tmp_path,
+        options=replace(CPU, max_steps=2),
+        progress=told.append,
+    )
+    assert [(p.step, p.steps) for p in told] == [(1, 2), (2, 2)]
+    assert told[-1].remaining_s == 0
