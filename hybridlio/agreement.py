@@ -120,4 +120,4 @@ class Witness:
 def _comparable(measured: RelativePose, predicted: RelativePose | None) -> bool:
     if predicted is None or not predicted.ok or not measured.ok or measured.from_imu:
         return False
-    return bool(np.sqrt(predicted.covariance[3:, 3:].trace()) <= _UNSURE_TRANSLATION_M)
+    return predicted.translation_sigma_m <= _UNSURE_TRANSLATION_M

@@ -96,6 +96,11 @@ class RelativePose:
             if self.ok:  # else the pose bridges, and its covariance is no part of the path's
                 check_covariance(self.covariance - self.drift, f"{self.source}: covariance less drift")
 
+    @property
+    def translation_sigma_m(self) -> float:
+        """How unsure the translation is, along all axes together."""
+        return float(np.sqrt(self.covariance[3:, 3:].trace()))
+
     def wider(self, times: float = 1.0, added: Array | None = None) -> RelativePose:
         """The same poses, less sure.
 

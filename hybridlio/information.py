@@ -48,12 +48,20 @@ def strong_directions(information: Array, values: Array, normal_noise: float = N
     return strong
 
 
+def weak_basis(
+    information: Array, levers_m: Array | None = None, normal_noise: float = NORMAL_NOISE
+) -> tuple[Array, Array]:
+    """The directions ``(6, D)`` that do not stand out, orthonormal in one unit, and what takes them to the tangent."""
+    values, vectors, scale = scaled_spectrum(information, levers_m)
+    return np.asarray(vectors[:, ~strong_directions(information, values, normal_noise)]), scale
+
+
 def degenerate_directions(
     information: Array, levers_m: Array | None = None, normal_noise: float = NORMAL_NOISE
 ) -> Array:
     """``(D, 6)`` unit tangent directions along which the matches say no more than the noise of their normals."""
-    values, vectors, scale = scaled_spectrum(information, levers_m)
-    directions = (vectors[:, ~strong_directions(information, values, normal_noise)] * scale[:, None]).T
+    basis, to_tangent = weak_basis(information, levers_m, normal_noise)
+    directions = (basis * to_tangent[:, None]).T
     return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
 

@@ -22,8 +22,7 @@ from hybridlio.information import (
     UNKNOWN_SIGMA_M,
     WEAK_NORMAL_NOISE,
     covariance_of,
-    scaled_spectrum,
-    strong_directions,
+    weak_basis,
 )
 from hybridlio.registration import Registration, RegistrationSettings, register
 from hybridlio.surface import Surface
@@ -93,8 +92,7 @@ def observe(
         far: nobody knows ``initial`` to a few decimetres: along what is not seen, weigh the costs farther off.
     """
     found = register(surface, source, initial, settings, kernel_start_m)
-    values, vectors, to_tangent = scaled_spectrum(found.hessian, found.levers_m)
-    basis = vectors[:, ~strong_directions(found.hessian, values, WEAK_NORMAL_NOISE)]
+    basis, to_tangent = weak_basis(found.hessian, found.levers_m, WEAK_NORMAL_NOISE)
     if not basis.shape[1]:
         return Observed(found, basis, np.empty((0, 6)), np.empty(0, dtype=bool), np.empty(0))
     beside = _Beside(surface, source, settings, basis, to_tangent)
@@ -109,9 +107,9 @@ def observe(
     seen = np.isfinite(weak.sigmas_m)
     sigmas_m = np.where(seen, weak.sigmas_m, UNKNOWN_SIGMA_M)
     if far and not seen.all():
-        ways_m = np.zeros(len(seen))
+        ways_m, here = np.zeros(len(seen)), beside.costs(found.pose)
         for i in np.flatnonzero(~seen):
-            ways_m[i], sigmas_m[i] = beside.weigh(found, weak.along[i])
+            ways_m[i], sigmas_m[i] = beside.weigh(found, here, weak.along[i])
         found = beside.register(found.pose @ se3.exp(ways_m @ weak.along), settings)
     return Observed(found, basis, weak.along, seen, sigmas_m)
 
@@ -137,7 +135,7 @@ class _Beside:
 
     def look(self, found: Registration) -> _Weak:
         """At both sides of ``found``, along each weak direction."""
-        here, count = self._costs(found.pose), self.basis.shape[1]
+        here, count = self.costs(found.pose), self.basis.shape[1]
         weak = _Weak(np.empty(count), np.empty((count, 6)), np.empty(count))
         for i, direction in enumerate((self.to_tangent[:, None] * self.basis).T):
             back, rises_back = self._step(found.pose, here, -_STEP_M * direction)
@@ -146,13 +144,12 @@ class _Beside:
             weak.way_m[i], weak.sigmas_m[i] = _minimum(rises_back, rises_ahead)
         return weak
 
-    def weigh(self, found: Registration, direction: Array) -> tuple[float, float]:
+    def weigh(self, found: Registration, here: Array, direction: Array) -> tuple[float, float]:
         """Metres along ``direction`` to where the costs make it likely to be, and their standard deviation.
 
-        Each offset's likelihood falls with its rise over the rise's scatter. What the choice of offsets pretends to
-        know is taken out again, as of a product of two normal distributions.
+        ``here`` are the costs at the pose found. Each offset's likelihood falls with its rise over the rise's scatter.
+        What the choice of offsets pretends to know is taken out again, as of a product of two normal distributions.
         """
-        here = self._costs(found.pose)
         rises = [self._step(found.pose, here, offset_m * direction)[1] for offset_m in _OFFSETS_M]
         depth = np.array([r.sum() / np.sqrt(r @ r + 1e-12) for r in rises]) / _TEMPER
         weights = np.exp(depth.min() - depth)
@@ -173,10 +170,10 @@ class _Beside:
     def _step(self, pose: Array, here: Array, step: Array) -> tuple[Array, Array]:
         """The pose a step away, and by how much the points' costs are higher there."""
         there = self.register(pose @ se3.exp(step), replace(self.settings, max_iterations=_STEPS)).pose
-        rises = self._costs(there) - here
+        rises = self.costs(there) - here
         return there, np.asarray(rises[~np.isnan(rises)])
 
-    def _costs(self, pose: Array) -> Array:
+    def costs(self, pose: Array) -> Array:
         """``(N,)`` robust cost of each point, between 0 and 1; NaN without a neighbour."""
         moved = se3.transform(pose, self.source)
         index, distance2 = self.surface.nearest(moved, self.settings.threads)

@@ -152,9 +152,10 @@ class ScanMatching:
         found = observed.found
         before, self._before = self._path, self._path
         step = se3.between(before.T_map_lidar, found.pose)
-        guessed = before.bridged or bool(len(observed.degenerate))
+        left_open = bool(len(observed.degenerate))
+        guessed = before.bridged or left_open
         self._path = _Path(found.pose, None if guessed else se3.log(step) / dt_s)
-        self._adrift = bool(len(observed.degenerate)) and _is_vague(initial)
+        self._adrift = left_open and _is_vague(initial)
         if self._settings.target == "last-scan" or self._adrift or self._map.wants(found.pose):
             self._waiting, self._path.map_changed = seen.points, True
         return self._answer(step, observed, before, len(seen.points))
@@ -169,7 +170,7 @@ class ScanMatching:
         few = min(len(earlier.points), len(current.points)) < self._settings.min_points
         if few or earlier.surface is None:
             return replace(initial, ok=False)
-        settings, sigma_m = self._settings.registration, float(np.sqrt(initial.covariance[3:, 3:].trace()))
+        settings, sigma_m = self._settings.registration, initial.translation_sigma_m
         wide = min(max(settings.kernel_m, sigma_m), 1.0)
         observed = observe(earlier.surface, current.source, initial.pose, settings, wide)
         if observed.found.matched < self._settings.min_matched:
@@ -229,7 +230,7 @@ class ScanMatching:
     def _register(self, seen: SeenScan, initial: RelativePose, dt_s: float) -> Observed:
         surface, settings = self._map.surface, self._settings.registration
         assert surface is not None
-        sigma_m = _sigma_m(initial)
+        sigma_m = initial.translation_sigma_m
         sideways_m = _LEVER_M * float(np.sqrt(initial.covariance[:3, :3].trace()))
         kernel_start_m = min(max(settings.kernel_m, sigma_m, sideways_m), 1.0)
         start = self._path.T_map_lidar @ initial.pose
@@ -258,13 +259,9 @@ class ScanMatching:
         )
 
 
-def _sigma_m(pose: RelativePose) -> float:
-    return float(np.sqrt(pose.covariance[3:, 3:].trace()))
-
-
 def _is_vague(pose: RelativePose) -> bool:
     """So that a map by such poses would show everything several times."""
-    return _sigma_m(pose) > _VAGUE_M
+    return pose.translation_sigma_m > _VAGUE_M
 
 
 def _details(found: Registration, points: int) -> dict[str, float]:

@@ -245,7 +245,7 @@ def _odometry(
 
 
 def _sure(pose: RelativePose, limit_m: float = _UNSURE_TRANSLATION_M) -> bool:
-    return pose.ok and float(np.sqrt(pose.covariance[3:, 3:].trace())) <= limit_m
+    return pose.ok and pose.translation_sigma_m <= limit_m
 
 
 def _compensated(sequence: Sequence, steps: dict[int, Array], k: int) -> Scan:

@@ -18,8 +18,7 @@ from hybridlio.information import (
     degenerate_directions,
     lever_arms,
     newton_step,
-    scaled_spectrum,
-    strong_directions,
+    weak_basis,
 )
 from hybridlio.learned.correspondences import Clouds, match
 from hybridlio.learned.losses import gauss_newton, loss
@@ -112,8 +111,8 @@ class Judged:
 
     def _loose(self) -> Array:
         """``(6, D)``: directions that the points do not constrain, each of a metre at the points' lever arms."""
-        values, vectors, scale = scaled_spectrum(self.information, self.levers_m)
-        return np.asarray(vectors[:, ~strong_directions(self.information, values, _NORMAL_NOISE)] * scale[:, None])
+        basis, to_tangent = weak_basis(self.information, self.levers_m, _NORMAL_NOISE)
+        return np.asarray(basis * to_tangent[:, None])
 
 
 class LossJudge:

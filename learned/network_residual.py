@@ -186,7 +186,7 @@ class NetworkResidual:
 
     def _starts(self, initial: RelativePose, dt_s: float) -> list[Array]:
         """The initial pose, or that and others ahead of it where it is unsure of the translation."""
-        sure = np.sqrt(initial.covariance[3:, 3:].trace()) <= _UNSURE_TRANSLATION_M
+        sure = initial.translation_sigma_m <= _UNSURE_TRANSLATION_M
         shifts = [0.0] if sure else [speed * dt_s for speed in self._settings.start_speeds_m_s]
         return [initial.pose @ se3.exp(np.array([0, 0, 0, shift, 0, 0])) for shift in shifts]
 
