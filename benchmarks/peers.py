@@ -82,7 +82,9 @@ def accuracy(one: Pass, sequence: Sequence) -> Figures:
             out["against forward speed [%]"] = 100 * (trajectory.length_m / driven_m - 1)
         else:
             out["moved though standing [m]"] = trajectory.length_m
-            out["ended away from the start [m]"] = float(np.linalg.norm(trajectory.poses[-1, :3, 3]))
+            away_mm = 1e3 * np.linalg.norm(trajectory.poses[:, :3, 3], axis=1)
+            out["away from the start, RMS [mm]"] = float(np.sqrt(np.mean(away_mm**2)))
+            out["at the end [mm]"] = float(away_mm[-1])
     return out
 
 
