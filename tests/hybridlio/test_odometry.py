@@ -11,12 +11,12 @@ from hybridlio.config import Config
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.errors import ConfigError, DataError, EstimationError
-from hybridlio.estimates import RelativePose, State
+from hybridlio.estimates import RelativePose
 from hybridlio.graph.offline import smooth
-from hybridlio.initial_pose import Identity, NoResidual
+from hybridlio.initial_pose import NoResidual
 from hybridlio.odometry import Estimate, Odometry
 from hybridlio.record import Record
-from hybridlio.sensors import Frame, GpsFix, ImuNoise, ImuSamples, Scan
+from hybridlio.sensors import Frame, GpsFix, ImuSamples, Scan
 
 
 @pytest.fixture(scope="module")
@@ -233,89 +233,3 @@ def test_an_empty_first_scan_is_refused_and_another_may_follow(frames: list[Fram
 def test_an_unknown_name_is_refused_at_once(kind: str, by: str):
     with pytest.raises(ConfigError, match=r"unknown .* 'lidar-dreams'; choose one of"):
         Odometry(**{kind: "lidar-dreams"}) if by == "argument" else Odometry(config=Config(**{kind: "lidar-dreams"}))
-
-
-# ---------------------------------------------------------------------------------------------- what is chosen
-
-
-class Truth:
-    """An initial pose from the reference; knows the future."""
-
-    name = "truth"
-
-    def __init__(self, sequence: Sequence) -> None:
-        self._sequence = sequence
-        self.learnt: list[int] = []
-
-    def predict(self, frame: Frame, state: State) -> RelativePose:  # noqa: ARG002
-        assert self._sequence.reference is not None
-        k = frame.index
-        step = se3.between(self._sequence.reference.poses[k - 1], self._sequence.reference.poses[k])
-        return RelativePose(step, np.eye(6) * 1e-6, self.name)
-
-    def correct(self, frame: Frame, estimate: RelativePose) -> None:  # noqa: ARG002
-        self.learnt.append(frame.index)
-
-
-def test_an_initial_pose_source_of_ones_own_is_used_and_told_each_step(frames: list[Frame], sequence: Sequence):
-    source = Truth(sequence)
-    odometry = Odometry(initial_pose=source)
-    estimates = [odometry.step(frame) for frame in frames[:6]]
-    assert source.learnt == [1, 2, 3, 4, 5]
-    assert {e.initial.source for e in estimates if e.initial} == {"truth"}
-    assert sequence.reference is not None
-    assert np.linalg.norm(estimates[-1].pose[:3, 3] - sequence.reference.poses[5, :3, 3]) < 0.05
-
-
-def test_a_guess_that_was_not_refined_is_nothing_to_learn_from(frames: list[Frame], sequence: Sequence):
-    source = Truth(sequence)
-    odometry = Odometry(initial_pose=source)
-    for frame in frames[:6]:
-        odometry.step(blind(frame) if frame.index in (3, 4) else frame)
-    assert source.learnt == [1, 2, 5]
-
-
-def test_a_backend_of_ones_own_is_used(frames: list[Frame]):
-    class Chained:
-        name = "chained"
-
-        def start(self, state: State) -> None:
-            self.state = state
-
-        def update(self, frame: Frame, relative: RelativePose) -> State:
-            self.step = relative
-            pose = self.state.T_world_imu @ relative.pose
-            self.state = replace(self.state, stamp_ns=frame.scan.stamp_ns, T_world_imu=pose)
-            return self.state
-
-        def last_step(self) -> RelativePose:
-            return self.step
-
-    odometry = Odometry(initial_pose=Identity(), residual="none", backend=Chained())
-    for frame in frames[:3]:
-        estimate = odometry.step(frame)
-    np.testing.assert_allclose(estimate.pose, np.eye(4), atol=1e-12)
-    assert estimate.step is estimate.relative
-
-
-def test_names_given_go_before_those_in_the_configuration(frames: list[Frame]):
-    config = Config(initial_pose="identity", residual="none")
-    both = [Odometry(config=config), Odometry(initial_pose="constant-velocity", config=config)]
-    for odometry in both:
-        odometry.step(frames[0])
-    sources = [odometry.step(frames[1]).initial for odometry in both]
-    assert [source.source for source in sources if source] == ["identity", "constant-velocity"]
-
-
-def test_the_noise_is_the_configurations_else_the_recordings_else_the_default(frames: list[Frame]):
-    mine, recorded = ImuNoise(1e-2, 1e-1), ImuNoise(5e-4, 5e-3)
-
-    def used(config: Config, in_frame: ImuNoise | None) -> ImuNoise:
-        odometry = Odometry(residual="none", config=config)
-        for frame in frames[:2]:
-            odometry.step(replace(frame, imu_noise=in_frame))
-        return odometry.record().imu_noise
-
-    assert used(Config(imu_noise=mine), recorded) == mine
-    assert used(Config(), recorded) == recorded
-    assert used(Config(), None) == ImuNoise()

@@ -15,12 +15,11 @@ from hybridlio import se3
 from hybridlio.config import Config
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.errors import ConfigError
 from hybridlio.estimates import Backend, InitialPoseSource, RelativePose, ResidualSource, State
 from hybridlio.learned.source_settings import LstmSettings, NetworkResidualSettings
 from hybridlio.odometry import Odometry
-from hybridlio.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples, Scan
-from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES, Setup, check_names
+from hybridlio.sensors import NS_PER_S, Frame, ImuNoise, ImuSamples, Scan
+from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES, Setup
 from hybridlio.startup import start_state
 
 INITIAL, RESIDUAL, BACKEND = sorted(INITIAL_POSE_SOURCES), sorted(RESIDUAL_SOURCES), sorted(BACKENDS)
@@ -298,19 +297,6 @@ def test_any_initial_pose_goes_with_any_residual(initial: str, residual: str, fr
     assert estimate.index == 3
 
 
-@pytest.mark.parametrize("kind", ["initial pose", "residual", "backend"])
-def test_an_unknown_name_is_an_error_that_lists_those_there_are(kind: str):
-    known = {"initial pose": INITIAL, "residual": RESIDUAL, "backend": BACKEND}
-    names = {seam: "preintegrated" if seam == kind else choices[0] for seam, choices in known.items()}
-    with pytest.raises(ConfigError, match=f"unknown {kind} 'preintegrated'") as error:
-        check_names(names["initial pose"], names["residual"], names["backend"])
-    assert all(name in str(error.value) for name in known[kind])
-
-
-def test_objects_are_taken_as_they_are():
-    check_names(object(), object(), object())
-
-
 @pytest.mark.parametrize(
     "table", [INITIAL_POSE_SOURCES, RESIDUAL_SOURCES, BACKENDS], ids=["initial", "residual", "backend"]
 )
@@ -319,7 +305,3 @@ def test_each_entry_makes_a_new_object_each_time(table: dict[str, Callable[[Setu
         first, second = make(setup), make(deepcopy(setup))
         assert first is not second
         assert first.name == second.name == name
-
-
-def test_a_setup_without_extrinsics_has_the_identity():
-    np.testing.assert_array_equal(Setup(Config(), Calibration(), ImuNoise()).calibration.T_imu_lidar, np.eye(4))

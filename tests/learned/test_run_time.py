@@ -9,7 +9,6 @@ import hybridlio as hl
 from hybridlio import se3
 from hybridlio.errors import ConfigError, DataError
 from hybridlio.estimates import RelativePose, State
-from hybridlio.information import covariance_of, degenerate_directions, newton_step
 from hybridlio.learned.lstm_initial_pose import LstmInitialPose
 from hybridlio.learned.network_residual import NetworkResidual
 from hybridlio.learned.odometry_network import OdometryNetwork
@@ -289,23 +288,3 @@ def test_weights_that_predict_no_initial_pose_are_refused(weights):
 def test_settings_out_of_range_are_refused(changes):
     with pytest.raises(ConfigError):
         NetworkResidualSettings(**changes)
-
-
-def spread(*weak: int) -> np.ndarray:
-    return np.diag([0.0 if axis in weak else 1000.0 * (25.0 if axis < 3 else 1.0) for axis in range(6)])
-
-
-def test_the_covariance_is_the_inverse_information_where_that_is_full():
-    found = covariance_of(spread(), sigma_m=0.02, scale=1.0)
-    # 2e-3 of the trace of translation is the normals' noise: 6 of 1000
-    assert np.sqrt(found[4, 4] - 1e-6) == pytest.approx(0.02 / np.sqrt(994), rel=1e-3)
-    assert degenerate_directions(spread()).shape == (0, 6)
-
-
-def test_directions_without_information_are_loose_and_no_step_is_taken_along_them():
-    found = covariance_of(spread(3), sigma_m=0.02, scale=1.0)
-    assert found[3, 3] == pytest.approx(100.0)
-    assert np.abs(degenerate_directions(spread(3))).argmax(axis=1).tolist() == [3]
-    step = newton_step(spread(3), np.array([0, 0, 0, 50.0, 50.0, 0]))
-    assert step[3] == 0
-    assert step[4] == pytest.approx(-0.05)
