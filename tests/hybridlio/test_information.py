@@ -1,4 +1,4 @@
-"""What matched points say of a pose: covariance, directions left open, and the lever arms that rotations are compared at."""
+"""What matched points say of a pose: its covariance, directions left open, and lever arms to compare rotations at."""
 
 import numpy as np
 import pytest
