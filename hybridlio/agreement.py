@@ -15,7 +15,7 @@ import numpy as np
 from hybridlio import se3
 from hybridlio.estimates import Array, RelativePose
 
-Verdict = Literal["untested", "agrees", "down-weighted", "rejected", "trusted again"]
+Verdict = Literal["untested", "agrees", "down-weighted", "rejected", "relocated", "trusted again"]
 
 GATE = 27.86  # χ², six degrees of freedom: one in ten thousand lies above
 GROSS = 10 * GATE  # no covariance that is only somewhat too small explains this
@@ -31,7 +31,8 @@ class Agreement:
     Attributes:
         verdict: ``untested`` where there is nothing to compare, or the IMU does not know its speed and tilt yet;
             ``agrees``; ``down-weighted``, with a covariance just large enough to agree; ``rejected``, so that the IMU
-            bridges; ``trusted again``, taken as it is after too many rejections.
+            bridges; ``relocated``, bridged too, but the residual source goes on from where it found the scan, after too
+            many rejections; ``trusted again``, taken as it is, after that.
         chi2: the difference under both covariances; None where untested.
     """
 
@@ -82,8 +83,9 @@ def _chi2(error: Array, covariance: Array) -> float:
 class Witness:
     """Compares each step's relative pose with what the IMU predicted, and remembers how often it was rejected.
 
-    After :data:`MOST_REJECTED` rejections in a row, scans are taken as they are until one agrees: the IMU may be what
-    is wrong, and the graph can then learn its bias or speed from them.
+    After :data:`MOST_REJECTED` rejections in a row it may be the map that was lost: the next scan's place in it is a jump
+    and no motion, and those after it agree again. Where they do not, it may be the IMU that is wrong, and they are taken
+    as they are until one agrees: the graph can then learn its bias or speed.
     """
 
     def __init__(self) -> None:
@@ -108,13 +110,14 @@ class Witness:
         if chi2 <= GATE:
             self._rejected = 0
             return measured, Agreement("agrees", chi2)
-        if self._rejected >= MOST_REJECTED:
+        if self._rejected > MOST_REJECTED:
             return measured, Agreement("trusted again", chi2)
         if chi2 <= GROSS:
             return measured.wider(widening(measured, predicted)), Agreement("down-weighted", chi2)
         self._rejected += 1
+        verdict: Verdict = "relocated" if self._rejected > MOST_REJECTED else "rejected"
         details = {**measured.details, "chi2": chi2}
-        return replace(bridge, ok=False, drift=None, keyframes=(), details=details), Agreement("rejected", chi2)
+        return replace(bridge, ok=False, drift=None, keyframes=(), details=details), Agreement(verdict, chi2)
 
 
 def _comparable(measured: RelativePose, predicted: RelativePose | None) -> bool:

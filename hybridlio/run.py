@@ -170,7 +170,7 @@ def _advance(run: Run, k: int) -> None:
         return
     run.reading_s.append(read)
     run.estimates.append(estimate)
-    if estimate.agreement.verdict in ("down-weighted", "rejected"):
+    if estimate.agreement.verdict in ("down-weighted", "rejected", "relocated"):
         chi2, verdict = estimate.agreement.chi2, estimate.agreement.verdict
         _log.info("frame %d: %s: it and the IMU differ by χ² = %.0f (%.0f is the limit)", k, verdict, chi2, GATE)
     _log.debug("frame %d: %s", k, _described(estimate))

@@ -92,6 +92,7 @@ def disagreements(run: Run) -> list[str]:
     """What was done with scans that contradict the IMU, in a line each; often none."""
     said = {
         "rejected": "contradict the IMU and are left out",
+        "relocated": "contradicted the IMU once too often: the map is followed from there, the jump left out",
         "down-weighted": "disagree with the IMU beyond their covariances and count for less",
         "trusted again": "contradict the IMU for longer than it is to be believed and are taken as they are",
     }
@@ -134,6 +135,7 @@ def metrics(run: Run, config: Config, evaluation: Evaluation | None) -> dict[str
         "bridged": run.bridged,
         "rejected": run.judged("rejected"),
         "down_weighted": run.judged("down-weighted"),
+        "relocated": run.judged("relocated"),
         "trusted_again": run.judged("trusted again"),
         "degenerate": (np.flatnonzero(run.degenerate) + run.skipped + 1).tolist(),
         "unreadable": {str(k): why for k, why in run.unreadable.items()},

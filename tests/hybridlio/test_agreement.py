@@ -105,10 +105,27 @@ def test_without_a_witness_nothing_is_tested(measured: RelativePose, predicted: 
     assert agreement.chi2 is None
 
 
-def test_after_a_few_rejections_scans_are_trusted_until_one_agrees():
+def rejected_as_often_as_may_be() -> Witness:
     witness = started()
-    verdicts = [witness.judge(off_by(50), IMU, IMU)[1].verdict for _ in range(MOST_REJECTED + 3)]
-    assert verdicts == ["rejected"] * MOST_REJECTED + ["trusted again"] * 3
+    verdicts = [witness.judge(off_by(50), IMU, IMU)[1].verdict for _ in range(MOST_REJECTED)]
+    assert verdicts == ["rejected"] * MOST_REJECTED
+    return witness
+
+
+def test_after_a_few_rejections_a_jump_is_followed_but_not_believed_to_be_motion():
+    witness = rejected_as_often_as_may_be()
+    taken, agreement = witness.judge(off_by(50), IMU, IMU)
+    assert agreement.verdict == "relocated"
+    assert (taken.ok, taken.source) == (False, "preintegration")
+    np.testing.assert_array_equal(taken.pose, STEP)
+    assert witness.judge(off_by(0.5), IMU, IMU)[1].verdict == "agrees"
+    assert witness.judge(off_by(50), IMU, IMU)[1].verdict == "rejected"
+
+
+def test_scans_that_go_on_to_contradict_the_imu_are_trusted_until_one_agrees():
+    witness = rejected_as_often_as_may_be()
+    verdicts = [witness.judge(off_by(50), IMU, IMU)[1].verdict for _ in range(4)]
+    assert verdicts == ["relocated"] + ["trusted again"] * 3
     assert witness.judge(off_by(0.5), IMU, IMU)[1].verdict == "agrees"
     assert witness.judge(off_by(50), IMU, IMU)[1].verdict == "rejected"
 
@@ -155,6 +172,14 @@ def test_a_registration_that_slips_is_rejected_and_does_no_harm(sequence: Sequen
     assert rejected == [15, 16]
     assert [e.index for e in slipped[1:] if e.relative and not e.relative.ok] == rejected
     assert farthest_off(slipped, sequence) < farthest_off(clean, sequence) + 0.05
+
+
+def test_a_map_that_was_lost_is_found_again_without_the_jump_in_the_path(sequence: Sequence):
+    """The registration slips once and says so ever after: where it is told to go back, it slips again."""
+    clean, slipped = driven(sequence, ScanMatching()), driven(sequence, Slipping(range(12, 13 + MOST_REJECTED), 1.0))
+    verdicts = [e.agreement.verdict for e in slipped[12 : 14 + MOST_REJECTED]]
+    assert verdicts == ["rejected"] * MOST_REJECTED + ["relocated", "agrees"]
+    assert farthest_off(slipped, sequence) < farthest_off(clean, sequence) + 0.2  # six steps by an IMU that started a second ago
 
 
 def test_any_initial_pose_has_the_imu_for_witness(sequence: Sequence):
