@@ -2,18 +2,33 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterator
+from operator import attrgetter
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from hybridlio.errors import ConfigError
-from hybridlio.files import write_whole
+from hybridlio.files import read_yaml, write_whole
 from hybridlio.keyframes import KeyframeSettings
 from hybridlio.learned.source_settings import LstmSettings, NetworkResidualSettings
 from hybridlio.recent_scans import RecentScansSettings
 from hybridlio.scan_matching import ScanMatchingSettings
 from hybridlio.sensors import ImuNoise
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
+_POSITIVE = (
+    "max_range_m", "map_voxel_m", "source_voxel_m", "covariance_scale",
+    "registration.kernel_m", "registration.max_distance_m", "registration.max_iterations", "registration.threads",
+    "local_map.keyframe_m", "local_map.keyframe_deg", "local_map.voxel_m", "local_map.horizon_keyframes",
+    "local_map.radius_m", "local_map.neighbours", "local_map.threads",
+)  # fmt: skip
+_NOT_NEGATIVE = ("min_range_m", "min_points", "min_matched", "drift_share")
 
 
 class Config(BaseModel):
@@ -44,6 +59,16 @@ class Config(BaseModel):
     network: NetworkResidualSettings = Field(default_factory=NetworkResidualSettings)
     keyframes: KeyframeSettings = Field(default_factory=KeyframeSettings)
 
+    @field_validator("scan_matching")
+    @classmethod
+    def _within_range(cls, settings: ScanMatchingSettings) -> ScanMatchingSettings:
+        for name in (*_POSITIVE, *_NOT_NEGATIVE):
+            value = attrgetter(name)(settings)
+            if not (value > 0 if name in _POSITIVE else value >= 0):  # NaN is neither
+                wanted = "above 0" if name in _POSITIVE else "0 or more"
+                raise ConfigError(f"scan_matching.{name}: must be {wanted}, got {value}")
+        return settings
+
 
 def config_to_yaml(config: Config) -> str:
     """The configuration as YAML text that :func:`load_config` reads back."""
@@ -61,13 +86,7 @@ def load_config(path: Path) -> Config:
     Raises:
         ConfigError: no such file, not YAML, an unknown key or a value out of range; names each.
     """
-    try:
-        tree = yaml.safe_load(Path(path).read_text())
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not YAML: {error}") from error
-    return parse_config(tree or {}, str(path))
+    return parse_config(read_yaml(path, ConfigError) or {}, str(path))
 
 
 def parse_config(tree: object, where: str) -> Config:
@@ -79,7 +98,29 @@ def parse_config(tree: object, where: str) -> Config:
     try:
         return Config.model_validate(tree)
     except ValidationError as error:
-        wrong = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg'].lower()}" for e in error.errors())
+        wrong = "; ".join(map(_complaint, error.errors()))
         raise ConfigError(f"{where}: {wrong}. `hybridlio config` prints all keys with their defaults") from None
     except ConfigError as error:  # settings that check themselves
         raise ConfigError(f"{where}: {error}") from None
+
+
+def _complaint(error: ErrorDetails) -> str:
+    """What is wrong with one key, and which one may have been meant."""
+    *above, last = map(str, error["loc"] or ("",))
+    path = ".".join((*above, last))
+    if not path:
+        return f"expected settings, each with its key, got {error['input']!r:.40}"
+    if error["type"] not in ("extra_forbidden", "unexpected_keyword_argument"):
+        return f"{path}: {error['msg'].lower()}"
+    every = [".".join(keys) for keys in _keys(Config().model_dump())]
+    beside = {key.rsplit(".", 1)[-1]: key for key in every if key.split(".")[:-1] == above}
+    meant = [beside[name] for name in difflib.get_close_matches(last, beside, n=1)]
+    meant = meant or [key for key in every if key.rsplit(".", 1)[-1] == last]
+    return f"{path}: unknown key{f'; did you mean {meant[0]}?' if meant else ''}"
+
+
+def _keys(tree: dict[str, Any], above: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    for key, value in tree.items():
+        yield (*above, key)
+        if isinstance(value, dict):
+            yield from _keys(value, (*above, key))

@@ -1,4 +1,4 @@
-"""Files that appear whole: written beside their place under a temporary name, then renamed into it."""
+"""Files that appear whole: written beside their place under a temporary name, then renamed into it. And YAML, read."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import os
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-from hybridlio.errors import DataError
+from hybridlio.errors import DataError, HybridLioError
 
 
 @contextlib.contextmanager
@@ -46,3 +47,26 @@ def write_whole(path: str | os.PathLike[str], data: bytes | str) -> None:
     """
     with writing_whole(path) as temporary:
         temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
+def read_yaml(path: str | os.PathLike[str], error: type[HybridLioError] = DataError) -> Any:
+    """The tree of a YAML (or JSON) file; None for an empty one. Nothing in it is executed.
+
+    Args:
+        path: the file.
+        error: what to raise.
+
+    Raises:
+        DataError, or what ``error`` says: it cannot be read or is not YAML; names the file and, if known, the line.
+    """
+    import yaml  # here, as it is on the way of every import
+
+    try:
+        return yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except OSError as trouble:
+        raise error(f"{path}: cannot be read ({trouble.strerror})") from trouble
+    except yaml.MarkedYAMLError as trouble:
+        line = "" if trouble.problem_mark is None else f" at line {trouble.problem_mark.line + 1}"
+        raise error(f"{path}: not YAML{line}: {trouble.problem or trouble.context}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as trouble:
+        raise error(f"{path}: not YAML: {' '.join(str(trouble).split())}") from None

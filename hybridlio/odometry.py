@@ -92,7 +92,7 @@ class Odometry:
 
         Raises:
             DataError: frames out of order, or a first scan without points.
-            ConfigError: IMU samples without extrinsics.
+            ConfigError: IMU samples without extrinsics, or a source that cannot be made as it is set.
         """
         self._made.heard(frame.gps)
         if frame.calibration is None and len(frame.imu):
@@ -140,18 +140,29 @@ class Odometry:
     def _begin(self, frame: Frame) -> Estimate:
         """Take the first frame: it defines the origin."""
         self._setup = _setup(self._config, frame)
-        initial_pose, residual, backend = self._chosen
-        setup = self._setup
-        self._initial_pose = (
-            INITIAL_POSE_SOURCES[initial_pose](setup) if isinstance(initial_pose, str) else initial_pose
-        )
-        self._residual = RESIDUAL_SOURCES[residual](setup) if isinstance(residual, str) else residual
-        self._backend = BACKENDS[backend](setup) if isinstance(backend, str) else backend
+        self._make_sources()
         self._witness = Witness()
         self._residual.start(frame)
         self._first = frame
         covariance = np.eye(6) * 1e-12  # it defines the frame; GTSAM and files want it positive definite
         return Estimate(frame.index, frame.scan.stamp_ns, np.eye(4), covariance, None, None, None, {})
+
+    def _make_sources(self) -> None:
+        """Make what was chosen by name.
+
+        Raises:
+            ConfigError: it cannot be made as it is set, whatever the frame is, such as for want of its weights.
+        """
+        initial_pose, residual, backend = self._chosen
+        setup = self._setup
+        try:
+            self._initial_pose = (
+                INITIAL_POSE_SOURCES[initial_pose](setup) if isinstance(initial_pose, str) else initial_pose
+            )
+            self._residual = RESIDUAL_SOURCES[residual](setup) if isinstance(residual, str) else residual
+            self._backend = BACKENDS[backend](setup) if isinstance(backend, str) else backend
+        except DataError as error:
+            raise ConfigError(str(error)) from error
 
     def _start(self, frame: Frame) -> State:
         """Start the graph at the first frame, with the second one's samples to tell where down is."""

@@ -8,9 +8,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import yaml
-
 from hybridlio.errors import ConfigError
+from hybridlio.files import read_yaml
 from hybridlio.learned.presets import preset
 from hybridlio.learned.settings import Recipe, from_dict, to_dict
 from hybridlio.preparation import PreparationOptions
@@ -41,12 +40,7 @@ def changed_by_file(recipe: Recipe, path: Path) -> Recipe:
     Raises:
         ConfigError: no such file, not YAML, an unknown key or a value out of range; names each.
     """
-    try:
-        tree = yaml.safe_load(path.read_text()) or {}
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not YAML: {error}") from error
+    tree = read_yaml(path, ConfigError) or {}
     if not isinstance(tree, dict):
         raise ConfigError(f"{path}: expected sections (network, loss, optimiser), got {type(tree).__name__}")
     network = tree.get("network")

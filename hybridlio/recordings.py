@@ -12,11 +12,10 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from hybridlio.datasets.registry import open_sequence, sequence_names
 from hybridlio.datasets.sequence import Sequence, part_of
 from hybridlio.errors import ConfigError, DataError, HybridLioError
+from hybridlio.files import read_yaml
 
 _YAML, _TEXT = (".yaml", ".yml"), (".txt", ".list")
 
@@ -102,11 +101,7 @@ def _listed(entry: str | Path | Recording) -> Iterator[Recording]:
 
 
 def _read_list(file: Path) -> Iterator[Recording]:
-    try:
-        text = file.read_text()
-        entries = yaml.safe_load(text) if file.suffix in _YAML else _lines(text, file)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise DataError(f"{file}: cannot be read as a list of recordings: {error}") from error
+    entries = read_yaml(file) if file.suffix in _YAML else _lines(file)
     if not isinstance(entries, list):
         raise DataError(f"{file}: expected a list of recordings, one an entry")
     for number, entry in enumerate(entries, 1):
@@ -116,7 +111,11 @@ def _read_list(file: Path) -> Iterator[Recording]:
         yield from (replace(item, path=one.path) for one in found)
 
 
-def _lines(text: str, file: Path) -> list[dict[str, str]]:
+def _lines(file: Path) -> list[dict[str, str]]:
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{file}: cannot be read as a list of recordings: {error}") from error
     entries = []
     for number, line in enumerate(text.splitlines(), 1):
         try:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio import se3
-from hybridlio.errors import DataError
+from hybridlio.errors import ConfigError, DataError
 from hybridlio.geodesy import GeodeticPoint
 
 NS_PER_S = 1_000_000_000
@@ -133,6 +133,9 @@ class ImuNoise:
 
     The accelerometer and gyroscope densities are white noise per root hertz, the bias walks random walks, and the two
     ``*_bias_sigma`` say how far the biases may be from zero at power-up.
+
+    Raises:
+        ConfigError: a value is negative or not finite.
     """
 
     __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
@@ -143,6 +146,11 @@ class ImuNoise:
     accel_walk_m_s3_sqrt_hz: float = 3.0e-4
     gyro_bias_sigma_rad_s: float = 1.0e-2
     accel_bias_sigma_m_s2: float = 1.0e-1
+
+    def __post_init__(self) -> None:
+        wrong = {name: value for name, value in vars(self).items() if not 0 <= value < np.inf}
+        if wrong:
+            raise ConfigError(f"imu_noise: expected numbers that are finite and 0 or more, got {wrong}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,8 @@
+import re
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -6,6 +10,16 @@ import yaml
 from hybridlio.config import Config, config_to_yaml, load_config, parse_config, save_config
 from hybridlio.errors import ConfigError
 from hybridlio.sensors import ImuNoise
+
+
+def leaves(settings: Any, above: str = "") -> Iterator[tuple[str, float]]:
+    """Every number in a tree of dataclasses, with its path."""
+    for f in fields(settings):
+        value = getattr(settings, f.name)
+        if is_dataclass(value):
+            yield from leaves(value, f"{above}{f.name}.")
+        elif isinstance(value, int | float):
+            yield f"{above}{f.name}", value
 
 
 def test_the_defaults_round_trip_through_yaml(tmp_path: Path):
@@ -129,3 +143,34 @@ def test_a_missing_file_is_named(tmp_path: Path):
 def test_settings_do_not_change_once_made():
     with pytest.raises((ValueError, AttributeError)):
         Config().backend = "none"  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("tree", "meant"),
+    [
+        ({"inital_pose": "kalman"}, "initial_pose"),
+        ({"scan_matching": {"map_voxl_m": 1.0}}, "scan_matching.map_voxel_m"),
+        ({"scan_matching": {"kernel_m": 1.0}}, "scan_matching.registration.kernel_m"),
+    ],
+)
+def test_a_misspelt_or_misplaced_key_is_told_what_it_may_have_meant(tree: dict, meant: str):
+    with pytest.raises(ConfigError, match=rf"unknown key; did you mean {re.escape(meant)}\?"):
+        parse_config(tree, "here")
+
+
+@pytest.mark.parametrize("value", [-1, float("nan")])
+@pytest.mark.parametrize("path", [path for path, _ in leaves(Config().scan_matching) if "start_" not in path])
+def test_no_number_of_scan_matching_may_be_negative_or_none(path: str, value: float):
+    *above, last = path.split(".")
+    tree: dict = {last: value}
+    for key in reversed(above):
+        tree = {key: tree}
+    with pytest.raises(ConfigError, match=rf"here: scan_matching\.{re.escape(path)}: "):
+        parse_config({"scan_matching": tree}, "here")
+
+
+@pytest.mark.parametrize("name", [f.name for f in fields(ImuNoise)])
+@pytest.mark.parametrize("value", [-1e-9, float("nan"), float("inf")])
+def test_noise_that_is_negative_or_endless_is_refused(name: str, value: float):
+    with pytest.raises(ConfigError, match=rf"here: imu_noise: .*{name}"):
+        parse_config({"imu_noise": {name: value}}, "here")

@@ -4,8 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybridlio.errors import DataError
-from hybridlio.files import write_whole, writing_whole
+from hybridlio.errors import ConfigError, DataError
+from hybridlio.files import read_yaml, write_whole, writing_whole
 
 
 def test_text_and_bytes_are_written_as_given_and_folders_are_made(tmp_path: Path) -> None:
@@ -66,3 +66,20 @@ def test_a_place_that_cannot_be_written_is_named_with_the_reason(tmp_path: Path)
 def test_trouble_with_another_file_inside_the_block_keeps_its_own_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="elsewhere"), writing_whole(tmp_path / "a.txt"):
         (tmp_path / "elsewhere").read_text()
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"a: 1\nb: [1, 2\n", r"my\.yaml: not YAML at line 3: "),
+        (b"\xff\xfe", r"my\.yaml: not YAML: "),
+        (None, r"my\.yaml: cannot be read \(No such file"),
+    ],
+)
+def test_what_is_not_yaml_is_named_in_one_line(tmp_path: Path, content: bytes | None, words: str) -> None:
+    if content is not None:
+        (tmp_path / "my.yaml").write_bytes(content)
+    for error in (DataError, ConfigError):
+        with pytest.raises(error, match=words) as raised:
+            read_yaml(tmp_path / "my.yaml", error)
+        assert "\n" not in str(raised.value)

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from hybridlio import se3
-from hybridlio.config import Config
+from hybridlio.config import Config, parse_config
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
+from hybridlio.errors import ConfigError
 from hybridlio.estimates import RelativePose, State
 from hybridlio.initial_pose import Identity
 from hybridlio.odometry import Odometry
+from hybridlio.run import run_odometry
 from hybridlio.sensors import Frame, ImuNoise, Scan
 
 
@@ -116,3 +118,12 @@ def test_the_noise_is_the_configurations_else_the_recordings_else_the_default(fr
     assert used(Config(imu_noise=mine), recorded) == mine
     assert used(Config(), recorded) == recorded
     assert used(Config(), None) == ImuNoise()
+
+
+@pytest.mark.parametrize("choice", [{"initial_pose": "lstm"}, {"residual": "network"}])
+def test_weights_that_cannot_be_read_end_a_run_at_once_and_not_at_every_scan(choice: dict, sequence: Sequence, caplog):
+    lost = {"weights": "nowhere.safetensors"}
+    run = run_odometry(sequence, Odometry(config=parse_config({"lstm": lost, "network": lost}, "here"), **choice))
+    assert isinstance(run.stopped, ConfigError)
+    assert "nowhere.safetensors: weights cannot be read" in str(run.stopped)
+    assert (run.done, run.unreadable, caplog.messages) == (0, {}, [])

@@ -66,7 +66,7 @@ def test_a_yaml_list_holds_paths_or_mappings(drives):
         ("a.yaml", "path: x\n", "expected a list"),
         ("a.yaml", "- {path: x, speed: 3}\n", "entry 1: unknown key 'speed'"),
         ("a.yaml", "- {sequence: x}\n", "entry 1: expected a path"),
-        ("a.yaml", "- [", "cannot be read"),
+        ("a.yaml", "- [", r"a\.yaml: not YAML at line 1"),
     ],
 )
 def test_a_malformed_list_is_refused_with_the_place(tmp_path, file, text, words):
