@@ -83,9 +83,9 @@ def _chi2(error: Array, covariance: Array) -> float:
 class Witness:
     """Compares each step's relative pose with what the IMU predicted, and remembers how often it was rejected.
 
-    After :data:`MOST_REJECTED` rejections in a row it may be the map that was lost: the next scan's place in it is a jump
-    and no motion, and those after it agree again. Where they do not, it may be the IMU that is wrong, and they are taken
-    as they are until one agrees: the graph can then learn its bias or speed.
+    After :data:`MOST_REJECTED` rejections in a row it may be the map that was lost: the next scan's place in it is a
+    jump and no motion, and those after it agree again. Where they do not, it may be the IMU that is wrong, and they are
+    taken as they are until one agrees: the graph can then learn its bias or speed.
     """
 
     def __init__(self) -> None:
