@@ -11,6 +11,9 @@ from hybridlio.estimates import Array
 from hybridlio.map_cells import MapCells
 from hybridlio.surface import Surface
 
+_FRESH_SHARE = 0.15
+_FAR_SHARE = 0.15  # of the radius
+
 
 @dataclass(frozen=True)
 class LocalMapSettings:
@@ -19,8 +22,9 @@ class LocalMapSettings:
     Attributes:
         keyframe_m, keyframe_deg: a scan this far from the last keyframe becomes one.
         voxel_m: cells of the map; each holds up to ten points at least 10 cm apart.
-        horizon_keyframes: a cell that so many keyframes have not touched is forgotten.
-        radius_m: points farther from the keyframe are left out of the surface.
+        horizon_keyframes: a cell that so many keyframes have not touched is forgotten, when the surface is next made
+            of all points: after some keyframes.
+        radius_m: points farther from the keyframe are left out of the surface then.
         neighbours: points to fit a plane to for a normal.
         threads: for normals and trees.
     """
@@ -43,6 +47,7 @@ class LocalMap:
         self._settings = settings
         self._cells = MapCells(settings.voxel_m, settings.horizon_keyframes, settings.neighbours, settings.threads)
         self._keyframe: Array | None = None
+        self._middle: Array = np.zeros(3)  # of the surface when it was last made of all points
         self.keyframes = 0
         self.surface: Surface | None = None
 
@@ -56,9 +61,26 @@ class LocalMap:
 
     def insert(self, points: Array, T_map_lidar: Array) -> None:
         """Take a scan's points ``(N, 3)``, lidar frame, as a keyframe at this pose and renew the surface."""
-        self._cells.insert(points, T_map_lidar, self.surface)
+        new = self._cells.insert(points, T_map_lidar, self.surface)
         self._keyframe = T_map_lidar
         self.keyframes += 1
-        away = self._cells.points - T_map_lidar[:3, 3]
-        near = np.einsum("ij,ij->i", away, away) < self._settings.radius_m**2
-        self.surface = Surface(self._cells.points[near], self._cells.normals[near], self._settings.threads)
+        if self.surface is not None:
+            self.surface = self.surface.grown(*new, self._settings.threads)
+        if self.surface is None or self._is_worn(self.surface):
+            self.surface = self._anew(T_map_lidar[:3, 3])
+
+    def _is_worn(self, surface: Surface) -> bool:
+        """Whether much has come since the surface was made of all points, or the keyframe is far from where it was."""
+        assert self._keyframe is not None
+        way_m = np.linalg.norm(self._keyframe[:3, 3] - self._middle)
+        return surface.fresh_share > _FRESH_SHARE or bool(way_m > _FAR_SHARE * self._settings.radius_m)
+
+    def _anew(self, middle: Array) -> Surface | None:
+        """Of what is remembered within the radius; None of nothing."""
+        points, normals = self._cells.remembered()
+        away = points - middle
+        near = np.flatnonzero(np.einsum("ij,ij->i", away, away) < self._settings.radius_m**2)
+        self._middle = middle
+        if not len(near):
+            return None
+        return Surface(points.take(near, axis=0), normals.take(near, axis=0), self._settings.threads)

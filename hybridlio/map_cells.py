@@ -11,9 +11,9 @@ import small_gicp
 from numpy.typing import NDArray
 
 from hybridlio import se3
+from hybridlio.cell_table import CellTable, cells_of
 from hybridlio.estimates import Array
 from hybridlio.surface import Surface
-from hybridlio.voxel import voxel_labels
 
 Index = NDArray[np.intp]
 
@@ -32,47 +32,54 @@ class MapCells:
         horizon: a cell that so many insertions have not hit is forgotten.
         neighbours: points of a scan to fit a plane to for a normal.
         threads: for trees.
-
-    Attributes:
-        points, normals: ``(M, 3)`` each.
     """
 
     def __init__(self, side_m: float, horizon: int, neighbours: int, threads: int) -> None:
         self._side_m, self._horizon, self._neighbours, self._threads = side_m, horizon, neighbours, threads
-        self.points: Array = np.empty((0, 3))
-        self.normals: Array = np.empty((0, 3))
-        self._hit = np.empty(0, np.int64)  # of each point, the last insertion that hit its cell
+        self._table = CellTable()
+        self._parts: list[tuple[Array, Array]] = []  # of every insertion since what was forgotten was dropped
         self._insertions = 0
 
-    def insert(self, points: Array, T_map_lidar: Array, known: Surface | None) -> None:
+    def insert(self, points: Array, T_map_lidar: Array, known: Surface | None) -> tuple[Array, Array]:
         """Take in what there is room for of a scan's points ``(N, 3)``, lidar frame; ``known`` is of the points so far.
 
         Points that lie beside one of ``known``, or that have no neighbours to make a plane, are left out.
+
+        Returns:
+            the points ``(M, 3)`` taken in, and their normals; map frame.
         """
         moved = se3.transform(T_map_lidar, points)
-        labels, count = voxel_labels(np.concatenate([self.points, moved]).astype(np.float32), self._side_m)
-        old, new = labels[: len(self.points)], labels[len(self.points) :]
-        taken = _with_room(old, new, count)
+        labels, cells = cells_of(moved, self._side_m)
+        taken = _with_room(MOST - self._table.held(cells), labels)
         if known is not None and len(taken):
             taken = taken[known.nearest(moved[taken], self._threads)[1] >= _APART_M**2]
         taken, normals = _with_planes(points, taken, self._neighbours, self._threads)
-        normals = normals @ T_map_lidar[:3, :3].T
-        self._hit[(np.bincount(new, minlength=count) > 0)[old]] = self._insertions
-        kept = self._hit > self._insertions - self._horizon
-        self.points = np.concatenate([self.points[kept], moved[taken]])
-        self.normals = np.concatenate([self.normals[kept], normals])
-        self._hit = np.concatenate([self._hit[kept], np.full(len(taken), self._insertions)])
+        self._table.hit(cells, np.bincount(labels[taken], minlength=len(cells)), self._insertions)
         self._insertions += 1
+        new = moved[taken], normals @ T_map_lidar[:3, :3].T
+        self._parts.append(new)
+        return new
+
+    def remembered(self) -> tuple[Array, Array]:
+        """All points ``(M, 3)`` and normals but those of cells that are forgotten, which are dropped."""
+        points = np.concatenate([np.empty((0, 3)), *(points for points, _ in self._parts)])
+        normals = np.concatenate([np.empty((0, 3)), *(normals for _, normals in self._parts)])
+        self._table.forget(self._insertions - self._horizon)
+        labels, cells = cells_of(points, self._side_m)
+        kept = self._table.has(cells)
+        if not kept.all():
+            points, normals = points[kept[labels]], normals[kept[labels]]
+        self._parts = [(points, normals)]
+        return points, normals
 
 
-def _with_room(old: Index, new: Index, count: int) -> Index:
-    """Which of the new points find room in their cells, of ``count``, where the old ones are."""
-    free = MOST - np.bincount(old, minlength=count)
-    candidates = np.flatnonzero(free[new] > 0)
-    order = candidates[np.argsort(new[candidates], kind="stable")]
-    cells = new[order]
-    rank = np.arange(len(cells)) - np.searchsorted(cells, cells)  # among those of the same cell
-    return np.sort(order[rank < free[cells]])
+def _with_room(room: NDArray[np.int64], cells: Index) -> Index:
+    """Which points find room, where ``cells`` ``(N,)`` they lie in have ``room`` for so many each."""
+    candidates = np.flatnonzero(room[cells] > 0)
+    order = candidates[np.argsort(cells[candidates], kind="stable")]
+    ordered = cells[order]
+    rank = np.arange(len(ordered)) - np.searchsorted(ordered, ordered)  # among those of the same cell
+    return np.sort(order[rank < room[ordered]])
 
 
 def _with_planes(points: Array, wanted: Index, neighbours: int, threads: int) -> tuple[Index, Array]:
@@ -81,19 +88,21 @@ def _with_planes(points: Array, wanted: Index, neighbours: int, threads: int) ->
     if neighbours < _LEAST or not len(wanted):
         return wanted[:0], np.empty((0, 3))
     index, _ = small_gicp.KdTree(points, threads).batch_knn_search(points[wanted], neighbours, threads)
-    near = points[index]
-    several = _of_several_rings(near)
-    near = near[several]
+    several = _of_several_rings(points, index)
+    near = points.take(index[several], axis=0)
     near -= near.mean(axis=1, keepdims=True)
     return wanted[several], np.asarray(np.linalg.eigh(near.transpose(0, 2, 1) @ near)[1][:, :, 0])
 
 
-def _of_several_rings(near: Array) -> NDArray[np.bool_]:
-    """Whether points ``(M, K, 3)``, lidar frame, are of more than one beam.
+def _of_several_rings(points: Array, near: NDArray[np.uint64]) -> NDArray[np.bool_]:
+    """Whether those of the points ``(N, 3)``, lidar frame, that ``near`` ``(M, K)`` numbers are of more than one beam.
 
     One beam's points lie on a cone about the lidar's axis: whatever it hits, their plane is the cone's. On a far wall
     its normal stands upright, and the next scan's ring would be pulled to the height of this one's.
     """
-    elevation_rad = np.arcsin(near[..., 2] / np.maximum(np.linalg.norm(near, axis=-1), 1e-9))
-    others = np.abs(elevation_rad - np.median(elevation_rad, axis=1, keepdims=True)) > _RING_RAD
+    elevation_rad = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+    beams_rad = np.sort(elevation_rad[near], axis=1)
+    count = beams_rad.shape[1]
+    middle_rad = (beams_rad[:, (count - 1) // 2] + beams_rad[:, count // 2]) / 2  # np.median takes three times as long
+    others = np.abs(beams_rad - middle_rad[:, None]) > _RING_RAD
     return np.asarray(others.sum(axis=1) >= _LEAST_OF_OTHERS)

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import small_gicp
 from numpy.typing import NDArray
 
 from hybridlio.estimates import Array
 from hybridlio.information import lever_arms
-
-_QUERIES_A_THREAD = 2000  # half a millisecond
+from hybridlio.point_tree import PointTree
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,43 +76,56 @@ class Matches:
 
 
 class Surface:
-    """Points with normals and a KD-tree over them: what a scan is registered to.
+    """Points with normals and a tree over them: what a scan is registered to.
 
     Args:
-        points: ``(M, 3)`` metres.
+        points: ``(M, 3)`` metres, one at least.
         normals: ``(M, 3)`` unit vectors.
         threads: for building the tree.
     """
 
     def __init__(self, points: Array, normals: Array, threads: int = 2) -> None:
         self.points = points
-        self.normals = normals
-        self._planes = np.column_stack([normals, np.einsum("ij,ij->i", normals, points)])
-        self._tree = small_gicp.KdTree(points, threads)
+        self._planes = _planes(points, normals)
+        self._tree = PointTree(points, threads)
 
-    def nearest(self, queries: Array, threads: int) -> tuple[Array, Array]:
+    def grown(self, points: Array, normals: Array, threads: int = 2) -> Surface:
+        """This one and more points after its own, for less than making it of all; it stays as it is."""
+        other = object.__new__(Surface)
+        other.points = np.concatenate([self.points, points])
+        other._planes = np.concatenate([self._planes, _planes(points, normals)])
+        other._tree = self._tree.grown(other.points, threads)
+        return other
+
+    @property
+    def normals(self) -> Array:
+        """``(M, 3)`` unit vectors."""
+        return self._planes[:, :3]
+
+    @property
+    def fresh_share(self) -> float:
+        """How many points came by :meth:`grown`, for each that was there before: with many, searches take longer."""
+        return self._tree.fresh_share
+
+    def nearest(self, queries: Array, threads: int) -> tuple[NDArray[np.int64], Array]:
         """Index ``(N,)`` and squared distance ``(N,)`` of each query's nearest point."""
-        index, distance2 = self._tree.batch_knn_search(queries, 1, _worth(threads, queries))
-        return index[:, 0].astype(np.int64), distance2[:, 0]
+        return self._tree.nearest(queries, threads)
 
     def two_nearest(self, queries: Array, threads: int) -> tuple[NDArray[np.int64], Array]:
         """Index ``(N,)`` of each query's nearest point, and how far the query may move so that it surely stays that.
 
         The way is half of what the second nearest is farther away; infinite of a surface of one point.
         """
-        index, distance2 = self._tree.batch_knn_search(queries, min(2, len(self.points)), _worth(threads, queries))
-        distance = np.sqrt(distance2)
-        free = np.full(len(queries), np.inf) if len(self.points) < 2 else (distance[:, 1] - distance[:, 0]) / 2
-        return index[:, 0].astype(np.int64), free
+        index, first2, second2 = self._tree.two_nearest(queries, threads)
+        return index, (np.sqrt(second2) - np.sqrt(first2)) / 2
 
     def planes(self, index: NDArray[np.int64]) -> Array:
         """``(N, 4)`` of the points: normal n, and n·v."""
         return self._planes.take(index, axis=0)  # much quicker than brackets
 
 
-def _worth(threads: int, queries: Array) -> int:
-    """So many threads as gain more than waiting for each other costs, which on a busy machine is milliseconds."""
-    return max(1, min(threads, len(queries) // _QUERIES_A_THREAD))
+def _planes(points: Array, normals: Array) -> Array:
+    return np.column_stack([normals, np.einsum("ij,ij->i", normals, points)])
 
 
 class Neighbours:

@@ -180,12 +180,16 @@ def _labels(keys: NDArray[np.int32] | NDArray[np.int64], cells: int) -> tuple[ND
     occupied[keys] = True
     present = np.flatnonzero(occupied)
     number = np.empty(cells, np.int32)  # written and read at occupied cells only
-    number[present] = np.arange(len(present))
-    return number[keys].astype(np.intp), len(present)
+    number[present] = np.arange(len(present), dtype=np.int32)
+    return number.take(keys).astype(np.intp), len(present)
 
 
 def _sums(values: Floats, labels: NDArray[np.intp], count: int) -> NDArray[np.float64]:
-    return np.stack([np.bincount(labels, weights=column, minlength=count) for column in values.T], axis=1)
+    """By a sparse matrix of ones, which takes half as long as a bincount for each column and adds in the same order."""
+    from scipy.sparse import csc_array  # late: it takes a while to load
+
+    ones = csc_array((np.ones(len(values)), labels, np.arange(len(values) + 1)), shape=(count, len(values)))
+    return np.asarray(ones @ values.astype(np.float64))
 
 
 def _unit(vectors: NDArray[np.float32] | NDArray[np.float64]) -> Floats:
