@@ -1,7 +1,8 @@
 """The nearest of points that keep coming: a tree over most of them, and a small one over those that came since.
 
 Making a tree of all points anew takes as long as looking for the neighbours of several scans. A few per cent of them
-make one in a twentieth of the time; a search then goes through both trees, and finds what one of all would.
+make one in a twentieth of the time; a search then goes through both trees, and finds what one of all would. Most
+queries have none of the new points around and need not look there.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ Index = NDArray[np.int64]
 
 _QUERIES_A_THREAD = 2000  # half a millisecond
 _POINTS_A_THREAD = 10_000
+_SIDE_M = 1.0  # more than most neighbours are away
+_TABLE_CELLS = 1 << 23
 
 
 class PointTree:
@@ -29,7 +32,7 @@ class PointTree:
     def __init__(self, points: Array, threads: int) -> None:
         self._old = _tree(points, threads)
         self._settled, self._fresh = len(points), 0
-        self._new: small_gicp.KdTree | None = None
+        self._new: tuple[small_gicp.KdTree, _Surroundings] | None = None
 
     def __len__(self) -> int:
         return self._settled + self._fresh
@@ -42,49 +45,76 @@ class PointTree:
     def grown(self, points: Array, threads: int) -> PointTree:
         """Of all ``points`` ``(N, 3)``, which begin with those of this one; it stays as it is, they share a tree."""
         other = object.__new__(PointTree)
-        other._old, other._settled, other._fresh = self._old, self._settled, len(points) - self._settled
-        other._new = _tree(points[self._settled :], threads) if other._fresh else None
+        fresh = points[self._settled :]
+        other._old, other._settled, other._fresh = self._old, self._settled, len(fresh)
+        other._new = (_tree(fresh, threads), _Surroundings(fresh)) if len(fresh) else None
         return other
 
     def nearest(self, queries: Array, threads: int) -> tuple[Index, Array]:
         """Index ``(N,)`` and squared distance ``(N,)`` of each query's nearest point."""
-        index, distance2 = _search(self._old, queries, 1, threads)
-        if self._new is None:
-            return index[:, 0], distance2[:, 0]
-        among, there2 = _search(self._new, queries, 1, threads)
-        closer = there2[:, 0] < distance2[:, 0]
-        return (
-            np.where(closer, among[:, 0] + self._settled, index[:, 0]),
-            np.where(closer, there2[:, 0], distance2[:, 0]),
-        )
+        index, nearest2, _ = self._search(queries, 1, threads)
+        return index, nearest2
 
     def two_nearest(self, queries: Array, threads: int) -> tuple[Index, Array, Array]:
-        """Index ``(N,)`` and squared distances ``(N,)`` of the nearest and the second; infinite without one."""
-        index, (first2, second2) = _two(self._old, self._settled, queries, threads)
+        """Index ``(N,)`` of the nearest, its squared distance ``(N,)``, and up to which ``(N,)`` there is no other.
+
+        That is the second nearest's; where it is farther away than a metre it may be less, but not less than that.
+        """
+        return self._search(queries, 2, threads)
+
+    def _search(self, queries: Array, count: int, threads: int) -> tuple[Index, Array, Array]:
+        index, nearest2, second2 = _search(self._old, self._settled, queries, count, threads)
         if self._new is None:
-            return index, first2, second2
-        among, (fresh2, next2) = _two(self._new, self._fresh, queries, threads)
-        closer = np.flatnonzero(fresh2 < first2)
-        second2 = np.minimum(second2, fresh2)
-        second2[closer] = np.minimum(first2[closer], next2[closer])
-        index[closer] = among[closer] + self._settled
-        first2[closer] = fresh2[closer]
-        return index, first2, second2
+            return index, nearest2, second2
+        tree, surroundings = self._new
+        asked = surroundings.may_matter(queries, nearest2)
+        among, fresh2, next2 = _search(tree, self._fresh, queries.take(asked, axis=0), count, threads)
+        old2, later2 = nearest2[asked], second2[asked]
+        closer = fresh2 < old2
+        index[asked] = np.where(closer, among + self._settled, index[asked])
+        nearest2[asked] = np.minimum(old2, fresh2)
+        second2 = np.minimum(second2, surroundings.side_m**2)  # nobody looked whether a new point lies beyond that
+        second2[asked] = np.where(closer, np.minimum(old2, next2), np.minimum(later2, fresh2))
+        return index, nearest2, second2
+
+
+class _Surroundings:
+    """The cubes in which there are points ``(M, 3)``, and those beside them."""
+
+    def __init__(self, points: Array) -> None:
+        self.side_m = _SIDE_M
+        while np.prod(np.ptp(points, axis=0) / self.side_m + 6) > _TABLE_CELLS:
+            self.side_m *= 2
+        self._low = points.min(axis=0) - 2 * self.side_m
+        self._most = np.floor(np.ptp(points, axis=0) / self.side_m) + 4  # the outermost cubes stay empty
+        nx, ny, nz = (int(n) + 1 for n in self._most)
+        self._steps = (ny * nz, nz)
+        self._table = np.zeros(nx * ny * nz, bool)
+        occupied = np.unique(self._cubes(points))
+        for x in (-ny * nz, 0, ny * nz):
+            for y in (-nz, 0, nz):
+                for z in (-1, 0, 1):
+                    self._table[occupied + (x + y + z)] = True
+
+    def may_matter(self, queries: Array, nearest2: Array) -> Index:
+        """Which queries may have a point nearer than what they have; the others' are all a side away and more."""
+        return np.flatnonzero(self._table.take(self._cubes(queries)) | (nearest2 > self.side_m**2))
+
+    def _cubes(self, points: Array) -> Index:
+        x, y, z = np.clip((points - self._low) / self.side_m, 0, self._most).astype(np.int64).T
+        return np.asarray(x * self._steps[0] + y * self._steps[1] + z)
 
 
 def _tree(points: Array, threads: int) -> small_gicp.KdTree:
     return small_gicp.KdTree(points, max(1, min(threads, len(points) // _POINTS_A_THREAD)))
 
 
-def _search(tree: small_gicp.KdTree, queries: Array, count: int, threads: int) -> tuple[Index, Array]:
-    """With so many threads as gain more than waiting for each other costs, which on a busy machine is milliseconds."""
+def _search(tree: small_gicp.KdTree, size: int, queries: Array, count: int, threads: int) -> tuple[Index, Array, Array]:
+    """Index and squared distance of the nearest of ``size``, and of the second; infinite where that is not asked for.
+
+    With so many threads as gain more than waiting for each other costs, which on a busy machine is milliseconds.
+    """
     worth = max(1, min(threads, len(queries) // _QUERIES_A_THREAD))
-    index, distance2 = tree.batch_knn_search(queries, count, worth)
-    return index.view(np.int64), distance2
-
-
-def _two(tree: small_gicp.KdTree, size: int, queries: Array, threads: int) -> tuple[Index, tuple[Array, Array]]:
-    index, distance2 = _search(tree, queries, min(2, size), threads)
-    first2 = np.ascontiguousarray(distance2[:, 0])
-    second2 = np.full(len(queries), np.inf) if size < 2 else np.ascontiguousarray(distance2[:, 1])
-    return np.ascontiguousarray(index[:, 0]), (first2, second2)
+    index, distance2 = tree.batch_knn_search(queries, min(count, size), worth)
+    second2 = distance2[:, 1].copy() if distance2.shape[1] > 1 else np.full(len(queries), np.inf)
+    return index[:, 0].astype(np.int64), distance2[:, 0].copy(), second2
