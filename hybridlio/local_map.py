@@ -11,8 +11,9 @@ from hybridlio.estimates import Array
 from hybridlio.map_cells import MapCells
 from hybridlio.surface import Surface
 
-_FRESH_SHARE = 0.15
-_FAR_SHARE = 0.15  # of the radius
+_FRESH_SHARE = 0.12
+_FAR_SHARE = 0.12  # of the radius
+_WORN_OUT = 2.0  # times that, where no scan came without a keyframe
 
 
 @dataclass(frozen=True)
@@ -60,27 +61,34 @@ class LocalMap:
         return bool(np.linalg.norm(step[:3, 3]) > self._settings.keyframe_m or angle_deg > self._settings.keyframe_deg)
 
     def insert(self, points: Array, T_map_lidar: Array) -> None:
-        """Take a scan's points ``(N, 3)``, lidar frame, as a keyframe at this pose and renew the surface."""
+        """Take a scan's points ``(N, 3)``, lidar frame, as a keyframe at this pose into the surface."""
         new = self._cells.insert(points, T_map_lidar, self.surface)
         self._keyframe = T_map_lidar
         self.keyframes += 1
         if self.surface is not None:
             self.surface = self.surface.grown(*new, self._settings.threads)
-        if self.surface is None or self._is_worn(self.surface):
-            self.surface = self._anew(T_map_lidar[:3, 3])
+        if self._wear() > _WORN_OUT:
+            self._renew()
 
-    def _is_worn(self, surface: Surface) -> bool:
-        """Whether much has come since the surface was made of all points, or the keyframe is far from where it was."""
+    def tidy(self) -> None:
+        """Make the surface anew where that is due: at a scan that brings no keyframe, which takes long enough."""
+        if self.keyframes and self._wear() > 1:
+            self._renew()
+
+    def _wear(self) -> float:
+        """How much has come since the surface was made of all points, or how far the keyframe is from there; of 1."""
+        if self.surface is None or self._keyframe is None:
+            return np.inf
+        way_m = float(np.linalg.norm(self._keyframe[:3, 3] - self._middle))
+        return max(self.surface.fresh_share / _FRESH_SHARE, way_m / (_FAR_SHARE * self._settings.radius_m))
+
+    def _renew(self) -> None:
+        """Make the surface of what is remembered within the radius; of nothing there is none."""
         assert self._keyframe is not None
-        way_m = np.linalg.norm(self._keyframe[:3, 3] - self._middle)
-        return surface.fresh_share > _FRESH_SHARE or bool(way_m > _FAR_SHARE * self._settings.radius_m)
-
-    def _anew(self, middle: Array) -> Surface | None:
-        """Of what is remembered within the radius; None of nothing."""
+        self._middle = self._keyframe[:3, 3]
         points, normals = self._cells.remembered()
-        away = points - middle
+        away = points - self._middle
         near = np.flatnonzero(np.einsum("ij,ij->i", away, away) < self._settings.radius_m**2)
-        self._middle = middle
-        if not len(near):
-            return None
-        return Surface(points.take(near, axis=0), normals.take(near, axis=0), self._settings.threads)
+        self.surface = None
+        if len(near):
+            self.surface = Surface(points.take(near, axis=0), normals.take(near, axis=0), self._settings.threads)

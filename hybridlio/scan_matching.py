@@ -221,6 +221,7 @@ class ScanMatching:
     def _take_in_keyframe(self) -> None:
         """Put a keyframe that was not taken back into the map."""
         if self._waiting is None:
+            self._map.tidy()
             return
         if self._settings.target == "last-scan" or self._adrift:
             self._map = LocalMap(self._settings.local_map)

@@ -165,3 +165,27 @@ def test_one_beams_points_make_no_plane(beams_deg: tuple[float, ...], planes: bo
     assert (local_map.surface is not None) == planes
     if local_map.surface is not None:
         assert (np.abs(local_map.surface.normals[:, 0]) > 0.999).mean() > 0.9
+
+
+def test_tidying_changes_how_the_surface_is_kept_and_not_what_it_is(rng: np.random.Generator):
+    """Left alone, keyframes wear it out until one makes it of all points; tidied after each, none of them has to."""
+    left, tidied, worn = LocalMap(SETTINGS), LocalMap(SETTINGS), []
+    for x in range(0, 24, 2):
+        points = floor(rng)
+        for local_map in (left, tidied):
+            local_map.insert(points, at(float(x)))
+        tidied.tidy()
+        assert left.surface is not None
+        assert tidied.surface is not None
+        rows = [surface.points[np.lexsort(surface.points.T)] for surface in (left.surface, tidied.surface)]
+        np.testing.assert_array_equal(*rows)
+        worn.append(left.surface.fresh_share)
+        assert tidied.surface.fresh_share < 0.13
+    assert (np.diff(worn) < 0).any()
+    assert max(worn) < 0.3
+
+
+def test_tidying_an_empty_map_does_nothing():
+    local_map = LocalMap(SETTINGS)
+    local_map.tidy()
+    assert local_map.surface is None
