@@ -74,6 +74,7 @@ class RelativePose:
         drift: ``(6, 6)``, what of the covariance adds up over consecutive steps; the rest is scatter about a map that
             the next step takes back. None where the steps' errors are independent, so that all of it adds up.
         from_imu: whether the pose is the inertial data's; a graph that has the IMU itself must not count it twice.
+        proposed: ``(4, 4)``, of an initial pose: where else a residual source may start, if it finds that to be better.
         keyframes: the same scan k+1 relative to earlier scans than k, from a source that looks at several.
         details: the source's own diagnostics by name (inliers, iterations, error …).
     """
@@ -85,12 +86,15 @@ class RelativePose:
     ok: bool = True
     from_imu: bool = False
     drift: Array | None = None
+    proposed: Array | None = None
     keyframes: tuple[KeyframePose, ...] = ()
     details: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "pose", se3.check_pose(self.pose, f"{self.source}: relative pose"))
         object.__setattr__(self, "covariance", check_covariance(self.covariance, f"{self.source}: relative pose"))
+        if self.proposed is not None:
+            object.__setattr__(self, "proposed", se3.check_pose(self.proposed, f"{self.source}: proposed pose"))
         if self.drift is not None:
             object.__setattr__(self, "drift", check_covariance(self.drift, f"{self.source}: drift"))
             if self.ok:  # else the pose bridges, and its covariance is no part of the path's

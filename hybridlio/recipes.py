@@ -90,11 +90,6 @@ def preparation_for(recipe: Recipe) -> PreparationOptions:
     return PreparationOptions(geometry=recipe.network.geometry, remove_ground=not recipe.loss.keep_ground)
 
 
-def judging_for(recipe: Recipe) -> PreparationOptions:
-    """As :func:`preparation_for` where the loss only judges poses: planes of coarser places, in half of the time."""
-    return replace(preparation_for(recipe), normal_thin_m=0.4, loss_voxel_m=0.5)
-
-
 def lasting(recipe: Recipe, steps: int, pairs: int) -> Recipe:
     """The recipe with as many epochs as so many steps over so many pairs begin."""
     epochs = math.ceil(steps / math.ceil(pairs / recipe.optimiser.batch))

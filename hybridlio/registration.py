@@ -155,7 +155,7 @@ class _Descent:
     def outcome(self, points: int) -> Registration:
         """Where it ended, of so many points."""
         system, matches, settings = self._system, self._matches, self._settings
-        cost = _cost(system.distances, points, settings.kernel_m)
+        cost = robust_cost(system.distances, points, settings.kernel_m)
         weight = max(float(system.weights.sum()), 1e-12)
         sigma_m = float(np.sqrt((system.weights @ system.distances**2) / weight))
         pose, matched = se3.orthonormalise(self.pose), len(matches) / max(points, 1)
@@ -189,9 +189,10 @@ def fit_at(
     Neighbours farther than ``reach_m``, by default three times the kernel, do not count.
     """
     matches = Neighbours(surface, source, threads).matches(pose, 3 * kernel_m if reach_m is None else reach_m)
-    return Fit(_cost(matches.rows[6], len(source), kernel_m), len(matches) / max(len(source), 1))
+    return Fit(robust_cost(matches.rows[6], len(source), kernel_m), len(matches) / max(len(source), 1))
 
 
-def _cost(distances: Array, points: int, kernel_m: float) -> float:
+def robust_cost(distances: Array, points: int, kernel_m: float) -> float:
+    """Mean Geman-McClure cost, between 0 and 1, of so many points, of which those without a distance cost 1."""
     r2 = distances**2
     return float((r2 / (kernel_m**2 + r2)).sum() + points - len(r2)) / max(points, 1)

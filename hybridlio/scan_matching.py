@@ -16,7 +16,7 @@ from hybridlio.local_map import LocalMap, LocalMapSettings
 from hybridlio.observability import Observed, observe
 from hybridlio.registration import Registration, RegistrationSettings
 from hybridlio.sensors import NS_PER_S, Frame, Scan
-from hybridlio.start_search import COARSE_KERNEL_M, best_start, motions
+from hybridlio.start_search import COARSE_KERNEL_M, best_start, lies_better, motions
 from hybridlio.surface import Surface
 from hybridlio.voxel import voxel_average
 
@@ -245,7 +245,19 @@ class ScanMatching:
             rates_deg_s = self._settings.start_rates_deg_s if turns else (0.0,)
             starts = [start @ step for step in motions(self._settings.start_speeds_m_s, rates_deg_s, dt_s)]
             start = best_start(surface, seen.source, seen.points, starts, settings)
-        return observe(surface, seen.source, start, settings, kernel_start_m, far=_is_vague(initial))
+        return self._from_the_better(seen.source, start, initial, kernel_start_m)
+
+    def _from_the_better(self, source: Array, start: Array, initial: RelativePose, kernel_start_m: float) -> Observed:
+        """Register from ``start``, or from what was proposed, where the points lie better on the map there."""
+        surface, settings, far = self._map.surface, self._settings.registration, _is_vague(initial)
+        assert surface is not None
+        if initial.proposed is not None:
+            proposed = self._path.T_map_lidar @ initial.proposed
+            if lies_better(surface, source, proposed, start, kernel_start_m, settings.threads):
+                observed = observe(surface, source, proposed, settings, kernel_start_m, far)
+                if not observed.basis.shape[1]:  # the initial pose knows more of what the points hardly see
+                    return observed
+        return observe(surface, source, start, settings, kernel_start_m, far)
 
     def _bridge(self, initial: RelativePose, points: int, observed: Observed | None) -> RelativePose:
         self._before, self._path = self._path, self._path.carried_on(initial)

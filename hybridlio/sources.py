@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # the command line lists the names, and must start quickly
     from hybridlio.config import Config
     from hybridlio.estimates import Backend, InitialPoseSource, ResidualSource
     from hybridlio.graph.inertial_steps import InertialSteps
+    from hybridlio.learned.network_residual import NetworkResidual
     from hybridlio.recent_scans import PairSource
     from hybridlio.sensors import Calibration, ImuNoise
 
@@ -75,12 +76,12 @@ def _scan_matching(setup: Setup) -> ResidualSource:
     return _with_recent_scans(ScanMatching(settings), setup)
 
 
-def _network_alone(setup: Setup) -> PairSource:
+def _network_alone(setup: Setup) -> NetworkResidual:
     from hybridlio.learned.network_residual import NetworkResidual
     from hybridlio.preparation import prepare
-    from hybridlio.recipes import judging_for
+    from hybridlio.recipes import preparation_for
 
-    return NetworkResidual(lambda recipe: partial(prepare, options=judging_for(recipe)), setup.config.network)
+    return NetworkResidual(lambda recipe: partial(prepare, options=preparation_for(recipe)), setup.config.network)
 
 
 def _network(setup: Setup) -> ResidualSource:

@@ -50,6 +50,12 @@ def best_start(
     return tries[_best(fits)[0]]
 
 
+def lies_better(surface: Surface, source: Array, one: Array, other: Array, kernel_m: float, threads: int) -> bool:
+    """Whether ``source`` ``(M, 3)`` lies better on the surface at one pose ``(4, 4)`` than at the other."""
+    here, there = (fit_at(surface, source[::_SPARSE], T, kernel_m, threads).cost for T in (one, other))
+    return here < there
+
+
 def _best(fits: Sequence[Fit]) -> list[int]:
     """Their numbers, the best first; those of much fewer points are left out."""
     most = max(fit.matched for fit in fits)

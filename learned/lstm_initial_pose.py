@@ -12,7 +12,7 @@ from hybridlio import se3
 from hybridlio.errors import ConfigError
 from hybridlio.estimates import RelativePose, State
 from hybridlio.initial_pose import unknown_motion_covariance
-from hybridlio.learned.devices import pick_device
+from hybridlio.learned.devices import at_run_time, pick_device
 from hybridlio.learned.imu_rows import imu_rows
 from hybridlio.learned.settings import NetworkSettings
 from hybridlio.learned.source_settings import LstmSettings
@@ -97,7 +97,7 @@ class LstmInitialPose:
 
     def _part(self, samples: ImuSamples, frame: Frame, step: tuple[Array, float] | None, dt_s: float) -> Array:
         rows, velocity = inertial(samples, frame, self._settings, step)
-        with torch.no_grad():
+        with at_run_time():
             imu, v = (torch.from_numpy(x)[None].to(self._device) for x in (rows, velocity))
             pose = self._network(imu, v, torch.tensor([_STEP_S], device=self._device))[0].double().cpu().numpy()
         # the motion of a tenth of a second, for as long as the step took

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -13,14 +14,12 @@ from numpy.typing import NDArray
 from hybridlio import se3
 from hybridlio.errors import ConfigError, DataError
 from hybridlio.estimates import RelativePose
-from hybridlio.learned import maps
-from hybridlio.learned.correspondences import Clouds
-from hybridlio.learned.devices import pick_device
-from hybridlio.learned.loss_judge import CHI2_99, Judged, LossJudge, on_device
+from hybridlio.learned.devices import at_run_time, on_device, pick_device
+from hybridlio.learned.loss_judge import CHI2_99, Judged, JudgedScan, LossJudge
 from hybridlio.learned.lstm_initial_pose import inertial
+from hybridlio.learned.maps import valid_cells
 from hybridlio.learned.odometry_network import NetworkInput, SeenScan
-from hybridlio.learned.pairs import padded
-from hybridlio.learned.preparing import Prepared
+from hybridlio.learned.preparing import Mapped
 from hybridlio.learned.settings import Recipe
 from hybridlio.learned.source_settings import NetworkResidualSettings
 from hybridlio.learned.weights import load_weights, weights_path
@@ -30,7 +29,7 @@ from hybridlio.sensors import NS_PER_S, Frame, Scan
 _log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
-Prepare = Callable[[Scan], Prepared]
+Prepare = Callable[[Scan], Mapped]
 
 _UNSURE_TRANSLATION_M = 0.5
 _RISE = 1.01  # the loss has changed by less when only which points match has
@@ -38,12 +37,18 @@ _RISE = 1.01  # the loss has changed by less when only which points match has
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """A scan as the network and the loss take it."""
+    """A scan as the network takes it, and, once asked for, as the loss does."""
 
     stamp_ns: int
     maps: SeenScan
     cells: int
-    cloud: Clouds
+    enough: bool
+    threads: int
+
+    @cached_property
+    def judged(self) -> JudgedScan:
+        vertices, normals = (part[0].cpu().numpy() for part in (self.maps.vertices, self.maps.normals))
+        return JudgedScan.of_maps(vertices, normals, self.threads)
 
 
 class NetworkResidual:
@@ -73,7 +78,8 @@ class NetworkResidual:
         weights = load_weights(weights_path(self._settings.weights))
         self._network = weights.network(self._device)
         self._prepare = prepare_for(weights.recipe)
-        self._judge = LossJudge(self._settings, self.geometry, self._device)
+        self._threads = torch.get_num_threads()
+        self._before: _Seen | None = None  # the scan before the last one
         self._last: _Seen | None = None
         self._step: tuple[Array, float] | None = None
 
@@ -89,8 +95,8 @@ class NetworkResidual:
             DataError: too few of its cells have a normal.
         """
         self._step = None
-        self._last = self._look(frame.scan)
-        if self._last.cells < self._settings.min_cells:
+        self._before, self._last = None, self._look(frame.scan)
+        if not self._last.enough:
             raise DataError(
                 f"frame {frame.index}: only {self._last.cells} cells of the network's maps "
                 f"({self.geometry.rows} x {self.geometry.columns}) have a normal, {self._settings.min_cells} are "
@@ -99,17 +105,30 @@ class NetworkResidual:
 
     def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:
         """The network's ``T = δT·T̂``; the initial pose, marked as not ok, where that fails."""
-        last, current = self._last, self._look(frame.scan)
-        if last is None:
-            raise DataError(f"frame {frame.index}: no scan before it; call start with the first frame")
-        self._last = current
+        self._take(frame)
+        return self.judge(frame, initial)
+
+    def propose(self, frame: Frame, initial: RelativePose) -> Array | None:
+        """The network's ``T`` ``(4, 4)``, which nothing has judged yet; None with too little to see."""
+        last, current = self._take(frame)
+        if not (last.enough and current.enough):
+            return None
+        dt_s = (current.stamp_ns - last.stamp_ns) / NS_PER_S
+        pose = self._ask(self._given(last, current, frame, dt_s), initial.pose, last, current)
+        self._step = (pose, dt_s)
+        return pose
+
+    def judge(self, frame: Frame, initial: RelativePose) -> RelativePose:
+        """What :meth:`refine` says of the frame that was last given to :meth:`propose`."""
+        last, current = self._before, self._last
+        assert last is not None
+        assert current is not None
         dt_s = (current.stamp_ns - last.stamp_ns) / NS_PER_S
         details = {"cells": float(current.cells), "last_cells": float(last.cells)}
-        if min(last.cells, current.cells) < self._settings.min_cells or not len(current.cloud.points[0]):
+        if not (last.enough and current.enough):
             why = f"{min(last.cells, current.cells)} cells with a normal, {self._settings.min_cells} are needed"
             return self._bridge(frame, initial, details, dt_s, why)
-        given = self._given(last, current, frame, dt_s)
-        before, after = self._estimate(given, initial, dt_s, last, current)
+        before, after = self._estimate(self._given(last, current, frame, dt_s), initial, dt_s, last, current)
         details |= {"cost": after.cost, "initial_cost": before.cost, "matched": after.matched}
         if after.matched < self._settings.min_matched:
             return self._bridge(frame, initial, details, dt_s, f"only {after.matched:.0%} of the points have a match")
@@ -126,7 +145,7 @@ class NetworkResidual:
 
     def pair(self, earlier: _Seen, current: _Seen, initial: RelativePose) -> RelativePose:
         """A scan relative to any earlier one, ``T_j_k``, by the points alone; ``initial``, not ok, where that fails."""
-        if min(earlier.cells, current.cells) < self._settings.min_cells or not len(current.cloud.points[0]):
+        if not (earlier.enough and current.enough):
             return replace(initial, ok=False)
         dt_s, settings = (current.stamp_ns - earlier.stamp_ns) / NS_PER_S, self._network.settings
         none, still = (torch.zeros(shape, device=self._device) for shape in ((1, settings.imu_samples, 6), (1, 3)))
@@ -142,19 +161,23 @@ class NetworkResidual:
         if self._step is not None:
             self._step = (initial.pose, self._step[1])
 
+    def _take(self, frame: Frame) -> tuple[_Seen, _Seen]:
+        """The last scan and the frame's, which is the last one from now on."""
+        last, current = self._last, self._look(frame.scan)
+        if last is None:
+            raise DataError(f"frame {frame.index}: no scan before it; call start with the first frame")
+        self._before, self._last = last, current
+        return last, current
+
     def _look(self, scan: Scan) -> _Seen:
         prepared = self._prepare(scan)
-        vertices, cloud = prepared.vertex_map, prepared.loss_cloud
-        cells = (self.geometry.rows, self.geometry.columns)
+        vertices, cells = prepared.vertex_map, (self.geometry.rows, self.geometry.columns)
         if vertices.shape[1:] != cells:
             raise ConfigError(f"the network takes maps of {cells} cells, scans are prepared with {vertices.shape[1:]}")
-        normals = cloud.normals if cloud.normals is not None else np.zeros_like(cloud.points)
-        both = padded([(cloud.points, normals)])
-        clouds = Clouds(*(part.to(self._device) for part in (both.points, both.normals, both.there)))
-        with torch.no_grad():
+        with at_run_time():
             seen = self._network.look(on_device(vertices, self._device))
-        there = int(maps.valid_cells(seen.normals).sum()) if prepared.usable else 0
-        return _Seen(scan.stamp_ns, seen, there, clouds)
+            there = int(valid_cells(seen.normals).sum()) if prepared.usable else 0
+        return _Seen(scan.stamp_ns, seen, there, there >= self._settings.min_cells, self._threads)
 
     def _given(self, last: _Seen, current: _Seen, frame: Frame, dt_s: float) -> NetworkInput:
         imu, velocity = inertial(frame.imu, frame, self._network.settings, self._step)
@@ -171,18 +194,20 @@ class NetworkResidual:
         self, given: NetworkInput, initial: RelativePose, dt_s: float, last: _Seen, current: _Seen
     ) -> tuple[Judged, Judged]:
         """The pose that the network starts from and its answer, both judged."""
-        clouds = last.cloud, current.cloud
-        before = min((self._judge.judge(T, *clouds) for T in self._starts(initial, dt_s)), key=lambda j: j.cost)
-        with torch.no_grad():
-            features = self._network.imu_features(given)
-            start = on_device(before.pose, self._device)
-            found = self._network.refine_seen(last.maps, current.maps, start, features).pose[0]
-        answer = self._judge.judge(se3.orthonormalise(found.double().cpu().numpy()), *clouds)
+        judge = LossJudge(last.judged, current.judged, self._settings, self._threads)
+        before = min((judge.judge(T) for T in self._starts(initial, dt_s)), key=lambda j: j.cost)
+        answer = judge.judge(self._ask(given, before.pose, last, current))
         if len(answer.degenerate):  # where the scans say nothing, the initial pose knows better than the network
             way = answer.constrained(se3.log(se3.between(before.pose, answer.pose)))
-            answer = self._judge.judge(se3.orthonormalise(before.pose @ se3.exp(way)), *clouds)
-        steps, scale = self._settings.refine_steps, self._settings.covariance_scale
-        return before, self._judge.descend(answer, *clouds, steps, scale)
+            answer = judge.judge(se3.orthonormalise(before.pose @ se3.exp(way)))
+        return before, judge.descend(answer)
+
+    def _ask(self, given: NetworkInput, start: Array, last: _Seen, current: _Seen) -> Array:
+        """Where the network gets to from a pose ``(4, 4)``."""
+        with at_run_time():
+            features = self._network.imu_features(given)
+            found = self._network.refine_seen(last.maps, current.maps, on_device(start, self._device), features)
+            return se3.orthonormalise(found.pose[0].double().cpu().numpy())
 
     def _starts(self, initial: RelativePose, dt_s: float) -> list[Array]:
         """The initial pose, or that and others ahead of it where it is unsure of the translation."""

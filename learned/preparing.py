@@ -35,8 +35,8 @@ class AveragedCloud(Protocol):
         ...
 
 
-class Prepared(Protocol):
-    """What is taken of a prepared scan."""
+class Mapped(Protocol):
+    """What is taken of a prepared scan at run time."""
 
     @property
     def vertex_map(self) -> NDArray[np.float32]:
@@ -44,13 +44,17 @@ class Prepared(Protocol):
         ...
 
     @property
-    def loss_cloud(self) -> AveragedCloud:
-        """For the loss."""
-        ...
-
-    @property
     def usable(self) -> bool:
         """Whether there are points enough."""
+        ...
+
+
+class Prepared(Mapped, Protocol):
+    """What is taken of a prepared scan to train by."""
+
+    @property
+    def loss_cloud(self) -> AveragedCloud:
+        """For the loss."""
         ...
 
 

@@ -47,7 +47,7 @@ class NetworkResidualSettings:
     device: str = "auto"
     min_cells: int = 500
     min_matched: float = 0.3
-    covariance_scale: float = 3.0
+    covariance_scale: float = 2.0
     refine_steps: int = 2
     kernel_m: float = 0.1
     max_distance_m: float = 1.0

@@ -196,6 +196,28 @@ def test_in_a_corridor_it_says_that_it_does_not_know_how_far_it_went(rng: np.ran
     np.testing.assert_allclose(found.pose[1:3, 3], 0.0, atol=0.01)
 
 
+def test_along_a_corridor_a_proposal_counts_for_nothing(rng: np.random.Generator, frames: list[Frame]):
+    matching = ScanMatching()
+    matching.start(with_points(frames[0], corridor(rng)))
+    initial = guess(se3.exp(np.array([0.0, 0.0, 0.004, 0.8, 0.05, -0.03])))
+    proposed = replace(initial, proposed=se3.exp(np.array([0, 0, 0, 0.3, 0, 0])))  # half a metre back, straight
+    found = matching.refine(with_points(frames[1], corridor(rng)), proposed)
+    assert found.pose[0, 3] == pytest.approx(0.8, abs=0.05)
+    np.testing.assert_allclose(found.pose[1:3, 3], 0.0, atol=0.01)
+
+
+def test_a_good_proposal_saves_steps_and_a_bad_one_changes_nothing(sequence: Sequence, frames: list[Frame]):
+    truth, answers = true_pose(sequence, 0, 1), {}
+    for name, proposed in {"none": None, "good": truth, "bad": truth @ OFF @ OFF @ OFF}.items():
+        matching = ScanMatching()
+        matching.start(frames[0])
+        answers[name] = matching.refine(frames[1], replace(guess(truth @ OFF), proposed=proposed))
+    assert answers["good"].details["iterations"] < answers["none"].details["iterations"]
+    np.testing.assert_allclose(answers["good"].pose, answers["none"].pose, atol=2e-3)
+    np.testing.assert_array_equal(answers["bad"].pose, answers["none"].pose)
+    np.testing.assert_array_equal(answers["bad"].covariance, answers["none"].covariance)
+
+
 # --------------------------------------------------------------------------------------------------- bad scans
 
 

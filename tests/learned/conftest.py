@@ -16,6 +16,7 @@ from hybridlio.learned.shards import ScanRecord, Shard, write_shard
 from hybridlio.projection import MapGeometry, vertex_map
 
 GEOMETRY = MapGeometry(20.0, -20.0, 12, 60)
+SEEN_GEOMETRY = MapGeometry(40.0, -40.0, 40, 180)
 NETWORK = NetworkSettings(
     geometry=GEOMETRY,
     siamese="twins",
@@ -48,7 +49,11 @@ def one_thread():
 def seen_room(T_world_lidar: np.ndarray, half: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Points and normals (N, 3) in the lidar frame, on the walls of a box around the world's origin."""
     rays = rng.normal(size=(1500, 3)) * [1.0, 1.0, 0.25]
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return hit_walls(rays / np.linalg.norm(rays, axis=1, keepdims=True), T_world_lidar, half)
+
+
+def hit_walls(rays: np.ndarray, T_world_lidar: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where unit rays (N, 3), lidar frame, meet the walls of the box, and the walls' normals."""
     turned = rays @ T_world_lidar[:3, :3].T
     ranges = (half * np.sign(turned) - T_world_lidar[:3, 3]) / turned
     wall = ranges.argmin(axis=1)
@@ -120,29 +125,32 @@ class SeenScan:
     """A scan that is prepared already."""
 
     points: np.ndarray
-    normals: np.ndarray
     vertex_map: np.ndarray = field(init=False)
     usable: bool = True
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "vertex_map", vertex_map(self.points, GEOMETRY))
-
-    @property
-    def loss_cloud(self) -> SeenScan:
-        return self
+        object.__setattr__(self, "vertex_map", vertex_map(self.points, SEEN_GEOMETRY))
 
 
 @pytest.fixture
 def seen() -> Callable[..., SeenScan]:
-    """What a sensor at a pose sees of a room of half sizes, with a centimetre of noise."""
+    """What a spinning sensor at a pose sees of a room of half sizes, with a centimetre of noise."""
+    elevations, azimuths = np.deg2rad(np.arange(-39, 40, 2)), np.deg2rad(np.arange(1, 360, 2))
+    up, around = (angles.ravel() for angles in np.meshgrid(elevations, azimuths, indexing="ij"))
+    rays = np.column_stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
 
     def see(T_world_lidar: np.ndarray, half: tuple[float, float, float] = (8.0, 6.0, 2.5), seed: int = 0) -> SeenScan:
         rng = np.random.default_rng(seed)
-        points, normals = seen_room(T_world_lidar, np.array(half), rng)
-        noisy = points + normals * rng.normal(size=(len(points), 1)) * 0.01
-        return SeenScan(noisy.astype(np.float32), normals)
+        points, normals = hit_walls(rays, T_world_lidar, np.array(half))
+        return SeenScan((points + normals * rng.normal(size=(len(points), 1)) * 0.01).astype(np.float32))
 
     return see
+
+
+@pytest.fixture
+def seeing_recipe() -> Recipe:
+    """The tiny recipe for maps of the cells that ``seen`` gives."""
+    return replace(RECIPE, network=replace(NETWORK, geometry=SEEN_GEOMETRY))
 
 
 @pytest.fixture

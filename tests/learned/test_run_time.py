@@ -26,11 +26,11 @@ FEW = NetworkResidualSettings(min_cells=200)
 
 
 @pytest.fixture
-def weights(tiny_recipe, tmp_path):
+def weights(seeing_recipe, tmp_path):
     """Weights that know nothing yet: δT is nearly the identity."""
 
     def write(**changes):
-        recipe = replace(tiny_recipe, network=replace(tiny_recipe.network, residual_scale=1e-6, **changes))
+        recipe = replace(seeing_recipe, network=replace(seeing_recipe.network, residual_scale=1e-6, **changes))
         torch.manual_seed(0)
         save_weights(tmp_path / "w.safetensors", OdometryNetwork(recipe.network), recipe, {})
         return tmp_path / "w.safetensors"
@@ -152,7 +152,7 @@ def test_too_little_to_see_is_bridged_and_the_scan_after_it_too(weights, seen):
 
 
 def replace_points(scan, count):
-    return type(scan)(scan.points[:count], scan.normals[:count])
+    return type(scan)(scan.points[:count])
 
 
 def test_a_first_scan_without_much_in_it_is_an_error(weights, seen):
