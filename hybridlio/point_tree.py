@@ -7,11 +7,15 @@ queries have none of the new points around and need not look there.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import small_gicp
 from numpy.typing import NDArray
 
 from hybridlio.estimates import Array
+
+if TYPE_CHECKING:
+    import small_gicp
 
 Index = NDArray[np.int64]
 
@@ -106,6 +110,8 @@ class _Surroundings:
 
 
 def _tree(points: Array, threads: int) -> small_gicp.KdTree:
+    import small_gicp  # what only trains a network does without
+
     return small_gicp.KdTree(points, max(1, min(threads, len(points) // _POINTS_A_THREAD)))
 
 

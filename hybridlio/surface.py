@@ -85,8 +85,6 @@ class Surface:
     """
 
     def __init__(self, points: Array, normals: Array, threads: int = 2) -> None:
-        import small_gicp  # what only trains a network does without
-
         self.points = points
         self._planes = _planes(points, normals)
         self._tree = PointTree(points, threads)
