@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from hybridlio.datasets.csv_rows import read_csv
+from hybridlio.datasets.sequence import Notes
 from hybridlio.errors import DataError
-from hybridlio.geodesy import GeodeticPoint, enu_from_geodetic, origin_of
-from hybridlio.sensors import LIDAR_MODELS, GpsFix, ImuNoise, LidarModel
+from hybridlio.geodesy import GeodeticPoint, check_geodetic, enu_from_geodetic, origin_of
+from hybridlio.sensors import LIDAR_MODELS, NS_PER_S, GpsFix, ImuNoise, LidarModel
 
 _LOCAL, _GEODETIC = ("east", "north", "up"), ("latitude", "longitude", "height")
 _LEAST_SIGMA_M = 1e-3  # an exact fix still needs a covariance that can be inverted
@@ -34,22 +36,20 @@ def read_gps_csv(path: Path) -> tuple[GpsFix, ...]:
     that at the first row. With both, the frame is the file's own, and where it lies on Earth is known.
 
     Raises:
-        DataError: a column is missing or a row is malformed; names file and line.
+        DataError: a column is missing, or a row is malformed or no place on Earth; names file and line.
     """
     if not path.is_file():
         return ()
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = csv.DictReader(file)
-        given = set(rows.fieldnames or ())
-        local, geodetic = given >= set(_LOCAL), given >= set(_GEODETIC)
-        if not given >= {"stamp_ns", "sigma"} or not (local or geodetic):
-            missing = {"stamp_ns", "sigma", *_LOCAL} - given
-            raise DataError(
-                f"{path}: the header lacks {', '.join(sorted(missing))}; expected stamp_ns, sigma and "
-                f"{','.join(_LOCAL)} or {','.join(_GEODETIC)}"
-            )
-        names = ("stamp_ns", "sigma") + (_LOCAL if local else ()) + (_GEODETIC if geodetic else ())
-        read = [_numbers(path, rows.line_num, row, names) for row in rows]
+    header, rows = read_csv(path)
+    local, geodetic = set(header) >= set(_LOCAL), set(header) >= set(_GEODETIC)
+    if not set(header) >= {"stamp_ns", "sigma"} or not (local or geodetic):
+        missing = {"stamp_ns", "sigma", *_LOCAL} - set(header)
+        raise DataError(
+            f"{path}: the header lacks {', '.join(sorted(missing))}; expected stamp_ns, sigma and "
+            f"{','.join(_LOCAL)} or {','.join(_GEODETIC)}"
+        )
+    names = ("stamp_ns", "sigma") + (_LOCAL if local else ()) + (_GEODETIC if geodetic else ())
+    read = [_numbers(path, line, dict(zip(header, row, strict=True)), names) for line, row in rows]
     if not read:
         return ()
     first = GeodeticPoint(*read[0][-3:]) if geodetic else None
@@ -65,7 +65,17 @@ def _numbers(path: Path, line: int, row: dict[str, str], names: tuple[str, ...])
         raise DataError(f"{path}, line {line}: expected numbers in {','.join(names)}") from None
     if not np.isfinite(numbers[1:]).all() or numbers[1] < 0:
         raise DataError(f"{path}, line {line}: position must be finite and sigma not negative")
+    if names[-len(_GEODETIC) :] == _GEODETIC:
+        latitude, longitude, height = numbers[-len(_GEODETIC) :]
+        check_geodetic(latitude, longitude, height, f"{path}, line {line}")
     return numbers
+
+
+def note_fixes(fixes: tuple[GpsFix, ...], scans_ns: NDArray[np.int64], notes: Notes) -> None:
+    """Say if no fix lies within the time of the scans, as with another clock."""
+    if fixes and not any(scans_ns[0] <= fix.stamp_ns <= scans_ns[-1] for fix in fixes):
+        away = (fixes[0].stamp_ns - int(scans_ns[0])) / NS_PER_S
+        notes.add(f"no GPS fix lies within the scans' time: they begin {away:+.1f} s from the first scan")
 
 
 def _fix(numbers: list[float], local: bool, origin: GeodeticPoint | None) -> GpsFix:

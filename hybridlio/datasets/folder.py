@@ -1,12 +1,12 @@
 """A plain folder: scans in natural order with a stamps file, an IMU CSV and a calibration.
 
 recording/
-    scans/*.bin|.npy|.pcd|.ply   (or directly in the folder, or in lidar/, points/, velodyne/, data/)
+    scans/*.bin|.npy|.pcd|.ply   (or in lidar/, points/, velodyne/, data/, or directly in the folder)
     timestamps.txt or times.txt  one stamp a scan: seconds (1.5), whole nanoseconds, or ISO dates
     imu.csv                      optional; see `imu_csv`
     calibration.yaml             T_imu_lidar as four rows of four; needed with imu.csv. Also T_camera_lidar, lidar
     poses_tum.txt                optional reference: lidar poses on the stamps' clock
-    gps.csv                      optional: stamp_ns,east,north,up,sigma
+    gps.csv                      optional; see `extras.read_gps_csv`
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio import se3
-from hybridlio.datasets.extras import read_gps_csv
+from hybridlio.datasets.extras import note_fixes, read_gps_csv
 from hybridlio.datasets.imu_csv import read_imu_csv
 from hybridlio.datasets.point_files import SUFFIXES, read_scan
 from hybridlio.datasets.reference import poses_at
@@ -28,12 +28,14 @@ from hybridlio.datasets.sequence import Notes, Sequence
 from hybridlio.datasets.stamps import MISSING_STAMP, note_coverage, note_gaps, read_stamps, usable_scans
 from hybridlio.datasets.vertical_angle import raised
 from hybridlio.errors import DataError
+from hybridlio.files import read_yaml
 from hybridlio.sensors import LIDAR_MODELS, Calibration, ImuSamples, LidarModel, Scan
 from hybridlio.trajectory_files import read_tum
 
 LAYOUT = "a folder with .bin, .npy, .pcd or .ply scans (there or in scans/) and timestamps.txt"
 
-_SCAN_FOLDERS = (".", "scans", "lidar", "points", "velodyne", "data")
+_SCAN_FOLDERS = ("scans", "lidar", "points", "velodyne", "data", ".")  # a map may lie beside the scans' folder
+_FARTHEST_M = 20.0  # from the IMU to the lidar, on any vehicle
 _STAMP_FILES = ("timestamps.txt", "times.txt")
 _HOW_TO_CALIBRATE = (
     "write T_imu_lidar there, which maps lidar points into the IMU's frame, as in\n"
@@ -74,22 +76,24 @@ def open_folder(folder: Path, raw_root: Path | None = None, vertical_angle_deg: 
     folder = folder.resolve()
     notes = Notes(folder.name)
     stamps, paths = _stamped(folder, _scan_files(folder), notes)
-    calibration, lidar = read_calibration_yaml(folder / "calibration.yaml")
     imu = read_imu_csv(folder / "imu.csv", notes) if (folder / "imu.csv").is_file() else ImuSamples.empty()
-    if len(imu) and calibration is None:
-        raise DataError(f"{folder / 'calibration.yaml'}: missing, and imu.csv needs it: {_HOW_TO_CALIBRATE}")
-    if not len(imu):
+    calibration, lidar = read_calibration_yaml(folder / "calibration.yaml", needs_imu=len(imu) > 0)
+    if len(imu):
+        _note_mounting(imu, calibration.T_imu_lidar, notes)
+    else:
         notes.add(f"no inertial data: {folder / 'imu.csv'} does not exist")
     note_coverage(imu.stamps_ns, stamps, "inertial data", notes)
+    gps = read_gps_csv(folder / "gps.csv")
+    note_fixes(gps, stamps, notes)
     poses = read_tum(folder / "poses_tum.txt") if (folder / "poses_tum.txt").is_file() else None
     return Sequence(
         name=folder.name,
         stamps_ns=stamps,
         load_scan=raised(PointFiles(paths, stamps), vertical_angle_deg),
         imu=imu,
-        calibration=calibration or Calibration(),
+        calibration=calibration,
         reference=poses_at(stamps, poses.stamps_ns, poses.poses, "rows of poses_tum.txt", notes) if poses else None,
-        gps=read_gps_csv(folder / "gps.csv"),
+        gps=gps,
         lidar=lidar,
         notes=tuple(notes.texts),
     )
@@ -133,28 +137,38 @@ def _stamped(folder: Path, paths: tuple[Path, ...], notes: Notes) -> tuple[NDArr
     return stamps[keep], tuple(paths[k] for k in keep)
 
 
-def read_calibration_yaml(path: Path) -> tuple[Calibration | None, LidarModel | None]:
-    """Extrinsics and lidar of a ``calibration.yaml``; None each where the file, or the entry, is missing.
+def _note_mounting(imu: ImuSamples, T_imu_lidar: NDArray[np.float64], notes: Notes) -> None:
+    """Say if the extrinsics and the samples cannot both be right: lengths in another unit, gravity from above."""
+    away_m = float(np.linalg.norm(T_imu_lidar[:3, 3]))
+    if away_m > _FARTHEST_M:
+        notes.add(f"T_imu_lidar: the lidar is {away_m:g} m from the IMU; its last column must be in metres")
+    force = T_imu_lidar[:3, :3].T @ np.median(imu.accel_m_s2, axis=0)
+    if force[2] < -0.5 * np.linalg.norm(force):
+        notes.add(
+            "the specific force points down in the lidar's frame, whose z axis is up; check T_imu_lidar, and that an "
+            "accelerometer at rest reads +9.81 on the axis that points up"
+        )
+
+
+def read_calibration_yaml(path: Path, needs_imu: bool = False) -> tuple[Calibration, LidarModel | None]:
+    """Extrinsics and lidar of a ``calibration.yaml``; the identity and None where the file, or the entry, is missing.
 
     Raises:
-        DataError: not YAML, an unknown key or lidar, or a matrix that is no rigid transform.
+        DataError: not YAML, an unknown key or lidar, or a matrix that is no rigid transform; or no ``T_imu_lidar``
+            although there are inertial data that need it.
     """
-    if not path.is_file():
-        return None, None
-    import yaml
-
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        raise DataError(f"{path}: not YAML ({error})") from None
+    content = read_yaml(path) if path.is_file() else {}
     known = ("T_imu_lidar", "T_camera_lidar", "lidar")
     if not isinstance(content, dict) or set(content) - set(known):
         raise DataError(f"{path}: expected only the keys {', '.join(known)}; {_HOW_TO_CALIBRATE}")
     lidar = content.get("lidar")
-    if lidar is not None and lidar not in LIDAR_MODELS:
+    if lidar is not None and str(lidar) not in LIDAR_MODELS:
         raise DataError(f"{path}: unknown lidar {lidar!r}; known: {', '.join(LIDAR_MODELS)}")
     T_imu_lidar, T_camera_lidar = (_matrix(path, name, content.get(name)) for name in known[:2])
-    calibration = None if T_imu_lidar is None else Calibration(T_imu_lidar, T_camera_lidar)
+    if T_imu_lidar is None and needs_imu:
+        what = "lacks T_imu_lidar" if path.is_file() else "missing"
+        raise DataError(f"{path}: {what}, and imu.csv needs it: {_HOW_TO_CALIBRATE}")
+    calibration = Calibration(np.eye(4) if T_imu_lidar is None else T_imu_lidar, T_camera_lidar)
     return calibration, LIDAR_MODELS[lidar] if lidar else None
 
 
@@ -164,5 +178,7 @@ def _matrix(path: Path, name: str, value: Any) -> NDArray[np.float64] | None:
     try:
         matrix = np.array(value, dtype=np.float64)
     except (ValueError, TypeError):
-        raise DataError(f"{path}: {name} must be four rows of four numbers; {_HOW_TO_CALIBRATE}") from None
+        matrix = np.empty(0)
+    if matrix.shape != (4, 4):
+        raise DataError(f"{path}: {name} must be four rows of four numbers; {_HOW_TO_CALIBRATE}")
     return se3.check_pose(matrix, f"{path}: {name}")

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import csv
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridlio.datasets.csv_rows import read_csv
 from hybridlio.datasets.sequence import Notes
 from hybridlio.datasets.stamps import note_gaps, sorted_unique
 from hybridlio.errors import DataError
 from hybridlio.sensors import NS_PER_S, ImuSamples
 
 _STANDARD_GRAVITY_M_S2 = 9.80665
+_FASTEST_RAD_S = 6.0  # a turn a second: of a vehicle, or of a hand for long, only degrees taken for radians
 _UNITS = {
     "g": {"": 1.0, "_rad_s": 1.0, "_deg_s": np.pi / 180},
     "a": {"": 1.0, "_m_s2": 1.0, "_g": _STANDARD_GRAVITY_M_S2},
@@ -32,16 +33,11 @@ def read_imu_csv(path: Path, notes: Notes) -> ImuSamples:
     Raises:
         DataError: a column is missing, or a row is malformed; names file and line.
     """
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        reader = csv.reader(file, skipinitialspace=True)
-        header = [name.strip().lstrip("# ") for name in next(reader, [])]
-        time_column, columns = _columns(path, header)
-        rows = [(reader.line_num, row) for row in reader if any(field.strip() for field in row)]
+    header, rows = read_csv(path)
+    time_column, columns = _columns(path, header)
     stamps = np.empty(len(rows), dtype=np.int64)
     values = np.empty((len(rows), 6))
     for k, (line, row) in enumerate(rows):
-        if len(row) != len(header):
-            raise DataError(f"{path}, line {line}: {len(row)} columns where the header has {len(header)}")
         try:
             stamps[k] = _stamp_ns(row[time_column], header[time_column])
             values[k] = [float(row[column]) * scale for column, scale in columns]
@@ -79,4 +75,7 @@ def _clean(path: Path, stamps: NDArray[np.int64], values: NDArray[np.float64], n
     force = float(np.median(np.linalg.norm(values[:, 3:], axis=1)))
     if not 5 < force < 20:
         notes.add(f"{path}: the median specific force is {force:.2f} m/s², far from gravity's 9.81; check the unit")
+    turn = float(np.quantile(np.linalg.norm(values[:, :3], axis=1), 0.95))
+    if turn > _FASTEST_RAD_S:
+        notes.add(f"{path}: angular velocities of {turn:.0f} rad/s are no vehicle's; check the unit (gx_deg_s for °/s)")
     return ImuSamples(stamps, values[:, :3], values[:, 3:])

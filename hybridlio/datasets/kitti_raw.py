@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hybridlio import se3
 from hybridlio.datasets.drive_imu import drive_imu, fast_rows
-from hybridlio.datasets.extras import read_gps_csv, read_simulation
+from hybridlio.datasets.extras import note_fixes, read_gps_csv, read_simulation
 from hybridlio.datasets.kitti_files import BinScans, numbered, read_calibration, read_rigid, rows_of
 from hybridlio.datasets.oxts import OxtsRows, read_oxts
 from hybridlio.datasets.sequence import Notes, Sequence
@@ -62,6 +62,8 @@ def open_drive(drive: Path, raw_root: Path | None = None, vertical_angle_deg: fl
     simulation = read_simulation(drive / "simulation.json")
     imu = drive_imu(drive, oxts, notes)
     note_coverage(imu.stamps_ns, stamps, "inertial data", notes)
+    gps = read_gps_csv(drive / "gps.csv")
+    note_fixes(gps, stamps, notes)
     return Sequence(
         name=notes.name,
         stamps_ns=stamps,
@@ -69,7 +71,7 @@ def open_drive(drive: Path, raw_root: Path | None = None, vertical_angle_deg: fl
         imu=imu,
         calibration=calibration,
         reference=_reference(drive, numbers, stamps, oxts, calibration, notes),
-        gps=read_gps_csv(drive / "gps.csv"),
+        gps=gps,
         lidar=simulation.lidar if simulation else LIDAR_MODELS["hdl-64e"],
         forward_speed_m_s=oxts.forward_speed_at(stamps) if oxts else None,
         imu_noise=simulation.imu_noise if simulation else None,

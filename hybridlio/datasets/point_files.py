@@ -88,7 +88,7 @@ def _intensity(columns: Columns) -> NDArray[np.float32] | None:
     values = next((columns[name] for name in _INTENSITIES if name in columns), None)
     if values is None:
         return None
-    full_scale = 255 if len(values) and np.nanmax(values) > 1 else 1
+    full_scale = 255 if np.max(values, where=np.isfinite(values), initial=0) > 1 else 1
     return np.asarray(values, dtype=np.float32) / np.float32(full_scale)
 
 

@@ -18,11 +18,17 @@ from hybridlio.sensors import NS_PER_S
 Stamps = NDArray[np.int64]
 
 _LEAST_STEP_NS = 5_000_000
+_LARGEST_STEP_S = 10.0
+_ISO = re.compile(r"(\d{4}-\d\d-\d\d.*?)(?:Z|([+-])(\d\d):?(\d\d))?")
 MISSING_STAMP = int(np.iinfo(np.int64).min)  # what a blank line reads as; NumPy's "not a time" has the same bits
 
 
 def _iso_ns(text: str) -> int:
-    return int(np.datetime64(text.replace(" ", "T").rstrip("Z"), "ns").astype(np.int64))
+    date, sign, hours, minutes = _ISO.fullmatch(text).groups(default="0")  # type: ignore[union-attr]
+    if not 1678 <= int(date[:4]) <= 2261:  # NumPy would wrap around without a word
+        raise OverflowError
+    east_ns = int(f"{sign}1") * (60 * int(hours) + int(minutes)) * 60 * NS_PER_S if sign != "0" else 0
+    return int(np.datetime64(date.replace(" ", "T"), "ns").astype(np.int64)) - east_ns
 
 
 def _seconds_ns(text: str) -> int:
@@ -39,7 +45,8 @@ def _parser(lines: list[str]) -> Callable[[str], int]:
 
 def read_stamps(path: Path) -> Stamps:
     """Stamps ``(N,)`` of a text file with one a line: whole numbers are nanoseconds, or seconds where any line has a
-    point or an exponent, and dates such as ``2011-09-26 13:04:32.349659964`` ISO 8601 in UTC.
+    point or an exponent, and dates such as ``2011-09-26 13:04:32.349659964`` ISO 8601, in UTC unless they say how far
+    off it they are (``+02:00``).
 
     A blank line, as for a frame that was not recorded, reads as ``MISSING_STAMP``.
 
@@ -56,7 +63,7 @@ def read_stamps(path: Path) -> Stamps:
     for row, line in enumerate(lines):
         try:
             stamps[row] = parse(line) if line else MISSING_STAMP
-        except (ValueError, InvalidOperation, OverflowError):
+        except (ValueError, InvalidOperation, OverflowError, AttributeError):
             raise DataError(f"{path}, line {row + 1}: cannot read {line[:40]!r} as a time stamp") from None
     known = stamps[stamps != MISSING_STAMP]
     if parse is int and len(known) > 1 and 0 < np.median(np.abs(np.diff(known))) < 1000:
@@ -114,10 +121,15 @@ def sorted_unique(stamps: Stamps, what: str, notes: Notes) -> NDArray[np.intp]:
 
 
 def note_gaps(stamps: Stamps, what: str, notes: Notes, factor: float) -> None:
-    """Say how many steps in ``stamps`` exceed ``factor`` times the median step, and which is the longest."""
+    """Say how many steps in ``stamps`` exceed ``factor`` times the median step, and which is the longest.
+
+    A median step of over 10 s is told too: stamps may be in another unit.
+    """
     steps = np.diff(stamps) / NS_PER_S
     if not len(steps):
         return
+    if len(steps) > 1 and np.median(steps) > _LARGEST_STEP_S:
+        notes.add(f"{what}: {np.median(steps):g} s apart; check that their stamps are in seconds, or whole nanoseconds")
     large = int((steps > factor * np.median(steps)).sum())
     if large:
         worst = int(steps.argmax())

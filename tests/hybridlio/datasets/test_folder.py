@@ -33,6 +33,16 @@ class TestScans:
         (folder / "scans").rmdir()
         assert len(open_sequence(folder)) == 12
 
+    def test_a_map_beside_the_scans_folder_is_no_scan(self, recordings: Any, folder: Path) -> None:
+        recordings.put_bin(folder / "map.bin", recordings.ride.points(3))
+        assert len(open_sequence(folder)) == 12
+
+    @pytest.mark.filterwarnings("error")
+    def test_a_scan_of_no_finite_value_is_refused_in_one_line_alone(self, folder: Path) -> None:
+        np.save(folder / "scans/0.npy", np.full((10, 4), np.nan))
+        with pytest.raises(DataError, match="no finite points"):
+            open_sequence(folder)[0]
+
     def test_scans_of_several_kinds_are_refused(self, recordings: Any, folder: Path) -> None:
         recordings.put_bin(folder / "scans/3.bin", recordings.ride.points(3))
         with pytest.raises(DataError, match=r"\.bin, \.npy"):
@@ -97,6 +107,29 @@ class TestInertialData:
         (folder / "imu.csv").write_text(csv)
         assert any("check the unit" in note for note in open_sequence(folder).notes)
 
+    def test_degrees_taken_for_radians_are_noted(self, recordings: Any, folder: Path) -> None:
+        imu = recordings.ride.imu(recordings.ride.imu_stamps_ns(10))
+        (folder / "imu.csv").write_text(
+            recordings.imu_csv(type(imu)(imu.stamps_ns, np.degrees(imu.gyro_rad_s), imu.accel_m_s2))
+        )
+        assert any("rad/s are no vehicle's; check the unit" in note for note in open_sequence(folder).notes)
+
+    def test_gravity_of_the_wrong_sign_is_noted(self, recordings: Any, folder: Path) -> None:
+        imu = recordings.ride.imu(recordings.ride.imu_stamps_ns(10))
+        assert not any("points down" in note for note in open_sequence(folder).notes)
+        (folder / "imu.csv").write_text(recordings.imu_csv(type(imu)(imu.stamps_ns, imu.gyro_rad_s, -imu.accel_m_s2)))
+        assert any("points down in the lidar's frame" in note for note in open_sequence(folder).notes)
+
+    @pytest.mark.parametrize(
+        "content",
+        ["t_s,gx,gy,gz,ax,ay,az\n".encode("utf-16"), b"t_s,temperature \xb0C\n", b't_s\n"' + b"1" * 200_000],
+    )
+    @pytest.mark.parametrize("name", ["imu.csv", "gps.csv"])
+    def test_what_is_no_csv_is_named(self, folder: Path, name: str, content: bytes) -> None:
+        (folder / name).write_bytes(content)
+        with pytest.raises(DataError, match=rf"{name}: "):
+            open_sequence(folder)
+
     def test_rows_out_of_order_repeated_or_not_finite_are_sorted_out_with_notes(
         self, recordings: Any, folder: Path
     ) -> None:
@@ -145,6 +178,17 @@ class TestCalibration:
         (folder / "calibration.yaml").write_text("T_imu_lidar:" + str(caught.value).rpartition("T_imu_lidar:")[2])
         np.testing.assert_array_equal(open_sequence(folder).calibration.T_imu_lidar[:3, 3], [0.1, 0.0, 0.3])
 
+    def test_without_inertial_data_the_camera_alone_may_be_there(self, folder: Path) -> None:
+        (folder / "imu.csv").unlink()
+        (folder / "calibration.yaml").write_text(f"T_camera_lidar: {se3.exp([0, 0, 0.1, 1, 2, 3]).tolist()}")
+        calibration = open_sequence(folder).calibration
+        np.testing.assert_array_equal(calibration.T_imu_lidar, np.eye(4))
+        np.testing.assert_allclose(calibration.T_camera_lidar, se3.exp([0, 0, 0.1, 1, 2, 3]))
+
+    def test_lengths_in_millimetres_are_noted(self, folder: Path) -> None:
+        (folder / "calibration.yaml").write_text(f"T_imu_lidar: {se3.make(np.eye(3), [810, -320, 800]).tolist()}")
+        assert any("must be in metres" in note for note in open_sequence(folder).notes)
+
     def test_the_lidar_can_be_named(self, folder: Path) -> None:
         with (folder / "calibration.yaml").open("a") as file:
             file.write("lidar: 32-beam\n")
@@ -160,6 +204,8 @@ class TestCalibration:
             "T_imu_lidar: [[1,0,0,0],[0,1,0,0],[0,0,-1,0],[0,0,0,1]]",
             "lidar: hdl-9",
             "lidar: 16-beam",
+            "lidar: [16-beam]",
+            "T_imu_lidar: [0.1, 0, 0.2, 0, 0, 0, 1]",
             "[",
             "",
         ],
@@ -198,3 +244,11 @@ def test_extrinsics_are_read_as_written(recordings: Any, folder: Path) -> None:
     calibration = open_sequence(folder).calibration
     np.testing.assert_allclose(calibration.T_imu_lidar, T, atol=1e-14)
     np.testing.assert_allclose(calibration.T_camera_lidar, se3.inverse(T), atol=1e-14)
+
+
+def test_fixes_of_another_clock_are_noted_and_places_not_on_earth_refused(folder: Path) -> None:
+    (folder / "gps.csv").write_text("stamp_ns,sigma,east,north,up\n1,1,8,49,100\n")
+    assert any("no GPS fix lies within the scans' time" in note for note in open_sequence(folder).notes)
+    (folder / "gps.csv").write_text("stamp_ns,sigma,latitude,longitude,height\n1,1,8,49,100\n2,1,115,49,100\n")
+    with pytest.raises(DataError, match=r"gps\.csv, line 3: a latitude"):
+        open_sequence(folder)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridlio.datasets.sequence import Notes
-from hybridlio.datasets.stamps import MISSING_STAMP, increasing, read_stamps, sorted_unique
+from hybridlio.datasets.stamps import MISSING_STAMP, increasing, note_gaps, read_stamps, sorted_unique
 from hybridlio.errors import DataError
 
 
@@ -21,6 +21,8 @@ from hybridlio.errors import DataError
         ("2011-09-26 13:04:32.349659964", [1317042272349659964]),
         ("2011-09-26 13:04:32", [1317042272000000000]),
         ("2011-09-26T13:04:32.5Z", [1317042272500000000]),
+        ("2011-09-26 15:04:32.5+02:00", [1317042272500000000]),
+        ("2011-09-26T09:34:32-0330", [1317042272000000000]),
         ("0.000000e+00\n1.037359e-01", [0, 103735900]),
         ("1317042272.349659964\n", [1317042272349659964]),
         ("1317042272349659964\n1317042272449659964", [1317042272349659964, 1317042272449659964]),
@@ -34,8 +36,10 @@ def test_stamps_are_read_exactly(tmp_path: Path, text: str, expected: list[int])
     assert read_stamps(path).tolist() == expected
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
-    "text", ["", "\n\n", "soon", "1.0\nlater", "2011-09-26 13:04:32\n5.0", "1\n2\n3", "1e400", "nan"]
+    "text",
+    ["", "\n\n", "soon", "1.0\nlater", "2011-09-26 13:04:32\n5.0", "1\n2\n3", "1e400", "nan", "3000-01-01 00:00:00"],
 )
 def test_what_is_no_stamp_is_refused_with_the_file(tmp_path: Path, text: str) -> None:
     path = tmp_path / "timestamps.txt"
@@ -64,3 +68,10 @@ def test_sorting_keeps_each_stamp_once_and_the_first_row_that_has_it(values: lis
     assert stamps[order].tolist() == sorted(set(values))
     assert all(values.index(values[k]) == k for k in order)
     assert bool(notes.texts) == (values != sorted(set(values)))
+
+
+def test_scans_that_lie_many_seconds_apart_are_noted_as_perhaps_in_another_unit() -> None:
+    for step_s, told in ((100, 1), (0.1, 0)):
+        notes = Notes("ride")
+        note_gaps((np.arange(5) * step_s * 1e9).astype(np.int64), "scans", notes, factor=1.5)
+        assert len([text for text in notes.texts if "are in seconds" in text]) == told
