@@ -137,14 +137,14 @@ def _reached_its_end(metrics: dict[str, Any]) -> bool:
 
 def _description(folder: Path) -> Any:
     try:
-        return json.loads((folder / JOB).read_text())
+        return json.loads((folder / JOB).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
 
 
 def _metrics(folder: Path) -> dict[str, Any]:
     try:
-        return dict(json.loads((folder / run_folder.METRICS).read_text()))
+        return dict(json.loads((folder / run_folder.METRICS).read_text(encoding="utf-8")))
     except (OSError, ValueError):
         return {}
 

@@ -73,7 +73,7 @@ class Batch:
         """How many there are of each status."""
         count = Counter(row.status for row in self.rows)
         told = [f"{count[status]} {status}" for status in (DONE, DONE_BEFORE, FAILED, NOT_RUN) if count[status]]
-        return f"{len(self.rows)} recording{'s' * (len(self.rows) != 1)}: {', '.join(told)}"
+        return f"{tables.counted(len(self.rows), 'recording')}: {', '.join(told)}"
 
 
 def figures_of(metrics: dict[str, Any]) -> dict[str, Any]:

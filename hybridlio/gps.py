@@ -66,12 +66,12 @@ class GpsFit:
         return float(np.sqrt((kept**2).sum(axis=1).mean())) if len(kept) else float("nan")
 
     def to_json_dict(self) -> dict[str, Any]:
-        """The figures as plain values."""
+        """The figures as plain values; None for an RMSE of no fix."""
         return {
             "fixes": len(self.used),
             "used": int(self.used.sum()),
             "rejected": np.flatnonzero(self.rejected).tolist(),
-            "rmse_m": self.rmse_m,
+            "rmse_m": None if np.isnan(self.rmse_m) else self.rmse_m,
             "shift_s": self.shift_s,
             "shift_sigma_s": self.shift_sigma_s,
             "noise_scale": self.noise_scale,

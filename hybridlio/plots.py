@@ -127,7 +127,7 @@ def step_error_figure(errors: Mapping[str, tuple[Array, Array]]) -> Figure:
             row[0].yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
             row[1].set(title="Share of scans with less", xlabel="scans")
             row[1].xaxis.set_major_formatter(PercentFormatter(1.0))
-            row[1].legend(loc="lower right")
+            row[1].legend(loc="best")
             for text in row[1].get_legend().get_texts():
                 text.set_text(f"{text.get_text()} {unit}")
     return figure

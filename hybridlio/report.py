@@ -92,8 +92,9 @@ def _page(data: ReportData, findings: Findings) -> dict[str, Any]:
     from hybridlio.plots import to_png
 
     inline = {name: base64.b64encode(to_png(f)).decode() for name, f in pictures(data, findings).items()}
-    bridged = [] if data.ok is None else _ranges(np.flatnonzero(~np.asarray(data.ok, bool)) + 1)
-    degenerate = [] if data.degenerate is None else _ranges(np.flatnonzero(data.degenerate) + 1)
+    second = data.first_scan + 1  # the scan that the first step leads to
+    bridged = [] if data.ok is None else _ranges(np.flatnonzero(~np.asarray(data.ok, bool)) + second)
+    degenerate = [] if data.degenerate is None else _ranges(np.flatnonzero(data.degenerate) + second)
     return {
         "name": data.name,
         "facts": {**_own_facts(data), **data.facts},

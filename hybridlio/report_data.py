@@ -33,6 +33,7 @@ class ReportData:
         timings_s: stage to ``(M,)`` seconds, one a scan, in the order in which the stages run.
         ok: ``(N-1,)``; False where a step is bridged because its scan could not be used.
         degenerate: ``(N-1,)``; True where the scan left a direction of the step unconstrained.
+        first_scan: which of the recording's scans, counted from 0, the estimate's first pose belongs to.
         loops: ``(L, 2)`` rows of the estimate that loop closures join.
         facts: short lines for the head by label, such as the sources used.
         config: the configuration as YAML text.
@@ -50,6 +51,7 @@ class ReportData:
     timings_s: Mapping[str, Array] = field(default_factory=dict)
     ok: NDArray[np.bool_] | None = None
     degenerate: NDArray[np.bool_] | None = None
+    first_scan: int = 0
     loops: NDArray[np.int64] | None = None
     facts: Mapping[str, str] = field(default_factory=dict)
     config: str = ""

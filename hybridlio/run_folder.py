@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import datetime
 import json
+import logging
 import os
 import shutil
 from collections.abc import Sequence as Items
@@ -26,6 +27,8 @@ from hybridlio.sensors import NS_PER_S
 from hybridlio.trajectory import Trajectory
 from hybridlio.trajectory_errors import select
 from hybridlio.trajectory_files import read_tum, write_kitti, write_tum
+
+_log = logging.getLogger(__name__)
 
 POSES, KITTI, COVARIANCES, GRAPH = "poses_tum.txt", "poses_kitti.txt", "covariances.npz", "graph.g2o"
 RECORD, CONFIG, METRICS, REFERENCE = "odometry.npz", "config.yaml", "metrics.json", "reference_tum.txt"
@@ -91,14 +94,20 @@ def clear(folder: Path) -> None:
 
 
 def point_latest_at(folder: Path) -> None:
-    """Make ``latest`` beside the folder a link to it, replacing an older one in one move."""
+    """Make ``latest`` beside the folder a link to it, replacing an older one in one move.
+
+    Where that cannot be, as on a disk without links, the log says so: it must not take a finished run's place.
+    """
     link = folder.parent / "latest"
     if link.exists() and not link.is_symlink():
         return
     temporary = folder.parent / f".latest.{os.getpid()}"
-    temporary.unlink(missing_ok=True)
-    temporary.symlink_to(folder.name)
-    temporary.replace(link)
+    try:
+        temporary.unlink(missing_ok=True)
+        temporary.symlink_to(folder.name)
+        temporary.replace(link)
+    except OSError as error:
+        _log.warning("%s cannot be made a link to %s: %s", link, folder.name, error.strerror or error)
 
 
 def write_trajectory(
@@ -167,7 +176,7 @@ def read_run(path: Path) -> StoredRun:
     whole = read_tum(path / POSES)
     reference = read_tum(path / REFERENCE) if (path / REFERENCE).is_file() else None
     try:
-        metrics = json.loads((path / METRICS).read_text())
+        metrics = json.loads((path / METRICS).read_text(encoding="utf-8"))
         with np.load(path / COVARIANCES, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         estimated = arrays["estimated"]

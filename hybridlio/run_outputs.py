@@ -16,6 +16,7 @@ from hybridlio.record import Record
 from hybridlio.report import pictures, write_report
 from hybridlio.report_data import Findings, ReportData, find
 from hybridlio.run import Run
+from hybridlio.tables import counted
 from hybridlio.trajectory_files import write_tum
 
 if TYPE_CHECKING:
@@ -80,9 +81,9 @@ def notes(run: Run) -> list[str]:
         why = "interrupted" if isinstance(run.stopped, KeyboardInterrupt) else f"stopped by an error ({run.stopped})"
         out.append(f"{why} after {run.done} of {len(run.sequence)} scans")
     if run.skipped:
-        out.append(f"the first {run.skipped} scans could not be used: the run starts at scan {run.skipped}")
+        out.append(f"the run starts at scan {run.skipped}; {counted(run.skipped, 'scan')} before could not be used")
     if run.bridged:
-        out.append(f"{len(run.bridged)} scans could not be used and are bridged by the initial pose")
+        out.append(f"bridged by the initial pose, as they could not be used: {counted(len(run.bridged), 'scan')}")
     out += disagreements(run)
     told = [f"frame {k}: {why}" for k, why in run.unreadable.items()]
     return out + told[:_TOLD] + ([f"and {len(told) - _TOLD} more"] if len(told) > _TOLD else [])
@@ -91,13 +92,13 @@ def notes(run: Run) -> list[str]:
 def disagreements(run: Run) -> list[str]:
     """What was done with scans that contradict the IMU, in a line each; often none."""
     said = {
-        "rejected": "contradict the IMU and are left out",
-        "relocated": "contradicted the IMU once too often: the map is followed from there, the jump left out",
-        "down-weighted": "disagree with the IMU beyond their covariances and count for less",
-        "trusted again": "contradict the IMU for longer than it is to be believed and are taken as they are",
+        "rejected": "left out, as they contradict the IMU",
+        "relocated": "the map is followed from there, the jump left out, after contradicting the IMU once too often",
+        "down-weighted": "counted for less, as they disagree with the IMU beyond their covariances",
+        "trusted again": "taken as they are, as they contradict the IMU for longer than it is to be believed",
     }
     counts = {what: len(run.judged(cast("Verdict", verdict))) for verdict, what in said.items()}
-    return [f"{count} {'scans' if count > 1 else 'scan'} {what}" for what, count in counts.items() if count]
+    return [f"{what}: {counted(count, 'scan')}" for what, count in counts.items() if count]
 
 
 def report_data(run: Run, config: Config, config_text: str) -> ReportData:
@@ -113,6 +114,7 @@ def report_data(run: Run, config: Config, config_text: str) -> ReportData:
         timings_s=run.timings_s,
         ok=run.ok,
         degenerate=run.degenerate,
+        first_scan=run.skipped,
         facts={"initial pose": config.initial_pose, "residual": config.residual, "backend": config.backend},
         config=config_text,
         warnings=notes(run),
@@ -199,6 +201,7 @@ def write_smoothed(folder: Path, stored: run_folder.StoredRun, record: Record, s
         step_covariances=steps.covariances,
         ok=np.array([step.ok for step in record.relative]),
         degenerate=np.array([len(step.degenerate) > 0 for step in record.relative]),
+        first_scan=len(stored.stamps_before),
         loops=np.array([(loop.earlier, loop.later) for loop in loops], np.int64).reshape(-1, 2),
         facts={"smoothed": f"{smoothed.iterations} iterations", "run": stored.path.name}
         | ({} if closed is None else {"loops": closed.summary()})

@@ -19,6 +19,11 @@ def number(value: float | None, decimals: int) -> str:
     return NOTHING if value is None else f"{value:.{decimals}f}"
 
 
+def counted(count: int, what: str) -> str:
+    """A number of things in words: ``1 scan``, ``2 scans``."""
+    return f"{count} {what}{'s' * (count != 1)}"
+
+
 def headings(rows: Items[Row]) -> list[str]:
     """The headings of all rows, in the order in which they first come, without those under which nothing is said."""
     names = dict.fromkeys(name for row in rows for name in row)

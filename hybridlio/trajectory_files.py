@@ -109,12 +109,21 @@ def read_pair(reference_path: PathLike, estimate_path: PathLike) -> tuple[Trajec
         DataError: what :func:`read_trajectory` raises, such as row counts that differ where stamps are lent.
     """
     reference, estimate = read_trajectory(reference_path), read_trajectory(estimate_path)
-    stamped = [len(next(_rows(path))[1]) == 8 for path in (reference_path, estimate_path)]
+    stamped = [is_tum_file(path) for path in (reference_path, estimate_path)]
     if stamped == [False, True]:
         reference = read_kitti(reference_path, estimate.stamps_ns)
     if stamped == [True, False]:
         estimate = read_kitti(estimate_path, reference.stamps_ns)
     return reference, estimate
+
+
+def is_tum_file(path: PathLike) -> bool:
+    """Whether the first row has TUM's eight columns.
+
+    Raises:
+        DataError: unreadable, or no row in it.
+    """
+    return len(next(_rows(path))[1]) == 8
 
 
 def _seconds(stamp_ns: int) -> str:

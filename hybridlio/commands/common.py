@@ -114,6 +114,12 @@ def fail(error: BaseException, code: int | None = None) -> NoReturn:
         raise typer.Exit(code or (BAD_INPUT if bad_input else FAILED)) from None
     if isinstance(error, SystemExit | GeneratorExit):
         raise error
+    if isinstance(error, OSError) and error.strerror:  # a full disk, missing rights: the system's, and not a fault
+        complain(f"error: {error.filename}: {error.strerror}" if error.filename else f"error: {error.strerror}")
+        raise typer.Exit(code or FAILED) from None
+    if isinstance(error, MemoryError):
+        complain("error: out of memory; give less at once, such as a part of the recording by --frames")
+        raise typer.Exit(code or FAILED) from None
     complain(f"error: {type(error).__name__}: {error} (a fault in hybridlio; -vv shows where)")
     raise typer.Exit(FAILED) from None
 

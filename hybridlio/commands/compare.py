@@ -71,7 +71,6 @@ def _names(text: str, known: tuple[str, ...], option: str) -> tuple[str, ...]:
         return known
     unknown = [name for name in names if name not in known]
     if unknown or not names:
-        raise ConfigError(
-            f"{option} {text!r}: {'no name' if not names else f'unknown {unknown[0]!r}'}; {_several(known)}"
-        )
+        what = f"unknown {unknown[0]!r}" if unknown else "no name"
+        raise ConfigError(f"{option} {text!r}: {what}; give some of {', '.join(known)}, with commas between, or all")
     return names

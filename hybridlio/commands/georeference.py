@@ -61,14 +61,12 @@ def georeference(
 
 
 def _origin(text: str | None) -> GeodeticPoint | None:
-    from hybridlio.geodesy import GeodeticPoint as Point
+    from hybridlio.geodesy import check_geodetic
 
     if text is None:
         return None
     try:
         latitude, longitude, height = (float(part) for part in text.split(","))
     except ValueError:
-        raise ConfigError(f"origin {text!r}: give latitude, longitude (degrees) and height (metres)") from None
-    if not (abs(latitude) <= 90 and abs(longitude) <= 360):
-        raise ConfigError(f"origin {text!r}: latitude comes first, from -90 to 90 degrees")
-    return Point(latitude, longitude, height)
+        raise ConfigError(f"--origin {text!r}: give latitude, longitude (degrees) and height (metres)") from None
+    return check_geodetic(latitude, longitude, height, f"--origin {text!r}, latitude first")

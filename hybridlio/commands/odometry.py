@@ -9,6 +9,7 @@ import typer
 
 from hybridlio.commands import common
 from hybridlio.commands.common import FAILED, guarded
+from hybridlio.tables import counted
 from hybridlio.terminal import complain, progress, say, say_table
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ def _say_result(folder: Path, run: Run, findings: Findings) -> None:
 
     metres, ms = run.trajectory.length_m, ms_per_scan(run).get("total")
     speed = "" if ms is None else f", {ms:.0f} ms a scan"
-    say(f"{run.sequence.name}: {run.done} scans, {metres:.2f} m in {run.seconds:.1f} s{speed}")
+    say(f"{run.sequence.name}: {counted(run.done, 'scan')}, {metres:.2f} m in {run.seconds:.1f} s{speed}")
     if (driven := forward_speed_length_m(run)) is not None:
         say(f"by its own forward speed the vehicle drove {driven:.2f} m")
     if run.bridged:

@@ -34,7 +34,7 @@ def simulate(
     ] = "camera",
     _verbose: Verbose = 0,
 ) -> None:
-    """Simulate a drive through a town, as KITTI raw data: HDL-64E scans, a 100 Hz IMU, exact poses.
+    """Simulate a drive through a town, as KITTI raw data: lidar scans, a 100 Hz IMU, exact poses.
 
     The same options give the same bytes. An interrupted run goes on where it stopped.
     """

@@ -18,7 +18,7 @@ class SimulationConfig(BaseModel):
     """Settings of a simulated drive; the same settings give the same bytes.
 
     Attributes:
-        seconds: duration; by default 60 s, or with ``poses`` the whole file.
+        seconds: duration, a day at most; by default 60 s, or with ``poses`` the whole file.
         length_m: drive this far instead of for ``seconds``.
         seed: decides road, world, noise; drives of other seeds share nothing.
         speed_m_s: cruising speed; curves, junctions and stops are slower. Not used along a pose file.
@@ -41,8 +41,8 @@ class SimulationConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    seconds: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
-    length_m: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
+    seconds: float | None = Field(default=None, gt=0.0, le=86_400.0, allow_inf_nan=False)
+    length_m: float | None = Field(default=None, gt=0.0, le=1e6, allow_inf_nan=False)
     seed: int = Field(default=1, ge=0)
     speed_m_s: float = Field(default=10.0, ge=1.0, le=40.0)
     driving: Driving = "calm"

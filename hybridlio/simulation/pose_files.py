@@ -12,11 +12,14 @@ from hybridlio import se3
 from hybridlio.errors import DataError
 from hybridlio.simulation.path import SmoothPath
 from hybridlio.simulation.rig import SCAN_RATE_HZ, T_CAMERA_LIDAR, T_LIDAR_IMU
+from hybridlio.trajectory import Trajectory
+from hybridlio.trajectory_files import is_tum_file, read_trajectory
 
 Array = NDArray[np.float64]
 
 KNOT_S = 0.3
 MARGIN_STEPS = 10
+_LEAST_POSES = 10
 _TWIST_STEPS = 5
 
 
@@ -28,29 +31,22 @@ def read_lidar_poses(path: Path, frame: str) -> Array:
         frame: what a KITTI file's poses are of, ``camera`` or ``lidar``.
 
     Raises:
-        DataError: not a pose file of either kind, or fewer than 10 poses.
+        DataError: as :func:`hybridlio.trajectory_files.read_trajectory`, or fewer than 10 poses.
     """
-    try:
-        rows = np.loadtxt(path, ndmin=2)
-    except ValueError as error:
-        raise DataError(f"{path}: not a KITTI or TUM pose file: {error}") from None
-    if rows.shape[1] not in (8, 12) or len(rows) < 10 or not np.isfinite(rows).all():
-        raise DataError(f"{path}: expected 10 or more rows of 12 (KITTI) or 8 (TUM) finite numbers, got {rows.shape}")
-    if rows.shape[1] == 8:
-        return _upright(_evenly(rows, path))
-    blocks = rows.reshape(-1, 3, 4)
-    poses = se3.orthonormalise(se3.make(blocks[..., :3], blocks[..., 3]))
-    return _upright(poses @ T_CAMERA_LIDAR if frame == "camera" else poses)
+    recorded, is_tum = read_trajectory(path), is_tum_file(path)
+    if len(recorded) < _LEAST_POSES:
+        raise DataError(f"{path}: {len(recorded)} poses; a drive needs {_LEAST_POSES} or more")
+    if is_tum:
+        return _upright(_evenly(recorded))
+    return _upright(recorded.poses @ T_CAMERA_LIDAR if frame == "camera" else recorded.poses)
 
 
-def _evenly(rows: Array, path: Path) -> Array:
-    """TUM rows, interpolated every 0.1 s from the first."""
-    times = rows[:, 0] - rows[0, 0]
-    if (np.diff(times) <= 0).any():
-        raise DataError(f"{path}: time does not increase at row {int((np.diff(times) <= 0).argmax()) + 2}")
+def _evenly(recorded: Trajectory) -> Array:
+    """The poses, interpolated every 0.1 s from the first."""
+    times = recorded.times_s
     at = np.arange(0.0, times[-1] + 1e-9, 1.0 / SCAN_RATE_HZ)
-    attitude = Slerp(times, Rotation.from_quat(rows[:, 4:8]))(at).as_matrix()
-    position = np.column_stack([np.interp(at, times, rows[:, i]) for i in (1, 2, 3)])
+    attitude = Slerp(times, Rotation.from_matrix(recorded.poses[:, :3, :3]))(at).as_matrix()
+    position = np.column_stack([np.interp(at, times, column) for column in recorded.poses[:, :3, 3].T])
     return se3.make(attitude, position)
 
 

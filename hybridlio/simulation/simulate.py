@@ -96,7 +96,7 @@ def _fingerprint(description: dict[str, Any]) -> str:
 def _require_same(drive: Path, description: dict[str, Any]) -> None:
     path = drive / "simulation.json"
     try:
-        found = json.loads(path.read_text())
+        found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         raise DataError(f"{drive} is there already and is no simulated drive; choose another folder") from None
     if _completed(found) != description:

@@ -1,3 +1,4 @@
+import errno
 import json
 import logging
 import shutil
@@ -100,6 +101,7 @@ def test_simulating_again_leaves_the_drive_as_it_is_and_other_settings_are_refus
         (("--lidar", "128-beam"), "--lidar: unknown lidar '128-beam'"),
         (("--speed", "99"), "--speed: "),
         (("--seconds", "-1"), "--seconds: "),
+        (("--seconds", "1e9"), "--seconds: "),
         (("--poses", "none.txt"), "none.txt"),
     ],
 )
@@ -277,6 +279,35 @@ def test_a_fault_shows_its_traceback_only_when_asked_to(tiny_drive, tmp_path, mo
         result = run(*words)
         assert result.exit_code == 1
         assert "Traceback" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (PermissionError(errno.EACCES, "Permission denied", "/root/map"), "error: /root/map: Permission denied"),
+        (OSError(errno.ENOSPC, "No space left on device"), "error: No space left on device"),
+        (MemoryError(), "error: out of memory"),
+    ],
+)
+def test_what_the_system_refuses_is_no_fault_of_the_librarys(error, said, monkeypatch):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr("hybridlio.config.config_to_yaml", fail)
+    assert said in (words := refused(1, "config"))
+    assert "fault" not in words
+
+
+def test_a_disk_without_links_keeps_the_run_and_says_so(tiny_drive, tmp_path, monkeypatch, without_pages):
+    def fail(*_, **__):
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Path, "symlink_to", fail)
+    result = run("odometry", tiny_drive, "--residual", "none", "--frames", ":3")
+    assert result.exit_code == 0, result.output
+    assert "latest cannot be made a link" in result.stderr
+    assert len(list((tmp_path / "runs").glob("*/metrics.json"))) == 1
 
 
 def test_progress_goes_to_stderr_so_that_results_can_be_piped(tiny_drive, tmp_path, without_pages):

@@ -114,6 +114,13 @@ def test_the_page_says_what_went_wrong_where_and_with_which_settings(html: str) 
         assert text in html
 
 
+def test_scans_to_look_at_are_counted_as_the_recording_counts_them(data: ReportData, tmp_path: Path) -> None:
+    write_report(tmp_path / "r.html", dataclasses.replace(data, first_scan=7))
+    html = (tmp_path / "r.html").read_text()
+    assert "<b>107, 207–209</b>" in html
+    assert "<b>308–317</b>" in html
+
+
 def test_names_are_text_and_never_markup(html: str) -> None:
     assert "town &lt;1&gt;" in html
     assert "town <1>" not in html

@@ -15,7 +15,7 @@ from hybridlio.metrics import evaluate
 from hybridlio.odometry import Odometry
 from hybridlio.record import Record
 from hybridlio.run import Run, run_odometry
-from hybridlio.run_outputs import metrics, write_run
+from hybridlio.run_outputs import metrics, report_data, write_run
 from hybridlio.sensors import Calibration
 from hybridlio.trajectory_files import read_kitti, read_tum
 
@@ -132,6 +132,7 @@ def test_scans_before_the_first_usable_one_have_rows_that_claim_nothing(tiny_dri
         return sequence.load_scan(k)
 
     run = run_odometry(replace(sequence, load_scan=load), Odometry(config=CONFIG))
+    assert report_data(run, CONFIG, "").first_scan == 3
     write_run(tmp_path, run, CONFIG)
     whole = read_tum(tmp_path / "poses_tum.txt")
     assert whole.stamps_ns.tolist() == sequence.stamps_ns.tolist()

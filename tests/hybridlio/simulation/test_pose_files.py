@@ -46,7 +46,12 @@ def test_a_tum_file_is_brought_to_ten_scans_a_second(tmp_path: Path):
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("1 2 3\n" * 20, "12 .KITTI. or 8 .TUM."), ("a b\n", "not a KITTI or TUM"), ("1 " * 12, "10 or more rows")],
+    [
+        ("1 2 3\n" * 20, "row 1 has 3 columns; expected one of TUM"),
+        ("a b\n", "row 1 has 2 columns"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 9, "9 poses; a drive needs 10"),
+        ("".join(f"{k} 0 0 0 0 0 0 0\n" for k in range(20)), "row 1: its quaternion"),
+    ],
 )
 def test_a_file_of_something_else_is_refused(tmp_path: Path, text: str, message: str):
     (tmp_path / "x.txt").write_text(text)
