@@ -1,41 +1,41 @@
-"""Makes the record of a run while it goes on: a few kilobytes a step, most of it as arrays."""
+"""Makes the record of a run while it goes on: a kilobyte or two a step, most of it packed."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from hybridlio.estimates import Array, RelativePose, State
 from hybridlio.keyframes import Keyframes
+from hybridlio.packing import PackedArray, packed, unpacked
 from hybridlio.record import Record
 from hybridlio.record_steps import keyframe_arrays, relative_arrays, relatives, with_keyframes
 from hybridlio.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.trajectory import Trajectory
 
-_AT_ONCE = 100  # so many steps become arrays together: as objects they take five times the memory
+_AT_ONCE = 50  # so many scans are packed together: as objects they take five times the memory
 
 
 class RecordMaker:
     """Takes in a run's estimates, samples and fixes."""
 
     def __init__(self) -> None:
-        self._stamps_ns: list[int] = []
-        self._poses: list[Array] = []
-        self._covariances: list[Array] = []
-        self._steps: list[tuple[RelativePose, RelativePose]] = []
-        self._packed: list[dict[str, Any]] = []
+        self._scans = 0
+        self._last_ns = 0
+        self._recent: list[_Kept] = []
+        self._packed: list[dict[str, PackedArray]] = []
         self._imu: list[ImuSamples] = []
         self._gps: list[GpsFix] = []
 
     def __len__(self) -> int:
-        return len(self._stamps_ns)
+        return self._scans
 
     @property
     def last_ns(self) -> int:
         """The last scan's stamp."""
-        return self._stamps_ns[-1]
+        return self._last_ns
 
     def heard(self, gps: tuple[GpsFix, ...]) -> None:
         """Take in fixes."""
@@ -49,34 +49,52 @@ class RecordMaker:
         self, stamp_ns: int, pose: Array, covariance: Array, step: tuple[RelativePose, RelativePose] | None = None
     ) -> None:
         """Take in a scan's estimate, and but for the first scan the initial and the refined relative pose."""
-        self._stamps_ns.append(stamp_ns)
-        self._poses.append(pose)
-        self._covariances.append(covariance)
-        if step is not None:
-            self._steps.append(step)
-        if len(self._steps) >= _AT_ONCE:
-            initial, relative = zip(*self._steps, strict=True)
-            self._packed.append(
-                relative_arrays("initial", initial) | relative_arrays("relative", relative) | keyframe_arrays(relative)
-            )
-            self._steps = []
+        self._scans, self._last_ns = self._scans + 1, stamp_ns
+        self._recent.append(_Kept(stamp_ns, pose, covariance, step))
+        if len(self._recent) >= _AT_ONCE:
+            self._packed.append(packed(_arrays(self._recent)))
+            self._recent = []
 
     def record(self, start: State, calibration: Calibration, noise: ImuNoise, keyframes: Keyframes) -> Record:
         """All so far."""
-        stamps = np.array(self._stamps_ns)
-        steps = [step for arrays in self._packed for step in _steps(arrays)] + self._steps
+        parts = [*map(unpacked, self._packed), *([_arrays(self._recent)] if self._recent else [])]
+        steps = [step for arrays in parts for step in _steps(arrays)]
+        stamps, poses, covariances = (
+            np.concatenate([arrays[f"online_{name}"] for arrays in parts]) for name in ("ns", "poses", "covariances")
+        )
         return Record(
-            online=Trajectory(stamps, np.array(self._poses), np.array(self._covariances)),
+            online=Trajectory(stamps, poses, covariances),
             initial=tuple(initial for initial, _ in steps),
             relative=tuple(relative for _, relative in steps),
             # a step that failed or was interrupted may have added more
-            imu=joined(self._imu).between(start.stamp_ns, int(stamps[-1])),
-            gps=tuple(fix for fix in self._gps if fix.stamp_ns <= stamps[-1]),
+            imu=joined(self._imu).between(start.stamp_ns, self._last_ns),
+            gps=tuple(fix for fix in self._gps if fix.stamp_ns <= self._last_ns),
             start=start,
             calibration=calibration,
             imu_noise=noise,
             keyframes=keyframes,
         )
+
+
+class _Kept(NamedTuple):
+    """A scan's estimate, and its initial and refined relative poses but for the first."""
+
+    stamp_ns: int
+    pose: Array
+    covariance: Array
+    step: tuple[RelativePose, RelativePose] | None
+
+
+def _arrays(scans: list[_Kept]) -> dict[str, Any]:
+    initial, relative = (tuple(scan.step[i] for scan in scans if scan.step is not None) for i in (0, 1))
+    online = {
+        "online_ns": np.array([scan.stamp_ns for scan in scans], np.int64),
+        "online_poses": np.array([scan.pose for scan in scans]),
+        "online_covariances": np.array([scan.covariance for scan in scans]),
+    }
+    return (
+        online | relative_arrays("initial", initial) | relative_arrays("relative", relative) | keyframe_arrays(relative)
+    )
 
 
 def _steps(arrays: dict[str, Any]) -> Iterator[tuple[RelativePose, RelativePose]]:
