@@ -143,6 +143,46 @@ def test_along_a_corridor_the_initial_pose_is_kept_whatever_the_network_says(wei
     assert abs(found.pose[1, 3] - STEP[1, 3]) < 0.02
 
 
+def test_a_proposal_is_the_networks_answer_as_it_is_and_can_be_judged_afterwards(weights, seen, monkeypatch):
+    scans, wrong = [seen(np.eye(4), seed=0), seen(STEP, seed=1)], STEP @ se3.exp(3 * OFF)
+    judged = []
+    for proposing in (True, False):
+        residual = source(weights(), scans, replace(FEW, refine_steps=0))
+        answering(residual, wrong, monkeypatch)
+        if proposing:
+            assert np.allclose(residual.propose(frame(1), initial(OFF)), wrong, atol=1e-6)
+        judged.append((residual.judge if proposing else residual.refine)(frame(1), initial(OFF)))
+    assert not judged[0].ok
+    assert np.array_equal(judged[0].covariance, judged[1].covariance)
+    assert judged[0].details == judged[1].details
+
+
+@pytest.mark.parametrize(("ahead_m", "looks"), [(0.1, 1), (0.3, 2)])
+def test_after_a_long_way_the_network_looks_once_more(weights, seen, monkeypatch, ahead_m, looks):
+    residual, starts = source(weights(), [seen(np.eye(4), seed=0), seen(STEP, seed=1)]), []
+    answer = type("Answer", (), {"pose": torch.tensor(STEP, dtype=torch.float32)[None]})
+    monkeypatch.setattr(residual._network, "refine_seen", lambda *given: (starts.append(given[2]), answer)[1])
+    residual.propose(frame(1), initial(np.array([0, 0, 0, ahead_m, 0, 0])))
+    assert len(starts) == looks
+    assert np.allclose(starts[-1][0], STEP, atol=1e-6) == (looks == 2)
+
+
+def test_of_a_scan_with_too_little_to_see_nothing_is_proposed(weights, seen):
+    residual = source(weights(), [seen(np.eye(4)), replace_points(seen(STEP, seed=1), 50)])
+    assert residual.propose(frame(1), initial(OFF)) is None
+
+
+def test_the_network_takes_one_thread_and_leaves_others_theirs(weights, seen, monkeypatch):
+    torch.set_num_threads(2)
+    residual, threads = source(weights(), [seen(np.eye(4), seed=0), seen(STEP, seed=1)]), []
+    refine = residual._network.refine_seen
+    monkeypatch.setattr(
+        residual._network, "refine_seen", lambda *given: (threads.append(torch.get_num_threads()), refine(*given))[1]
+    )
+    residual.refine(frame(1), initial(OFF))
+    assert (threads, torch.get_num_threads()) == ([1], 2)
+
+
 def test_too_little_to_see_is_bridged_and_the_scan_after_it_too(weights, seen):
     good, poor = seen(np.eye(4)), replace_points(seen(STEP, seed=1), 50)
     residual = source(weights(), [good, poor, good, good], replace(FEW, refine_steps=3))
@@ -227,13 +267,13 @@ def test_a_pair_on_which_the_network_fails_is_listed_and_weighs_nothing(weights,
     path = str(weights(geometry=GEOMETRY, projective_steps=3))
     options = PreparationOptions(geometry=GEOMETRY, loss_points=2000, threads=1)
     residual = NetworkResidual(lambda _: partial(prepare, options=options), replace(FEW, weights=path, refine_steps=0))
-    refine, count = residual._network.refine_seen, iter(range(99))
+    ask, count = residual._ask, iter(range(99))
 
     def failing(*given):
-        answer = refine(*given)
-        return type("Answer", (), {"pose": answer.pose + (next(count) == 4) * torch.eye(4)[:, [3, 0, 1, 2]].T})
+        answer = ask(*given)
+        return answer + (next(count) == 4) * np.eye(4)[:, [3, 0, 1, 2]].T
 
-    monkeypatch.setattr(residual._network, "refine_seen", failing)
+    monkeypatch.setattr(residual, "_ask", failing)
     sequence = hl.open_sequence(tiny_drive).part(0, 12)
     run = run_odometry(sequence, hl.Odometry(residual=residual))
     assert run.stopped is None
