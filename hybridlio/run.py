@@ -6,6 +6,7 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from hybridlio.errors import DataError
 from hybridlio.estimates import Array
 from hybridlio.metrics import Steps
 from hybridlio.odometry import Estimate, Odometry
+from hybridlio.packing import PackedList
 from hybridlio.record import Record
 from hybridlio.sensors import Frame
 from hybridlio.trajectory import Trajectory
@@ -46,7 +48,7 @@ class Run:
 
     sequence: Sequence
     odometry: Odometry
-    estimates: list[Estimate] = field(default_factory=list)
+    estimates: PackedList[Estimate] | list[Estimate] = field(default_factory=PackedList)
     skipped: int = 0
     unreadable: dict[int, str] = field(default_factory=dict)
     reading_s: list[float] = field(default_factory=list)
@@ -61,7 +63,7 @@ class Run:
     @property
     def trajectory(self) -> Trajectory:
         """The estimates, in the first usable scan's frame, with covariances."""
-        estimates = self.estimates
+        estimates = list(self.estimates)
         return Trajectory(
             np.array([e.stamp_ns for e in estimates]),
             np.array([e.pose for e in estimates]).reshape(-1, 4, 4),
@@ -109,8 +111,9 @@ class Run:
     @property
     def timings_s(self) -> dict[str, Array]:
         """Seconds by stage, one for each estimate after the first; reading the scan is a stage."""
-        stages = dict.fromkeys(stage for e in self.estimates[1:] for stage in e.seconds)
-        spent = {stage: np.array([e.seconds.get(stage, 0.0) for e in self.estimates[1:]]) for stage in stages}
+        seconds = [e.seconds for e in islice(self.estimates, 1, None)]
+        stages = dict.fromkeys(stage for spent in seconds for stage in spent)
+        spent = {stage: np.array([one.get(stage, 0.0) for one in seconds]) for stage in stages}
         return {"reading": np.array(self.reading_s[1:]), **spent} if spent else {}
 
     @property

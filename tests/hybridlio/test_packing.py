@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from hybridlio.keyframes import KeyframeSettings, compact
-from hybridlio.packing import PackedArray, PackedCloud, packed, unpacked
+from hybridlio.packing import PackedArray, PackedCloud, PackedList, packed, unpacked
 
 
 @pytest.mark.parametrize(
@@ -47,3 +47,19 @@ def test_a_keyframes_cloud_takes_less_memory(rng: np.random.Generator):
     cloud = compact(np.concatenate([ground, walls]).astype(np.float32), KeyframeSettings(max_points=100_000))
     packed_cloud = PackedCloud.of(cloud, 140)
     assert len(packed_cloud.cells) + len(packed_cloud.inside) < 0.6 * cloud.nbytes
+
+
+@pytest.mark.parametrize("count", [0, 1, 99, 100, 101, 150, 151, 377])
+def test_a_packed_list_reads_like_a_list(count: int):
+    items, kept = [(k, np.full(3, k)) for k in range(count)], PackedList[tuple[int, np.ndarray]]()
+    for item in items:
+        kept.append(item)
+    assert len(kept) == count
+    assert bool(kept) == bool(items)
+    assert [k for k, _ in kept] == list(range(count))
+    assert [k for k, _ in kept[1:-1:2]] == list(range(count))[1:-1:2]
+    for place in range(-count, count):
+        np.testing.assert_array_equal(kept[place][1], items[place][1])
+    for place in (count, -count - 1):
+        with pytest.raises(IndexError):
+            kept[place]
