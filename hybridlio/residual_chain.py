@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Protocol
 
-import numpy as np
-
 from hybridlio.estimates import Array, RelativePose, ResidualSource, TakesBack
 from hybridlio.sensors import Frame
 
@@ -30,8 +28,8 @@ class ResidualChain:
 
     Where the initial pose is sure to a decimetre, the first source only proposes where to start. The second looks
     whether that is better, and answers as it would without: a wrong proposal does no harm, and none has to be judged.
-    Where it is not, the first one's judged answer is the second's initial pose, and where the first fails, the initial
-    pose itself.
+    Where it is not, the first one's judged answer is the second's initial pose; where the first fails or leaves a
+    direction open, of which the second may see more, the initial pose itself.
 
     The answer is the second's, with its covariance; where that fails, the first's. Only if both do, the initial pose
     bridges.
@@ -66,26 +64,21 @@ class ResidualChain:
         }
         if fine.ok:
             return replace(fine, source=self.name, details=details)
-        if coarse is not None and coarse.ok:  # the second kept its place by it: as good as a step of its own
+        if coarse is not None and coarse.ok:
+            if isinstance(self._second, TakesBack):  # to keep its place by it, which is as good as a step of its own
+                self._second.take_back(coarse)
             return replace(coarse, source=self.name, drift=fine.drift, details=details)
         return replace(fine, details=details)
 
     def _judged(self, frame: Frame, initial: RelativePose) -> tuple[RelativePose, RelativePose]:
         """Both answers, the second's from the first's."""
         coarse = self._first.refine(frame, initial)
-        # where the first leaves a direction loose, the initial pose still knows something of it
-        start = replace(coarse, covariance=_both(coarse.covariance, initial.covariance)) if coarse.ok else initial
-        return coarse, self._second.refine(frame, start)
+        return coarse, self._second.refine(frame, coarse if coarse.ok and not len(coarse.degenerate) else initial)
 
     def _proposed(self, frame: Frame, initial: RelativePose) -> tuple[RelativePose | None, RelativePose]:
         """The second's answer, from where the first proposes or not; the first's where it is needed."""
         fine = self._second.refine(frame, replace(initial, proposed=self._first.propose(frame, initial)))
-        if fine.ok:
-            return None, fine
-        coarse = self._first.judge(frame, initial)
-        if coarse.ok and isinstance(self._second, TakesBack):
-            self._second.take_back(coarse)
-        return coarse, fine
+        return None if fine.ok else self._first.judge(frame, initial), fine
 
     def take_back(self, initial: RelativePose) -> None:
         """Tell those of the two that want to know that their answer was not believed."""
@@ -96,9 +89,3 @@ class ResidualChain:
 
 def _is_unsure(pose: RelativePose) -> bool:
     return pose.translation_sigma_m > _UNSURE_M
-
-
-def _both(a: Array, b: Array) -> Array:
-    """The covariance of what two independent estimates know together."""
-    joint = np.linalg.inv(np.linalg.inv(a) + np.linalg.inv(b))
-    return np.asarray((joint + joint.T) / 2)
