@@ -7,12 +7,12 @@ takes in, one in ten: fitting them to all would take longer than anything else t
 from __future__ import annotations
 
 import numpy as np
-import small_gicp
 from numpy.typing import NDArray
 
 from hybridlio import se3
 from hybridlio.cell_table import CellTable, cells_of
 from hybridlio.estimates import Array
+from hybridlio.point_tree import build_tree, threads_for
 from hybridlio.surface import Surface
 
 Index = NDArray[np.intp]
@@ -87,7 +87,8 @@ def _with_planes(points: Array, wanted: Index, neighbours: int, threads: int) ->
     neighbours = min(neighbours, len(points))
     if neighbours < _LEAST or not len(wanted):
         return wanted[:0], np.empty((0, 3))
-    index, _ = small_gicp.KdTree(points, threads).batch_knn_search(points[wanted], neighbours, threads)
+    worth = threads_for(2 * len(wanted), threads)  # ten neighbours take twice as long as one or two
+    index, _ = build_tree(points, threads).batch_knn_search(points[wanted], neighbours, worth)
     several = _of_several_rings(points, index)
     near = points.take(index[several], axis=0)
     near -= near.mean(axis=1, keepdims=True)

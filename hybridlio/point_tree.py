@@ -34,7 +34,7 @@ class PointTree:
     """
 
     def __init__(self, points: Array, threads: int) -> None:
-        self._old = _tree(points, threads)
+        self._old = build_tree(points, threads)
         self._settled, self._fresh = len(points), 0
         self._new: tuple[small_gicp.KdTree, _Surroundings] | None = None
 
@@ -51,7 +51,7 @@ class PointTree:
         other = object.__new__(PointTree)
         fresh = points[self._settled :]
         other._old, other._settled, other._fresh = self._old, self._settled, len(fresh)
-        other._new = (_tree(fresh, threads), _Surroundings(fresh)) if len(fresh) else None
+        other._new = (build_tree(fresh, threads), _Surroundings(fresh)) if len(fresh) else None
         return other
 
     def nearest(self, queries: Array, threads: int) -> tuple[Index, Array]:
@@ -109,18 +109,20 @@ class _Surroundings:
         return np.asarray(x * self._steps[0] + y * self._steps[1] + z)
 
 
-def _tree(points: Array, threads: int) -> small_gicp.KdTree:
+def threads_for(queries: int, most: int) -> int:
+    """So many as gain more than waiting for each other costs, which on a busy machine is milliseconds."""
+    return max(1, min(most, queries // _QUERIES_A_THREAD))
+
+
+def build_tree(points: Array, threads: int) -> small_gicp.KdTree:
+    """A tree of points ``(M, 3)``, by so many threads as are worth it."""
     import small_gicp  # what only trains a network does without
 
     return small_gicp.KdTree(points, max(1, min(threads, len(points) // _POINTS_A_THREAD)))
 
 
 def _search(tree: small_gicp.KdTree, size: int, queries: Array, count: int, threads: int) -> tuple[Index, Array, Array]:
-    """Index and squared distance of the nearest of ``size``, and of the second; infinite where that is not asked for.
-
-    With so many threads as gain more than waiting for each other costs, which on a busy machine is milliseconds.
-    """
-    worth = max(1, min(threads, len(queries) // _QUERIES_A_THREAD))
-    index, distance2 = tree.batch_knn_search(queries, min(count, size), worth)
+    """Index and squared distance of the nearest of ``size``, and of the second; infinite where it is not asked for."""
+    index, distance2 = tree.batch_knn_search(queries, min(count, size), threads_for(len(queries), threads))
     second2 = distance2[:, 1].copy() if distance2.shape[1] > 1 else np.full(len(queries), np.inf)
     return index[:, 0].astype(np.int64), distance2[:, 0].copy(), second2
