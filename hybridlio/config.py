@@ -12,7 +12,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from hybridlio.errors import ConfigError
-from hybridlio.files import read_yaml, write_whole
+from hybridlio.files import read_yaml
 from hybridlio.keyframes import KeyframeSettings
 from hybridlio.learned.source_settings import LstmSettings, NetworkResidualSettings
 from hybridlio.recent_scans import RecentScansSettings
@@ -73,11 +73,6 @@ class Config(BaseModel):
 def config_to_yaml(config: Config) -> str:
     """The configuration as YAML text that :func:`load_config` reads back."""
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
-
-
-def save_config(config: Config, path: Path) -> None:
-    """Write the configuration as YAML."""
-    write_whole(path, config_to_yaml(config))
 
 
 def load_config(path: Path) -> Config:

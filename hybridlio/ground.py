@@ -106,11 +106,6 @@ def find_ground(
     return GroundPlane(plane[:3], float(plane[3]), mask)
 
 
-def ground_mask(points: ArrayLike, normals: ArrayLike | None = None, options: GroundOptions | None = None) -> Mask:
-    """Which points ``(N,)`` are ground; arguments and errors as :func:`find_ground`."""
-    return find_ground(points, normals, options).mask
-
-
 def remove_ground(
     points: ArrayLike, normals: ArrayLike | None = None, options: GroundOptions | None = None
 ) -> NDArray[np.float32]:

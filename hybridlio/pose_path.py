@@ -11,7 +11,7 @@ from hybridlio.sensors import NS_PER_S
 
 Array = NDArray[np.float64]
 
-_NEAR_NS = NS_PER_S // 100
+_NEAR_NS = NS_PER_S // 100  # velocities are those over so long to either side
 
 
 class PosePath:
@@ -52,9 +52,8 @@ class PosePath:
 
     def points(self, stamps_ns: NDArray[np.int64], lever_m: Array) -> tuple[Array, Array]:
         """Positions and velocities ``(M, 3)`` in world of a point that sits at ``lever_m`` ``(3,)`` in the body."""
-        half = NS_PER_S // 100
-        before, here, after = (self.at(stamps_ns + step) @ np.r_[lever_m, 1.0] for step in (-half, 0, half))
-        spans = np.clip(stamps_ns + half, *self.stamps_ns[[0, -1]]) - np.clip(
-            stamps_ns - half, *self.stamps_ns[[0, -1]]
+        before, here, after = (self.at(stamps_ns + step) @ np.r_[lever_m, 1.0] for step in (-_NEAR_NS, 0, _NEAR_NS))
+        spans = np.clip(stamps_ns + _NEAR_NS, *self.stamps_ns[[0, -1]]) - np.clip(
+            stamps_ns - _NEAR_NS, *self.stamps_ns[[0, -1]]
         )
         return here[:, :3], (after - before)[:, :3] / np.maximum(spans / NS_PER_S, 1e-9)[:, None]

@@ -15,6 +15,7 @@ from hybridlio.errors import ConfigError, DataError
 from hybridlio.geodesy import GeodeticPoint
 
 NS_PER_S = 1_000_000_000
+FARTHEST_M = 1e4  # no lidar sees farther; what is there is broken data
 LONGEST_INTERPOLATION_NS = 250_000_000  # inertial samples farther apart say nothing of what lies between them
 
 
@@ -24,7 +25,7 @@ class Scan:
 
     Attributes:
         stamp_ns: the time the points refer to once compensated.
-        points: ``(N, 3)`` float32, metres; rows that are not finite are dropped on entry.
+        points: ``(N, 3)`` float32, metres; rows that are not finite, or 10 km away or more, are dropped on entry.
         intensity: ``(N,)`` float32 reflectance 0..1, or None.
         time_offsets_ns: ``(N,)`` int64, each point's time minus ``stamp_ns``; None where the scan needs no motion
             compensation (KITTI ships scans already compensated).
@@ -40,16 +41,17 @@ class Scan:
         if points.ndim != 2 or points.shape[1] != 3:
             raise DataError(f"scan at {self.stamp_ns} ns: points must be (N, 3), got {points.shape}")
         columns = {"intensity": (self.intensity, np.float32), "time_offsets_ns": (self.time_offsets_ns, np.int64)}
-        all_finite = bool(np.isfinite(points).all())
-        finite = np.ones(len(points), dtype=bool) if all_finite else np.isfinite(points).all(axis=1)
+        measurable = np.abs(points) < FARTHEST_M  # false for NaN too
+        whole = bool(measurable.all())
+        kept = np.ones(len(points), dtype=bool) if whole else measurable.all(axis=1)
         for name, (values, dtype) in columns.items():
             if values is None:
                 continue
             values = np.asarray(values, dtype=dtype)
             if values.shape != points.shape[:1]:
                 raise DataError(f"scan at {self.stamp_ns} ns: {name} must be ({len(points)},), got {values.shape}")
-            object.__setattr__(self, name, values if all_finite else values[finite])
-        object.__setattr__(self, "points", points if all_finite else points[finite])
+            object.__setattr__(self, name, values if whole else values[kept])
+        object.__setattr__(self, "points", points if whole else points[kept])
 
     def __len__(self) -> int:
         return len(self.points)

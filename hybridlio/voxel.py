@@ -72,12 +72,6 @@ def label_means(values: Floats, labels: NDArray[np.intp], count: int) -> Floats:
     return (_sums(values, labels, count) / np.bincount(labels, minlength=count)[:, None]).astype(np.float32)
 
 
-def voxel_count(points: ArrayLike, voxel_size_m: float) -> int:
-    """How many voxels of a side hold points, without averaging any; arguments and errors as :func:`voxel_average`."""
-    points, _ = _checked(points, None)
-    return _count(np.ascontiguousarray(points.T), voxel_size_m)
-
-
 def voxel_to_count(
     points: ArrayLike,
     normals: ArrayLike | None = None,

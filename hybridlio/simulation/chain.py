@@ -26,7 +26,6 @@ Array = NDArray[np.float64]
 
 START_NS = 1_700_000_000_000_000_000
 NOISE = ImuNoise()
-SILENT = ImuNoise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 STEP_SIGMAS = np.r_[np.full(3, 1e-3), np.full(3, 0.02)]  # rad, m: of a relative pose
 T_IMU_LIDAR = se3.make(Rotation.from_euler("xyz", (1.0, -0.5, 3.0), degrees=True).as_matrix(), (0.8, -0.3, 0.9))
 

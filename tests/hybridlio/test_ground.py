@@ -3,7 +3,7 @@ import pytest
 
 from hybridlio import se3
 from hybridlio.errors import ConfigError, DataError
-from hybridlio.ground import GroundOptions, find_ground, ground_mask, remove_ground
+from hybridlio.ground import GroundOptions, find_ground, remove_ground
 from hybridlio.normals import estimate_normals
 
 HEIGHT_M = 1.7
@@ -74,7 +74,7 @@ def test_walls_a_volume_of_scatter_and_a_ceiling_are_no_ground(seed):
     [np.empty((0, 3)), *(np.full((n, 3), value) for n, value in [(2, -1.0), (500, -1.0), (9, np.nan), (50, 0.0)])],
 )
 def test_clouds_that_show_nothing_have_no_ground(cloud):
-    assert ground_mask(cloud).tolist() == [False] * len(cloud)
+    assert find_ground(cloud).mask.tolist() == [False] * len(cloud)
     assert find_ground(cloud, np.zeros_like(cloud)).mask.tolist() == [False] * len(cloud)
 
 
@@ -86,7 +86,7 @@ def test_one_ring_of_points_is_a_line_not_ground():
 def test_points_that_are_not_finite_are_never_ground(rng):
     points = road(rng, 2000)
     points[::7] = np.nan
-    mask = ground_mask(points)
+    mask = find_ground(points).mask
     assert not mask[::7].any()
     assert mask.sum() == 2000 - len(points[::7])
 

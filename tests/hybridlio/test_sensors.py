@@ -97,9 +97,10 @@ def test_bad_imu_samples_are_refused_with_the_row(stamps: list[int], gyro: objec
         ImuSamples(np.array(stamps), np.asarray(gyro), np.asarray(accel))
 
 
-def test_a_scan_drops_points_that_are_not_finite_with_their_intensity_and_time() -> None:
+@pytest.mark.parametrize("broken", [np.inf, 1e30, -1e4])
+def test_a_scan_drops_points_that_nothing_can_have_measured_with_their_intensity_and_time(broken: float) -> None:
     points = np.arange(12.0).reshape(4, 3)
-    points[1, 2], points[3, 0] = np.nan, np.inf
+    points[1, 2], points[3, 0] = np.nan, broken
     scan = Scan(7, points, intensity=np.arange(4.0), time_offsets_ns=np.arange(4) * 100)
     assert scan.points.tolist() == [[0, 1, 2], [6, 7, 8]]
     assert scan.intensity is not None

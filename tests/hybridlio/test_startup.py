@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hybridlio.errors import DataError
 from hybridlio.sensors import ImuNoise, ImuSamples
 from hybridlio.startup import GRAVITY_M_S2, start_state
 
@@ -76,3 +77,8 @@ def test_the_covariances_are_positive_definite():
         state = start_state(0, imu, NOISE)
         np.linalg.cholesky(state.covariance)
         np.linalg.cholesky(state.gravity_covariance)
+
+
+def test_an_imu_without_an_accelerometer_is_refused_rather_than_divided_by():
+    with pytest.raises(DataError, match="averages to 0 m/s²"):
+        start_state(0, samples(np.zeros(3)), NOISE)
