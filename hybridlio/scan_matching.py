@@ -148,6 +148,8 @@ class ScanMatching:
         usable = len(seen.points) >= self._settings.min_points and self._map.surface is not None
         observed = self._register(seen, initial, dt_s) if usable else None
         if observed is None or observed.found.matched < self._settings.min_matched:
+            if self._map.surface is None:  # nothing could be made of the scans so far
+                self._waiting = seen.points
             return self._bridge(initial, len(seen.points), observed)
         found = observed.found
         before, self._before = self._path, self._path

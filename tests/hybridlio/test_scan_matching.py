@@ -288,3 +288,12 @@ def test_a_start_that_failed_can_be_followed_by_one_that_works(sequence: Sequenc
         matching.start(empty(frames[0]))
     matching.start(frames[1])
     assert matching.refine(frames[2], guess(true_pose(sequence, 1, 2))).ok
+
+
+def test_a_first_scan_of_one_beam_is_no_map_and_the_next_one_is(sequence: Sequence, frames: list[Frame]):
+    turn = np.linspace(0, 2 * np.pi, 900, endpoint=False)
+    ring = np.column_stack([40 * np.cos(turn), 40 * np.sin(turn), np.full(900, -1.0)])
+    matching = ScanMatching()
+    matching.start(with_points(frames[0], ring))
+    known = [matching.refine(frames[k], guess(true_pose(sequence, k - 1, k))).ok for k in (1, 2, 3)]
+    assert known == [False, True, True]
