@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,11 @@ DRIVES: dict[int, dict[str, Any]] = {
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path, metavar="DIR", help="where to")
+    folder = parser.parse_args().folder
     for seed, settings in DRIVES.items():
-        print(simulate(Path(sys.argv[1]), SimulationConfig(seed=seed, seconds=SECONDS, **settings)), flush=True)
+        print(simulate(folder, SimulationConfig(seed=seed, seconds=SECONDS, **settings)), flush=True)
 
 
 if __name__ == "__main__":

@@ -111,3 +111,10 @@ def test_laps_follow_each_other_without_a_gap():
         command, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_asking_for_help_simulates_nothing(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = run("training_drives.py", "--help")
+    assert (done.returncode, list(tmp_path.iterdir())) == (0, [])
+    assert "shipped weights" in done.stdout

@@ -68,6 +68,14 @@ RawRoot = Annotated[
     Path | None,
     typer.Option("--raw-root", metavar="DIR", help="For KITTI odometry: KITTI's raw data, to take the IMU from."),
 ]
+VerticalAngle = Annotated[
+    float | None,
+    typer.Option(
+        "--vertical-angle",
+        metavar="DEG",
+        help="Raise points by this angle; by default 0.205 for KITTI's own, else 0.",
+    ),
+]
 Frames = Annotated[str | None, typer.Option("--frames", metavar="A:B", help="Only scans A to B-1, counted from 0.")]
 InitialPoseName = Annotated[
     str | None, typer.Option("--initial-pose", metavar="NAME", help=", ".join(INITIAL_POSE_SOURCES))
@@ -125,13 +133,21 @@ def fail(error: BaseException, code: int | None = None) -> NoReturn:
 
 
 def open_data(
-    data: Path, sequence: str | None, reader: str | None, raw_root: Path | None, frames: str | None
+    data: Path,
+    sequence: str | None,
+    reader: str | None,
+    raw_root: Path | None,
+    frames: str | None,
+    vertical_angle_deg: float | None,
 ) -> Sequence:
     """The recording that the options mean, or the asked-for part of it."""
     from hybridlio.datasets.registry import open_sequence
     from hybridlio.datasets.sequence import part_of
 
-    return part_of(open_sequence(data, sequence=sequence, reader=reader, raw_root=raw_root), frames)
+    whole = open_sequence(
+        data, sequence=sequence, reader=reader, raw_root=raw_root, vertical_angle_deg=vertical_angle_deg
+    )
+    return part_of(whole, frames)
 
 
 def settings(config: Path | None, **names: str | None) -> Config:

@@ -35,6 +35,7 @@ def compare(
     ] = None,
     config: common.ConfigFile = None,
     frames: common.Frames = None,
+    vertical_angle: common.VerticalAngle = None,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", metavar="DIR", help="Write compare.json and compare.md there.")
     ] = None,
@@ -51,7 +52,7 @@ def compare(
         _names(backend or settings.backend, tuple(BACKENDS), "--backend"),
         settings,
     )
-    recording = common.open_data(data, sequence, reader, raw_root, frames)
+    recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle)
     with progress("comparing") as tick:
         comparison = run_all(recording, configs, lambda name, done, total: tick(done, total, name))
     say_table(table(comparison))

@@ -29,6 +29,7 @@ def odometry(
     backend: common.BackendName = None,
     config: common.ConfigFile = None,
     frames: common.Frames = None,
+    vertical_angle: common.VerticalAngle = None,
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", metavar="RUN", help="The run folder; by default runs/<sequence>-<date-time>."),
@@ -46,7 +47,7 @@ def odometry(
 
     chosen = common.settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
     estimator = Odometry(config=chosen)  # wrong names fail before the recording is opened
-    recording = common.open_data(data, sequence, reader, raw_root, frames)
+    recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle)
     suited = suited_to(recording, chosen, as_asked=initial_pose is not None or config is not None)
     if suited != chosen:
         chosen, estimator = suited, Odometry(config=suited)

@@ -82,7 +82,7 @@ def kitti_raised(
         return raised(load, angle_deg)
     notes.add(
         f"KITTI's own scans: points are raised by {KITTI_VERTICAL_ANGLE_DEG}° against the error of the lidar's "
-        "vertical angles; vertical_angle_deg=0 leaves them as they are"
+        "vertical angles; vertical_angle_deg=0 (--vertical-angle 0) leaves them as they are"
     )
     return raised(load, KITTI_VERTICAL_ANGLE_DEG)
 

@@ -11,6 +11,7 @@ import hybridlio
 from hybridlio.cli import app
 from hybridlio.config import Config, parse_config
 from hybridlio.datasets.registry import open_sequence
+from hybridlio.keyframes import Keyframes
 from hybridlio.run_folder import FILES
 from hybridlio.trajectory_files import read_tum
 
@@ -318,3 +319,13 @@ def test_progress_goes_to_stderr_so_that_results_can_be_piped(tiny_drive, tmp_pa
 
 def test_the_version_is_the_packages():
     assert ok("--version").split() == ["hybridlio", hybridlio.__version__]
+
+
+def test_the_vertical_angle_can_be_set(tiny_drive, tmp_path, without_pages):
+    said = refused(2, "odometry", tiny_drive, "--vertical-angle", 9)
+    assert "vertical_angle_deg: 9.0 is no calibration error" in said
+    heights = []
+    for name, angle in (("as-is", 0), ("raised", 1)):
+        ok("odometry", tiny_drive, "--vertical-angle", angle, "--frames", ":3", "-o", tmp_path / name)
+        heights.append(float(Keyframes.load(tmp_path / name / "keyframes.npz").points(0)[:, 2].mean()))
+    assert heights[1] > heights[0] + 0.05
