@@ -6,16 +6,29 @@ of half the weighted squared distances to the planes, right perturbation.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Normals are off by a few hundredths of a radian, so points on one plane alone seem to say something of motion along
-# it: this much of a point's information, per point, is that noise.
-NORMAL_NOISE = 2e-3
-# Edges of smooth walls were seen to pretend up to three times this. What says less may be that, or a few trunks.
-WEAK_NORMAL_NOISE = 8e-3
+
+class NormalNoise(NamedTuple):
+    """What normals pretend: some hundredths of a radian off, they have points on one plane say something along it.
+
+    Attributes:
+        mean: so much of a point's information, per point, is that noise.
+        most: edges of smooth walls were seen to pretend up to three times this. What says less may be that, or a few
+            trunks.
+    """
+
+    mean: float
+    most: float
+
+
+NORMAL_NOISE = NormalNoise(2e-3, 8e-3)
+NORMAL_NOISE_OF_THIN = NormalNoise(3e-4, 1.3e-3)  # where planes count the less the thicker they are
 FLOOR_SIGMAS = np.r_[np.full(3, 5e-5), np.full(3, 1e-3)]  # rad, m: no single step is known better
 UNKNOWN_SIGMA_M = 10.0
 _HALF = 0.5  # an eigenvector lies in what is held, or at a right angle to it
@@ -42,14 +55,14 @@ def scaled_spectrum(information: Array, levers_m: Array | None = None) -> tuple[
     return values, vectors, scale
 
 
-def strong_directions(information: Array, values: Array, normal_noise: float = NORMAL_NOISE) -> NDArray[np.bool_]:
+def strong_directions(information: Array, values: Array, normal_noise: float = NORMAL_NOISE.mean) -> NDArray[np.bool_]:
     """Which eigenvalues ``(6,)`` of :func:`scaled_spectrum` stand out of the noise of the normals."""
     strong: NDArray[np.bool_] = values >= 3 * normal_noise * np.trace(information[3:, 3:])
     return strong
 
 
 def weak_basis(
-    information: Array, levers_m: Array | None = None, normal_noise: float = NORMAL_NOISE
+    information: Array, levers_m: Array | None = None, normal_noise: float = NORMAL_NOISE.mean
 ) -> tuple[Array, Array]:
     """The directions ``(6, D)`` that do not stand out, orthonormal in one unit, and what takes them to the tangent."""
     values, vectors, scale = scaled_spectrum(information, levers_m)
@@ -57,7 +70,7 @@ def weak_basis(
 
 
 def degenerate_directions(
-    information: Array, levers_m: Array | None = None, normal_noise: float = NORMAL_NOISE
+    information: Array, levers_m: Array | None = None, normal_noise: float = NORMAL_NOISE.mean
 ) -> Array:
     """``(D, 6)`` unit tangent directions along which the matches say no more than the noise of their normals."""
     basis, to_tangent = weak_basis(information, levers_m, normal_noise)
@@ -70,7 +83,7 @@ def covariance_of(
     sigma_m: float,
     scale: float,
     levers_m: Array | None = None,
-    normal_noise: float = NORMAL_NOISE,
+    normal_noise: float = NORMAL_NOISE.mean,
     floor_sigmas: Array = FLOOR_SIGMAS,
     held: Array | None = None,
 ) -> Array:
@@ -107,7 +120,7 @@ def newton_step(
     gradient: Array,
     limit_m: float = np.inf,
     levers_m: Array | None = None,
-    normal_noise: float = NORMAL_NOISE,
+    normal_noise: float = NORMAL_NOISE.mean,
     held: Array | None = None,
 ) -> Array:
     """The step ``(6,)`` to the minimum of the quadratic, at most ``limit_m``, and none along degenerate directions.

@@ -66,7 +66,7 @@ class LocalMap:
         self._keyframe = T_map_lidar
         self.keyframes += 1
         if self.surface is not None:
-            self.surface = self.surface.grown(*new, self._settings.threads)
+            self.surface = self.surface.grown(new.points, new.normals, self._settings.threads, new.weights)
         if self._wear() > _WORN_OUT:
             self._renew()
 
@@ -86,9 +86,10 @@ class LocalMap:
         """Make the surface of what is remembered within the radius; of nothing there is none."""
         assert self._keyframe is not None
         self._middle = self._keyframe[:3, 3]
-        points, normals = self._cells.remembered()
-        away = points - self._middle
+        planes = self._cells.remembered()
+        away = planes.points - self._middle
         near = np.flatnonzero(np.einsum("ij,ij->i", away, away) < self._settings.radius_m**2)
         self.surface = None
         if len(near):
-            self.surface = Surface(points.take(near, axis=0), normals.take(near, axis=0), self._settings.threads)
+            points, normals, weights = (column.take(near, axis=0) for column in planes)
+            self.surface = Surface(points, normals, self._settings.threads, weights)

@@ -17,7 +17,7 @@ import small_gicp
 
 from hybridlio import se3
 from hybridlio.estimates import Array
-from hybridlio.information import WEAK_NORMAL_NOISE, covariance_of, degenerate_directions
+from hybridlio.information import NORMAL_NOISE, covariance_of, degenerate_directions
 from hybridlio.keyframes import Keyframes
 from hybridlio.odometry_chain import Index, OdometryChain
 from hybridlio.registration import Registration, RegistrationSettings, fit_at, register
@@ -196,7 +196,7 @@ class Verifier:
             return f"only {fit.matched:.0%} of the points match"
         if fit.cost > self._settings.max_cost:
             return f"the surfaces do not fit (cost {fit.cost:.2f})"
-        loose = degenerate_directions(found.hessian, found.levers_m, WEAK_NORMAL_NOISE)
+        loose = degenerate_directions(found.hessian, found.levers_m, NORMAL_NOISE.most)
         return "a direction is not held" if len(loose) else ""
 
     def _differ(self, there: Registration, back: Registration) -> str:

@@ -6,6 +6,8 @@ takes in, one in ten: fitting them to all would take longer than anything else t
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,9 +21,23 @@ Index = NDArray[np.intp]
 
 MOST = 10  # points a cell
 _APART_M = 0.1
+_THIN_M = 0.03  # thick as this, a plane's points lie off it by 1.4 times as much as those of the thinnest
 _LEAST = 5  # neighbours that make a plane
 _RING_RAD = np.deg2rad(0.1)  # beams of spinning lidars are 0.3° apart and more
 _LEAST_OF_OTHERS = 2  # of ten
+
+
+class Planes(NamedTuple):
+    """Points with the planes about them, map frame.
+
+    Attributes:
+        points, normals: ``(M, 3)`` each.
+        weights: ``(M,)``, how much each plane counts.
+    """
+
+    points: Array
+    normals: Array
+    weights: Array
 
 
 class MapCells:
@@ -37,40 +53,39 @@ class MapCells:
     def __init__(self, side_m: float, horizon: int, neighbours: int, threads: int) -> None:
         self._side_m, self._horizon, self._neighbours, self._threads = side_m, horizon, neighbours, threads
         self._table = CellTable()
-        self._parts: list[tuple[Array, Array]] = []  # of every insertion since what was forgotten was dropped
+        self._parts: list[Planes] = []  # of every insertion since what was forgotten was dropped
         self._insertions = 0
 
-    def insert(self, points: Array, T_map_lidar: Array, known: Surface | None) -> tuple[Array, Array]:
+    def insert(self, points: Array, T_map_lidar: Array, known: Surface | None) -> Planes:
         """Take in what there is room for of a scan's points ``(N, 3)``, lidar frame; ``known`` is of the points so far.
 
         Points that lie beside one of ``known``, or that have no neighbours to make a plane, are left out.
 
         Returns:
-            the points ``(M, 3)`` taken in, and their normals; map frame.
+            those taken in.
         """
         moved = se3.transform(T_map_lidar, points)
         labels, cells = cells_of(moved, self._side_m)
         taken = _with_room(MOST - self._table.held(cells), labels)
         if known is not None and len(taken):
             taken = taken[known.nearest(moved[taken], self._threads)[1] >= _APART_M**2]
-        taken, normals = _with_planes(points, taken, self._neighbours, self._threads)
+        taken, normals, weights = _with_planes(points, taken, self._neighbours, self._threads)
         self._table.hit(cells, np.bincount(labels[taken], minlength=len(cells)), self._insertions)
         self._insertions += 1
-        new = moved[taken], normals @ T_map_lidar[:3, :3].T
+        new = Planes(moved[taken], normals @ T_map_lidar[:3, :3].T, weights)
         self._parts.append(new)
         return new
 
-    def remembered(self) -> tuple[Array, Array]:
-        """All points ``(M, 3)`` and normals but those of cells that are forgotten, which are dropped."""
-        points = np.concatenate([np.empty((0, 3)), *(points for points, _ in self._parts)])
-        normals = np.concatenate([np.empty((0, 3)), *(normals for _, normals in self._parts)])
+    def remembered(self) -> Planes:
+        """All but those of cells that are forgotten, which are dropped."""
+        everything = Planes(*(np.concatenate(column) for column in zip(*self._parts, strict=True)))
         self._table.forget(self._insertions - self._horizon)
-        labels, cells = cells_of(points, self._side_m)
+        labels, cells = cells_of(everything.points, self._side_m)
         kept = self._table.has(cells)
         if not kept.all():
-            points, normals = points[kept[labels]], normals[kept[labels]]
-        self._parts = [(points, normals)]
-        return points, normals
+            everything = Planes(*(column[kept[labels]] for column in everything))
+        self._parts = [everything]
+        return everything
 
 
 def _with_room(room: NDArray[np.int64], cells: Index) -> Index:
@@ -82,17 +97,23 @@ def _with_room(room: NDArray[np.int64], cells: Index) -> Index:
     return np.sort(order[rank < room[ordered]])
 
 
-def _with_planes(points: Array, wanted: Index, neighbours: int, threads: int) -> tuple[Index, Array]:
-    """Those of ``wanted`` whose nearest points make a plane, and its normals ``(M, 3)``, of least spread."""
+def _with_planes(points: Array, wanted: Index, neighbours: int, threads: int) -> tuple[Index, Array, Array]:
+    """Those of ``wanted`` whose nearest points make a plane, its normals ``(M, 3)``, of least spread, and weights.
+
+    A hedge's or a trunk's points make no plane, and pull a scan anywhere: planes weigh by the inverse square of what a
+    scan's points lie off them. That was seen to grow with their thickness, the root mean square along the normal.
+    """
     neighbours = min(neighbours, len(points))
     if neighbours < _LEAST or not len(wanted):
-        return wanted[:0], np.empty((0, 3))
+        return wanted[:0], np.empty((0, 3)), np.empty(0)
     worth = threads_for(2 * len(wanted), threads)  # ten neighbours take twice as long as one or two
     index, _ = build_tree(points, threads).batch_knn_search(points[wanted], neighbours, worth)
     several = _of_several_rings(points, index)
     near = points.take(index[several], axis=0)
     near -= near.mean(axis=1, keepdims=True)
-    return wanted[several], np.asarray(np.linalg.eigh(near.transpose(0, 2, 1) @ near)[1][:, :, 0])
+    spread, axes = np.linalg.eigh(near.transpose(0, 2, 1) @ near)
+    thick2 = np.maximum(spread[:, 0], 0.0) / neighbours
+    return wanted[several], np.asarray(axes[:, :, 0]), np.asarray(_THIN_M**2 / (_THIN_M**2 + thick2))
 
 
 def _of_several_rings(points: Array, near: NDArray[np.uint64]) -> NDArray[np.bool_]:

@@ -18,12 +18,7 @@ from numpy.typing import NDArray
 
 from hybridlio import se3
 from hybridlio.estimates import Array
-from hybridlio.information import (
-    UNKNOWN_SIGMA_M,
-    WEAK_NORMAL_NOISE,
-    covariance_of,
-    weak_basis,
-)
+from hybridlio.information import UNKNOWN_SIGMA_M, covariance_of, weak_basis
 from hybridlio.registration import Registration, RegistrationSettings, register
 from hybridlio.surface import Surface
 
@@ -50,6 +45,7 @@ class Observed:
         seen: ``(D,)`` of which of them the points surely say something.
         sigmas_m: ``(D,)`` standard deviation along each: of what is seen as if the points were independent, of what is
             not as it is, 10 m where nothing is known.
+        normal_noise: how much of a point's information, per point, its normal's noise pretends.
     """
 
     found: Registration
@@ -57,6 +53,7 @@ class Observed:
     along: Array
     seen: NDArray[np.bool_]
     sigmas_m: Array
+    normal_noise: float
 
     @property
     def degenerate(self) -> Array:
@@ -71,7 +68,7 @@ class Observed:
             scale: how much larger it is than independent points would make it.
         """
         found = self.found
-        strong = covariance_of(found.hessian, found.sigma_m, scale, found.levers_m, held=self.basis)
+        strong = covariance_of(found.hessian, found.sigma_m, scale, found.levers_m, self.normal_noise, held=self.basis)
         sigmas_m = np.where(self.seen, np.sqrt(scale), 1.0) * self.sigmas_m
         weak = self.along * np.minimum(sigmas_m, UNKNOWN_SIGMA_M)[:, None]
         return np.asarray(strong + weak.T @ weak)
@@ -92,9 +89,10 @@ def observe(
         far: nobody knows ``initial`` to a few decimetres: along what is not seen, weigh the costs farther off.
     """
     found = register(surface, source, initial, settings, kernel_start_m)
-    basis, to_tangent = weak_basis(found.hessian, found.levers_m, WEAK_NORMAL_NOISE)
+    noise = surface.normal_noise
+    basis, to_tangent = weak_basis(found.hessian, found.levers_m, noise.most)
     if not basis.shape[1]:
-        return Observed(found, basis, np.empty((0, 6)), np.empty(0, dtype=bool), np.empty(0))
+        return Observed(found, basis, np.empty((0, 6)), np.empty(0, dtype=bool), np.empty(0), noise.mean)
     beside = _Beside(surface, source, settings, basis, to_tangent)
     weak = beside.look(found)
     for _ in range(_ROUNDS):
@@ -111,7 +109,7 @@ def observe(
         for i in np.flatnonzero(~seen):
             ways_m[i], sigmas_m[i] = beside.weigh(found, here, weak.along[i])
         found = beside.register(found.pose @ se3.exp(ways_m @ weak.along), settings)
-    return Observed(found, basis, weak.along, seen, sigmas_m)
+    return Observed(found, basis, weak.along, seen, sigmas_m, noise.mean)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ import numpy as np
 
 from hybridlio import se3
 from hybridlio.estimates import Array
-from hybridlio.information import WEAK_NORMAL_NOISE, newton_step
+from hybridlio.information import newton_step
 from hybridlio.surface import Matches, Neighbours, Surface, System
 
 _ROTATION_CONVERGED_RAD = 2e-5
@@ -116,7 +116,8 @@ def register(
         held: ``(6, D)`` directions that stay, of :func:`hybridlio.information.newton_step`, instead of the weak ones.
     """
     kernel_m, threads = max(settings.kernel_m, kernel_start_m), settings.threads
-    descent, neighbours = _Descent(settings, initial, kernel_m, held), Neighbours(surface, source, threads)
+    descent = _Descent(settings, initial, kernel_m, held, surface.normal_noise.most)
+    neighbours = Neighbours(surface, source, threads)
     for _ in range(_MOST_MATCHES):
         again = descent.by(neighbours.matches(descent.pose, max(settings.max_distance_m, 3 * descent.kernel_m)))
         if not again:
@@ -127,8 +128,10 @@ def register(
 class _Descent:
     """Steps down from a pose, by matches that are made anew once the pose has moved too far."""
 
-    def __init__(self, settings: RegistrationSettings, pose: Array, kernel_m: float, held: Array | None) -> None:
-        self.pose, self.kernel_m = pose, kernel_m
+    def __init__(
+        self, settings: RegistrationSettings, pose: Array, kernel_m: float, held: Array | None, normal_noise: float
+    ) -> None:
+        self.pose, self.kernel_m, self._normal_noise = pose, kernel_m, normal_noise
         self._settings, self._held = settings, held
         self._steps, self._converged = 0, False
         self._matches: Matches
@@ -142,7 +145,7 @@ class _Descent:
             step = np.zeros(6)
             if len(matches) >= 6:
                 system = self._system
-                step = newton_step(system.hessian, system.gradient, np.inf, levers_m, WEAK_NORMAL_NOISE, self._held)
+                step = newton_step(system.hessian, system.gradient, np.inf, levers_m, self._normal_noise, self._held)
             way, self._steps = way + step, self._steps + 1
             narrow = self.kernel_m == self._settings.kernel_m
             self.kernel_m = max(self._settings.kernel_m, self.kernel_m / 2)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.estimates import Array
-from hybridlio.information import lever_arms
+from hybridlio.information import NORMAL_NOISE, NORMAL_NOISE_OF_THIN, lever_arms
 from hybridlio.point_tree import PointTree
 
 
@@ -35,7 +35,7 @@ class Matches:
     Attributes:
         pose: ``(4, 4)`` that pose.
         source: ``(N, 3)`` the points, scan frame.
-        planes: ``(N, 4)`` normal n, and n·v of any point v in the plane.
+        planes: ``(N, 5)`` normal n, n·v of any point v in the plane, and how much it counts, of :class:`Surface`.
         rows: ``(7, N)`` derivatives of the distances by a right perturbation of the pose, and the distances.
     """
 
@@ -70,7 +70,7 @@ class Matches:
         On the way the distances are linear: after a milliradian and 50 m that is off by a twentieth of a millimetre.
         """
         distances = self.rows[6] if xi is None else self.rows[6] + xi @ self.rows[:6]
-        weights = (kernel_m**2 / (kernel_m**2 + distances * distances)) ** 2
+        weights = self.planes[:, 4] * (kernel_m**2 / (kernel_m**2 + distances * distances)) ** 2
         weighted = self.rows[:6] * weights
         return System(weighted @ self.rows[:6].T, weighted @ distances, distances, weights)
 
@@ -82,18 +82,24 @@ class Surface:
         points: ``(M, 3)`` metres, one at least.
         normals: ``(M, 3)`` unit vectors.
         threads: for building the tree.
+        weights: ``(M,)``, how much each plane counts, the less the thicker it is; by default 1.
+
+    Attributes:
+        normal_noise: what its normals pretend.
     """
 
-    def __init__(self, points: Array, normals: Array, threads: int = 2) -> None:
+    def __init__(self, points: Array, normals: Array, threads: int = 2, weights: Array | None = None) -> None:
         self.points = points
-        self._planes = _planes(points, normals)
+        self.normal_noise = NORMAL_NOISE if weights is None else NORMAL_NOISE_OF_THIN
+        self._planes = _planes(points, normals, weights)
         self._tree = PointTree(points, threads)
 
-    def grown(self, points: Array, normals: Array, threads: int = 2) -> Surface:
+    def grown(self, points: Array, normals: Array, threads: int = 2, weights: Array | None = None) -> Surface:
         """This one and more points after its own, for less than making it of all; it stays as it is."""
         other = object.__new__(Surface)
         other.points = np.concatenate([self.points, points])
-        other._planes = np.concatenate([self._planes, _planes(points, normals)])
+        other.normal_noise = self.normal_noise
+        other._planes = np.concatenate([self._planes, _planes(points, normals, weights)])
         other._tree = self._tree.grown(other.points, threads)
         return other
 
@@ -120,12 +126,13 @@ class Surface:
         return index, (np.sqrt(second2) - np.sqrt(first2)) / 2
 
     def planes(self, index: NDArray[np.int64]) -> Array:
-        """``(N, 4)`` of the points: normal n, and n·v."""
+        """``(N, 5)`` of the points: normal n, n·v, and weight."""
         return self._planes.take(index, axis=0)  # much quicker than brackets
 
 
-def _planes(points: Array, normals: Array) -> Array:
-    return np.column_stack([normals, np.einsum("ij,ij->i", normals, points)])
+def _planes(points: Array, normals: Array, weights: Array | None) -> Array:
+    weights = np.ones(len(points)) if weights is None else weights
+    return np.column_stack([normals, np.einsum("ij,ij->i", normals, points), weights])
 
 
 class Neighbours:
