@@ -25,6 +25,7 @@ from hybridlio.surface import Surface
 _STEP_M = 0.5  # more than neighbours lie apart, so that points find others there
 _STEPS = 6  # down the other directions, there
 _SEEN = 4.5  # times the scatter: between smooth walls the rise was at most 3.5 times that, in a field 6 and more
+_SEEN_SCALE = 6.0  # of a seen direction's variance: the few points that see it stand on a few trunks, and share errors
 _NEAR_M = 0.1  # a parabola through costs half a metre apart is good for so far
 _ROUNDS = 4
 _OFFSETS_M = np.linspace(-2.0, 2.0, 9)
@@ -65,11 +66,11 @@ class Observed:
         """``(6, 6)`` rad² and m², rotation first: of the strong directions, and along the weak ones.
 
         Args:
-            scale: how much larger it is than independent points would make it.
+            scale: how much larger that of the strong directions is than independent points would make it.
         """
         found = self.found
         strong = covariance_of(found.hessian, found.sigma_m, scale, found.levers_m, self.normal_noise, held=self.basis)
-        sigmas_m = np.where(self.seen, np.sqrt(scale), 1.0) * self.sigmas_m
+        sigmas_m = np.where(self.seen, np.sqrt(_SEEN_SCALE), 1.0) * self.sigmas_m
         weak = self.along * np.minimum(sigmas_m, UNKNOWN_SIGMA_M)[:, None]
         return np.asarray(strong + weak.T @ weak)
 

@@ -28,7 +28,7 @@ def test_gradient_and_hessian_are_those_of_the_weighted_cost(rng: np.random.Gene
     # Gauss-Newton leaves out the residuals' curvature: put the points on their planes and there is none
     normals = matches.planes[:, :3]
     offsets = np.einsum("ij,ij->i", se3.transform(pose, matches.source), normals)
-    flat = Matches.of(pose, matches.source, np.column_stack([normals, offsets]))
+    flat = Matches.of(pose, matches.source, np.column_stack([normals, offsets, matches.planes[:, 4]]))
     exact = flat.system(0.1)
 
     def flat_cost(xi: np.ndarray) -> float:
