@@ -169,15 +169,15 @@ def test_one_beams_points_make_no_plane(beams_deg: tuple[float, ...], planes: bo
 
 def test_planes_weigh_less_the_thicker_they_are(rng: np.random.Generator):
     """Ground with the noise of a lidar counts in full, a hedge's points hardly; between them lies rough ground."""
-    local_map, weight = LocalMap(SETTINGS), {}
-    for name, half_thick_m, x in (("smooth", 0.01, 0.0), ("rough", 0.05, 40.0), ("hedge", 0.6, -40.0)):
-        points = floor(rng)
+    local_map, middles = LocalMap(SETTINGS), {"smooth": 0.0, "rough": 40.0, "hedge": -40.0}
+    for half_thick_m, x in zip((0.01, 0.05, 0.6), middles.values(), strict=True):
+        points = floor(rng) + np.array([x, 0.0, 0.0])
         points[:, 2] += rng.uniform(-half_thick_m, half_thick_m, len(points))
-        local_map.insert(points + [x, 0.0, 0.0], at(0.0))
+        local_map.insert(points, at(0.0))
     assert local_map.surface is not None
     planes = local_map.surface.planes(np.arange(len(local_map.surface.points)))
-    for name, x in (("smooth", 0.0), ("rough", 40.0), ("hedge", -40.0)):
-        weight[name] = np.median(planes[np.abs(local_map.surface.points[:, 0] - x) < 12, 4])
+    x = local_map.surface.points[:, 0]
+    weight = {name: np.median(planes[np.abs(x - middle) < 12, 4]) for name, middle in middles.items()}
     assert weight["smooth"] > 0.9
     assert 0.3 < weight["rough"] < 0.8
     assert weight["hedge"] < 0.05
