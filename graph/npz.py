@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import io
 import os
-import zipfile
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 
-from hybridlio.errors import DataError, HybridLioError
+from hybridlio.errors import DataError
 from hybridlio.estimates import Array
-from hybridlio.files import write_whole
+from hybridlio.files import UNREADABLE_NPZ, write_whole
 from hybridlio.graph import coordinates as co
 from hybridlio.graph.edge_table import FORMS
 from hybridlio.graph.graph_data import GraphData
@@ -110,7 +109,7 @@ def read_npz(path: str | os.PathLike[str]) -> PoseGraph:
         return _assemble(arrays)
     except OSError as error:
         raise DataError(f"cannot read {path}: {error}") from error
-    except (KeyError, ValueError, TypeError, IndexError, EOFError, zipfile.BadZipFile, HybridLioError) as error:
+    except UNREADABLE_NPZ as error:
         raise DataError(f"{path}: no pose graph, or a damaged one: {error}") from error
 
 

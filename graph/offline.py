@@ -94,9 +94,9 @@ def smooth(
         ConfigError: an unknown treatment.
         DataError: loops are asked for, and the record has no keyframes.
     """
-    report = progress or _silent
+    report, robust = progress or _silent, check_treatment(robust)  # before the search for loops, which takes long
     fixes = [GpsGroup(record, gps if isinstance(gps, GpsOptions) else GpsOptions())] if gps else []
-    added = Added([*fixes, *_with_loops(groups, record, loops, report)], check_treatment(robust))
+    added = Added([*fixes, *_with_loops(groups, record, loops, report)], robust)
     states = _online_states(record)
     error_before: float | None = None
     for number in range(_ROUNDS):

@@ -5,11 +5,18 @@ from __future__ import annotations
 import contextlib
 import os
 import uuid
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 from hybridlio.errors import DataError, HybridLioError
+
+# what reading an .npz file that is damaged, or holds something else, can raise
+UNREADABLE_NPZ = (
+    OSError, ValueError, KeyError, IndexError, TypeError, EOFError, BadZipFile, zlib.error, HybridLioError
+)  # fmt: skip
 
 
 @contextlib.contextmanager

@@ -92,6 +92,8 @@ def align_fixes(
     Raises:
         EstimationError: too few fixes in the path's time.
     """
+    if not fixes:
+        raise EstimationError("no GPS fixes to place the run on; the recording needs some, see gps.csv")
     up = up_world / np.linalg.norm(up_world)
     fit = _Fit(path, fixes, lever_m, up, up_sigma_rad)
     shift = fit.best_shift(max_shift_s) if max_shift_s > 0 else 0.0

@@ -6,17 +6,15 @@ the default settings. During a run, packed, it takes five ninths of that in memo
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.errors import ConfigError, DataError
 from hybridlio.estimates import Array
-from hybridlio.files import writing_whole
+from hybridlio.files import UNREADABLE_NPZ, writing_whole
 from hybridlio.packing import PackedCloud
 from hybridlio.sensors import Scan
 from hybridlio.voxel import voxel_average
@@ -26,7 +24,6 @@ RESOLUTION_M = 0.005
 _FARTHEST_M = RESOLUTION_M * np.iinfo(np.int16).max
 _ENOUGH_POINTS = 30_000  # averaging more of a scan's points takes longer and moves the means by millimetres
 _MIN_POINTS = 200
-_UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, BadZipFile, zlib.error, DataError)
 
 
 @dataclass(frozen=True)
@@ -117,7 +114,7 @@ class Keyframes:
                 ends = np.cumsum(counts)
                 clouds = tuple(points[end - count : end] for end, count in zip(ends, counts, strict=True))
                 return cls(file["rows"], file["stamps_ns"], clouds)
-        except _UNREADABLE as error:
+        except UNREADABLE_NPZ as error:
             raise DataError(f"{path}: not the keyframes of a run ({error}); run `hybridlio odometry` again") from error
 
 

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybridlio.errors import DataError
 from hybridlio.estimates import RelativePose, State
-from hybridlio.files import writing_whole
+from hybridlio.files import UNREADABLE_NPZ, writing_whole
 from hybridlio.geodesy import GeodeticPoint
 from hybridlio.keyframes import Keyframes
 from hybridlio.record_steps import keyframe_arrays, relative_arrays, relatives, with_keyframes
@@ -26,7 +24,6 @@ Array = NDArray[np.float64]
 FORMAT_VERSION = 2
 _READABLE = (1, 2)  # the first had no poses relative to keyframes
 # what NumPy, zip and the checks of the parts raise at a file that is cut off, damaged or something else
-_UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, BadZipFile, zlib.error, DataError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +118,7 @@ class Record:
         try:
             with np.load(path, allow_pickle=False) as file:
                 return _from_arrays({name: file[name] for name in file.files})
-        except _UNREADABLE as error:
+        except UNREADABLE_NPZ as error:
             raise DataError(f"{path}: not a record of a run ({error}); run `hybridlio odometry` again") from error
 
 

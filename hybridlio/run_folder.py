@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybridlio.errors import ConfigError, DataError
 from hybridlio.estimates import RelativePose
-from hybridlio.files import write_whole, writing_whole
+from hybridlio.files import UNREADABLE_NPZ, write_whole, writing_whole
 from hybridlio.initial_pose import unknown_motion_covariance
 from hybridlio.metrics import Steps
 from hybridlio.sensors import NS_PER_S
@@ -176,13 +176,22 @@ def read_run(path: Path) -> StoredRun:
     whole = read_tum(path / POSES)
     reference = read_tum(path / REFERENCE) if (path / REFERENCE).is_file() else None
     try:
-        metrics = json.loads((path / METRICS).read_text(encoding="utf-8"))
+        metrics = _metrics(path / METRICS)
         with np.load(path / COVARIANCES, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         estimated = arrays["estimated"]
         covered = Trajectory(whole.stamps_ns, whole.poses, arrays["absolute"])
         trajectory = select(covered, np.flatnonzero(estimated))
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        raise DataError(f"{path}: its {METRICS} or {COVARIANCES} cannot be read ({error}); run again") from error
+    except UNREADABLE_NPZ as error:
+        what = f"its {METRICS}, {POSES} or {COVARIANCES} cannot be read"
+        raise DataError(f"{path}: {what} ({error}); run again") from error
     steps = Steps(arrays["relative_poses"], arrays["relative"]) if "relative" in arrays else None
     return StoredRun(path, trajectory, whole.stamps_ns[~estimated], steps, reference, metrics)
+
+
+def _metrics(path: Path) -> dict[str, Any]:
+    metrics = json.loads(path.read_text(encoding="utf-8"))
+    missing = {"sequence", "notes"} - set(metrics)
+    if not isinstance(metrics, dict) or missing:
+        raise ValueError(f"no {' and '.join(sorted(missing)) or 'object'} in {path.name}")
+    return metrics

@@ -92,3 +92,10 @@ def test_a_group_sees_the_covariances_of_the_solved_graph(drive: Any):
 def test_a_treatment_of_no_known_name_is_refused(drive: Any):
     with pytest.raises(ConfigError, match=r"no 'magic'.*huber.*gnc"):
         smooth(drive.record(multiplied(drive)), robust="magic")
+
+
+def test_a_treatment_of_no_known_name_is_refused_before_loops_are_looked_for(drive: Any):
+    told: list[str] = []
+    with pytest.raises(ConfigError, match="no 'magic'"):
+        smooth(drive.record(multiplied(drive)), lambda stage, *_: told.append(stage), loops=True, robust="magic")
+    assert told == []

@@ -159,7 +159,7 @@ def test_too_few_fixes_are_a_clear_error(drive: Any):
     record = with_fixes(drive, 1)
     with pytest.raises(EstimationError, match=r"2 of 2 GPS fixes lie in the run's time; 3 are needed"):
         smooth(replace(record, gps=record.gps[5:7]), gps=True)
-    with pytest.raises(EstimationError, match=r"0 of 0 GPS fixes.*3 are needed"):
+    with pytest.raises(EstimationError, match="no GPS fixes to place the run on"):
         smooth(replace(record, gps=()), gps=True)
 
 

@@ -222,3 +222,32 @@ def test_a_folder_without_a_run_is_refused(tmp_path):
         run_folder.read_run(tmp_path)
     with pytest.raises(DataError, match="no such folder"):
         run_folder.read_run(tmp_path / "none")
+
+
+def _halved(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def _flipped(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    third = len(content) // 3
+    content[third : third + 60] = bytes(byte ^ 0xFF for byte in content[third : third + 60])
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        ("covariances.npz", _halved),
+        ("covariances.npz", _flipped),
+        ("metrics.json", _halved),
+        ("metrics.json", lambda path: path.write_text("[]")),
+        ("metrics.json", lambda path: path.write_text('{"sequence": "town"}')),
+        ("poses_tum.txt", lambda path: path.write_text("".join(path.read_text().splitlines(True)[:5]))),
+    ],
+)
+def test_a_damaged_run_is_refused_with_its_folder(folder, tmp_path, name, damage):
+    damaged = shutil.copytree(folder, tmp_path / "run")
+    damage(damaged / name)
+    with pytest.raises(DataError, match=rf"{damaged}: its metrics.json, poses_tum.txt or covariances.npz cannot"):
+        run_folder.read_run(damaged)
