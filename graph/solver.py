@@ -13,9 +13,11 @@ from hybridlio.estimates import Array
 # variables, which would make each update cost as much as the run is long. The newest are always solved in full.
 _WILDFIRE_THRESHOLD = 1.0
 _EAGER = 1e-3
+# Far from the origin a little turn of the whole path moves its newest part by metres, all alike, which makes no other
+# factors: only turns do, and moves against each other.
 _RELINEARISE = {
-    "x": np.r_[np.full(3, 0.02), np.full(3, 1.0)],  # pose: rad, m
-    "m": np.r_[np.full(3, 0.02), np.full(3, 1.0)],  # pose on scan matching's own path
+    "x": np.r_[np.full(3, 0.02), np.full(3, 5.0)],  # pose: rad, m
+    "m": np.r_[np.full(3, 0.02), np.full(3, 5.0)],  # pose on scan matching's own path
     "v": np.full(3, 1.0),  # velocity, m/s
     "b": np.r_[np.full(3, 0.1), np.full(3, 0.01)],  # biases: m/s², rad/s
     "g": np.full(3, 0.1),  # gravity, m/s²
