@@ -6,15 +6,19 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
 
 from hybridlio import se3
 from hybridlio.errors import ConfigError
+from hybridlio.estimates import RelativePose
+from hybridlio.graph import online
 from hybridlio.graph.fixed_lag import FixedLagBackend
 from hybridlio.graph.inertial_steps import InertialSteps
 from hybridlio.graph.online import IncrementalBackend
-from hybridlio.sensors import Calibration, ImuNoise, ImuSamples
+from hybridlio.sensors import Calibration, Frame, ImuNoise, ImuSamples, Scan
+from hybridlio.startup import start_state
 
 
 def drive_through(backend: IncrementalBackend, chain: Any, with_imu: bool = True) -> list[int]:
@@ -60,3 +64,38 @@ def test_memory_stops_growing_at_the_lag(chain: Callable[..., Any]) -> None:
 def test_a_lag_shorter_than_the_start_needs_is_refused() -> None:
     with pytest.raises(ConfigError, match="too short"):
         FixedLagBackend(InertialSteps(Calibration(), ImuNoise()), lag_scans=5)
+
+
+def test_far_from_the_start_a_step_touches_no_more_of_the_graph_than_near_it(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There a milliradian that the whole path turns by is a metre, by which all its scans move alike."""
+    touched: list[int] = []
+    make = online.incremental_solver
+
+    class Counting:
+        def __init__(self) -> None:
+            self._solver = make()
+
+        def update(self, graph: gtsam.NonlinearFactorGraph, *arguments: Any) -> None:
+            result = self._solver.update(graph, *arguments)
+            touched.extend([result.getVariablesReeliminated()] if graph.size() else [])  # not where scans are forgotten
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self._solver, name)
+
+    monkeypatch.setattr(online, "incremental_solver", Counting)
+    backend = FixedLagBackend(InertialSteps(Calibration(), ImuNoise()))
+    sigmas = np.r_[np.full(3, 1e-3), np.full(3, 0.02)]
+    for k in range(1000):
+        stamps = k * 10**8 + np.arange(11) * 10**7
+        accel = np.array([0.0, 0.0, 9.81]) + 0.1 * rng.standard_normal((11, 3))
+        imu = ImuSamples(stamps, 0.01 * rng.standard_normal((11, 3)), accel)
+        if not k:
+            backend.start(start_state(0, imu, ImuNoise()))
+        step = se3.exp(np.array([0, 0, 0, 1.0, 0, 0]) + sigmas * rng.standard_normal(6))
+        scan = Scan(int(stamps[-1]), np.empty((0, 3), np.float32))
+        covariance = np.diag(sigmas**2)
+        relative = RelativePose(step, covariance, "test", drift=0.1 * covariance)
+        backend.update(Frame(k + 1, scan, imu, calibration=Calibration()), relative)
+    assert max(touched[-600:]) < 100
