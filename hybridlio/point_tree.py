@@ -86,19 +86,20 @@ class _Surroundings:
     """The cubes in which there are points ``(M, 3)``, and those beside them."""
 
     def __init__(self, points: Array) -> None:
+        columns = np.ascontiguousarray(points.T)  # along which a minimum is found ten times as quickly
+        low, extent = columns.min(axis=1), columns.max(axis=1) - columns.min(axis=1)
         self.side_m = _SIDE_M
-        while np.prod(np.ptp(points, axis=0) / self.side_m + 6) > _TABLE_CELLS:
+        while np.prod(extent / self.side_m + 6) > _TABLE_CELLS:
             self.side_m *= 2
-        self._low = points.min(axis=0) - 2 * self.side_m
-        self._most = np.floor(np.ptp(points, axis=0) / self.side_m) + 4  # the outermost cubes stay empty
+        self._low = low - 2 * self.side_m
+        self._most = np.floor(extent / self.side_m) + 4  # the outermost cubes stay empty
         nx, ny, nz = (int(n) + 1 for n in self._most)
         self._steps = (ny * nz, nz)
         self._table = np.zeros(nx * ny * nz, bool)
-        occupied = np.unique(self._cubes(points))
-        for x in (-ny * nz, 0, ny * nz):
-            for y in (-nz, 0, nz):
-                for z in (-1, 0, 1):
-                    self._table[occupied + (x + y + z)] = True
+        beside = [x + y + z for x in (-ny * nz, 0, ny * nz) for y in (-nz, 0, nz) for z in (-1, 0, 1)]
+        cubes = np.sort(self._cubes(points))
+        occupied = cubes[np.diff(cubes, prepend=-1) > 0]
+        self._table[np.add.outer(beside, occupied).ravel()] = True
 
     def may_matter(self, queries: Array, nearest2: Array) -> Index:
         """Which queries may have a point nearer than what they have; the others' are all a side away and more."""
