@@ -11,7 +11,7 @@ from hybridlio.graph.inertial_steps import InertialSteps
 from hybridlio.graph.online import WARM_UP_STEPS, IncrementalBackend
 from hybridlio.sensors import Frame
 
-_AT_ONCE = 20  # so many scans are forgotten together, as it takes sorting all that are left
+_AT_ONCE = 40  # so many scans are forgotten together, as it takes sorting all that are left
 
 
 class FixedLagBackend(IncrementalBackend):
