@@ -49,7 +49,7 @@ class ScanMatchingSettings:
     source_voxel_m: float = 1.0
     min_points: int = 200
     min_matched: float = 0.3
-    covariance_scale: float = 3.0
+    covariance_scale: float = 5.0
     drift_share: float = 0.1
     start_speeds_m_s: tuple[float, ...] = (0.0, -5.0, *(2.5 * i for i in range(1, 17)))
     start_rates_deg_s: tuple[float, ...] = (0.0, -50.0, 50.0, -100.0, 100.0)
