@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 from lockstep import Pass, resident_growth_mb, run_in_lockstep
-from systems import PEERS, Make, our_systems, peer_systems
+from systems import PEERS, Array, Make, our_systems, peer_systems
 
 from hybridlio import se3, tables
 from hybridlio.datasets.registry import open_sequence
@@ -36,6 +36,7 @@ from hybridlio.trajectory import Trajectory
 Figures = dict[str, Any]
 
 _DRIFT = "t_rel [%]"
+_A_SECOND = 10  # scans
 
 
 def opened(data: Path, sequence: str | None, frames: str | None) -> Sequence:
@@ -66,6 +67,18 @@ def drift_of(judgement: Evaluation) -> tuple[float | None, float | None]:
     return judgement.chosen_t_rel_percent, judgement.chosen_r_rel_deg_per_100m
 
 
+def ahead_of_speed(trajectory: Trajectory, sequence: Sequence) -> tuple[Array, float]:
+    """How much longer ``(N,)`` the path to each scan is than the forward speed has driven, and what that drives in all.
+
+    Both in metres. Errors of either sign add up to nothing in the end: what single seconds are off by tells more.
+    """
+    seconds, speed = sequence.stamps_ns / 1e9, sequence.forward_speed_m_s
+    assert speed is not None
+    driven_m = np.diff(seconds) * (speed[1:] + speed[:-1]) / 2
+    steps_m = np.linalg.norm(np.diff(trajectory.poses[:, :3, 3], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps_m - driven_m)]), float(driven_m.sum())
+
+
 def accuracy(one: Pass, sequence: Sequence) -> Figures:
     """How well, as far as the recording's references bear it; nothing of a system that did not reach the end."""
     if len(one.answers) < 2 or one.error is not None:
@@ -77,9 +90,12 @@ def accuracy(one: Pass, sequence: Sequence) -> Figures:
         out |= {"ATE [m]": judgement.ate_m, "end error [m]": judgement.end_error_m}
     out["path [m]"] = trajectory.length_m
     if sequence.forward_speed_m_s is not None and len(trajectory) == len(sequence):
-        driven_m = float(np.trapezoid(sequence.forward_speed_m_s, sequence.stamps_ns / 1e9))
+        ahead_m, driven_m = ahead_of_speed(trajectory, sequence)
         if driven_m > 1:
-            out["against forward speed [%]"] = 100 * (trajectory.length_m / driven_m - 1)
+            out["against forward speed [%]"] = 100 * float(ahead_m[-1] / driven_m)
+            out["the same over 1 s, RMS [mm]"] = 1e3 * float(
+                np.sqrt(np.mean((ahead_m[_A_SECOND:] - ahead_m[:-_A_SECOND]) ** 2))
+            )
         else:
             out["moved though standing [m]"] = trajectory.length_m
             away_mm = 1e3 * np.linalg.norm(trajectory.poses[:, :3, 3], axis=1)
