@@ -93,15 +93,19 @@ def the_lap(folder: Path) -> Sequence:
     return open_sequence(folder)
 
 
-def laps(folder: Path, first: int, scans: int) -> Iterator[Frame]:
+def laps(sequence: Sequence, first: int, scans: int) -> Iterator[Frame]:
     """The lap's frames from ``first`` on again and again: after its last, which is where the first is, the second."""
-    sequence = the_lap(folder)
     first_ns = int(sequence.stamps_ns[0])
     for k in range(first, scans):
         frame = sequence[(k - 1) % LAP + 1 if k else 0]
         late_ns = first_ns + k * _STEP_NS - frame.scan.stamp_ns
         imu = replace(frame.imu, stamps_ns=frame.imu.stamps_ns + late_ns)
         yield replace(frame, index=k, scan=replace(frame.scan, stamp_ns=frame.scan.stamp_ns + late_ns), imu=imu)
+
+
+def laps_below(folder: Path, first: int, scans: int) -> Iterator[Frame]:
+    """The same of the lap below a folder, which another process can open too."""
+    return laps(the_lap(folder), first, scans)
 
 
 def resident_mib() -> float:
@@ -190,7 +194,7 @@ def main() -> None:
         parser.error("give a folder for the lap, or --light")
     results = {}
     for backend in options.backend.split(","):
-        frames = light_frames if options.light else partial(laps, options.folder)
+        frames = light_frames if options.light else partial(laps_below, options.folder)
         results[backend] = found = run(frames, partial(made, backend, options.light), options.scans)
         ratio = found["last_mean_cpu_ms"] / found["fresh_mean_cpu_ms"]
         memory = list(found["resident_mib"].values())

@@ -99,12 +99,14 @@ def test_laps_follow_each_other_without_a_gap():
         "points = lambda k: np.full((1, 3), k, np.float32);"
         "frames = [Frame(k, Scan(int(stamps[k]), points(k)), samples(k)) for k in range(len(stamps))];"
         "lap = type('Lap', (list,), {'stamps_ns': stamps})(frames);"
-        "found = list(long_run.laps(lap, 2 * long_run.LAP + 2));"
+        "found = list(long_run.laps(lap, 0, 2 * long_run.LAP + 2));"
         "assert [f.index for f in found] == list(range(len(found)));"
         "assert (np.diff([f.scan.stamp_ns for f in found]) == 10**8).all();"
         "assert all(f.imu.stamps_ns[-1] == f.scan.stamp_ns for f in found);"
         "seam = [int(f.scan.points[0, 0]) for f in found[long_run.LAP - 1 :][:4]];"
-        "assert seam == [long_run.LAP - 1, long_run.LAP, 1, 2]"
+        "assert seam == [long_run.LAP - 1, long_run.LAP, 1, 2];"
+        "later = list(long_run.laps(lap, 5, 8));"
+        "assert [f.scan.stamp_ns for f in later] == [f.scan.stamp_ns for f in found[5:8]]"
     )
     command = [sys.executable, "-c", program, str(ROOT / "benchmarks")]
     done = subprocess.run(
