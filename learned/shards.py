@@ -27,7 +27,6 @@ FORMAT = 1
 _STEP_M = 0.004
 _LIMIT_M = 32767 * _STEP_M
 _STEPS = ("imu", "imu_there", "dt_s", "velocity_m_s", "initial", "reference", "usable")
-_CLOUDS = ("vertex_maps", "loss_points", "loss_normals", "loss_offsets")
 
 
 @dataclass(frozen=True, eq=False)

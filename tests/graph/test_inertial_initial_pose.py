@@ -7,44 +7,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from inertial import NOISE, at_rest, state_at
 from scipy.spatial.transform import Rotation
 
 from hybridlio import se3
 from hybridlio.estimates import RelativePose, State
 from hybridlio.graph.inertial_initial_pose import Preintegration
 from hybridlio.graph.inertial_steps import InertialSteps
-from hybridlio.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples, Scan
+from hybridlio.sensors import NS_PER_S, Calibration, Frame, ImuSamples, Scan
 
-GRAVITY = np.array([0.0, 0.0, -9.81])
-CERTAIN = 1e-18 * np.eye(15)
-NOISE = ImuNoise()
 IDENTITY = np.eye(4)
-
-
-def state_at(T: np.ndarray, velocity: np.ndarray, **changes: object) -> State:
-    state = State(0, T, velocity, np.zeros(3), np.zeros(3), GRAVITY, CERTAIN, 1e-18 * np.eye(3))
-    return replace(state, **changes)
-
-
-def samples(times_s: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> ImuSamples:
-    return ImuSamples(np.round(times_s * NS_PER_S).astype(np.int64), gyro, accel)
 
 
 def empty_scan(stamp_ns: int) -> Scan:
     return Scan(stamp_ns, np.empty((0, 3), np.float32))
 
 
-# ---------------------------------------------------------------------------------------- what may be missing
-
-
 def straight(steps: int, mount: np.ndarray = IDENTITY) -> tuple[State, Callable[[ImuSamples], Frame]]:
     state = state_at(np.eye(4), np.array([10.0, 0.0, 0.0]), covariance=np.diag(np.full(15, 1e-4)))
     return state, lambda imu: Frame(3, empty_scan(steps * NS_PER_S // 10), imu, calibration=Calibration(mount))
-
-
-def at_rest(start_s: float, end_s: float) -> ImuSamples:
-    times = np.arange(round(start_s * 100), round(end_s * 100) + 1) / 100
-    return samples(times, np.zeros((len(times), 3)), np.tile(-GRAVITY, (len(times), 1)))
 
 
 def test_the_prediction_is_of_the_lidar_not_of_the_imu():

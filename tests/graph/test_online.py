@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import X
+from online_runs import pose_error, run
 from scipy.spatial.transform import Rotation
 
 import hybridlio.graph.online as online
@@ -30,21 +31,6 @@ STRAIGHT = RelativePose(
     se3.make(np.eye(3), [1.0, 0.0, 0.0]), np.diag(np.r_[np.full(3, 1e-3), np.full(3, 0.02)] ** 2), "straight"
 )
 NEVER_TRUE = RelativePose(se3.exp(np.array([0.2, -0.3, 0.5, 5.0, -3.0, 2.0])), 1e-6 * np.eye(6), "broken", ok=False)
-
-
-def run(chain: Any) -> tuple[IncrementalBackend, list[State], list[RelativePose]]:
-    """The chain through the backend: states at all scans but the first, and the steps to them."""
-    backend = IncrementalBackend(InertialSteps(chain.calibration, chain.noise))
-    backend.start(chain.start)
-    states, steps = [], []
-    for frame, relative in zip(chain.frames[1:], chain.relative, strict=True):
-        states.append(backend.update(frame, relative))
-        steps.append(backend.last_step())
-    return backend, states, steps
-
-
-def pose_error(state: State, T_world_imu: np.ndarray) -> np.ndarray:
-    return se3.log(se3.between(state.T_world_imu, T_world_imu))
 
 
 def sigmas_off(error: np.ndarray, covariance: np.ndarray) -> float:

@@ -7,34 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from online_runs import pose_error, run
 
 from hybridlio import se3
 from hybridlio.consistency import Anees, anees
 from hybridlio.estimates import RelativePose, State
-from hybridlio.graph.inertial_steps import InertialSteps
-from hybridlio.graph.online import IncrementalBackend
-
-STRAIGHT = RelativePose(
-    se3.make(np.eye(3), [1.0, 0.0, 0.0]), np.diag(np.r_[np.full(3, 1e-3), np.full(3, 0.02)] ** 2), "straight"
-)
-
-
-def run(chain: Any) -> tuple[IncrementalBackend, list[State], list[RelativePose]]:
-    """The chain through the backend: states at all scans but the first, and the steps to them."""
-    backend = IncrementalBackend(InertialSteps(chain.calibration, chain.noise))
-    backend.start(chain.start)
-    states, steps = [], []
-    for frame, relative in zip(chain.frames[1:], chain.relative, strict=True):
-        states.append(backend.update(frame, relative))
-        steps.append(backend.last_step())
-    return backend, states, steps
-
-
-def pose_error(state: State, T_world_imu: np.ndarray) -> np.ndarray:
-    return se3.log(se3.between(state.T_world_imu, T_world_imu))
-
-
-# ------------------------------------------------------------------------------------------------ consistency
 
 
 @pytest.fixture(scope="module", params=[None, 0.02], ids=["steps", "map"])

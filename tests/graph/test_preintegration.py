@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from inertial import GRAVITY, NOISE, at_rest, samples, state_at
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
@@ -14,32 +15,14 @@ from hybridlio import se3
 from hybridlio.errors import DataError
 from hybridlio.estimates import State
 from hybridlio.graph.preintegration import covers, predict_step, preintegrate, sampling_noise
-from hybridlio.sensors import NS_PER_S, ImuNoise, ImuSamples, Scan
+from hybridlio.sensors import NS_PER_S, ImuNoise, ImuSamples
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.imu import ideal_imu
 from hybridlio.simulation.plan import plan
 
-GRAVITY = np.array([0.0, 0.0, -9.81])
-CERTAIN = 1e-18 * np.eye(15)
-NOISE = ImuNoise()
-IDENTITY = np.eye(4)
-
-
-def state_at(T: np.ndarray, velocity: np.ndarray, **changes: object) -> State:
-    state = State(0, T, velocity, np.zeros(3), np.zeros(3), GRAVITY, CERTAIN, 1e-18 * np.eye(3))
-    return replace(state, **changes)
-
-
-def samples(times_s: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> ImuSamples:
-    return ImuSamples(np.round(times_s * NS_PER_S).astype(np.int64), gyro, accel)
-
 
 def step_of(imu: ImuSamples, state: State, noise: ImuNoise = NOISE) -> np.ndarray:
     return predict_step(preintegrate(imu, state, noise), state)[0]
-
-
-def empty_scan(stamp_ns: int) -> Scan:
-    return Scan(stamp_ns, np.empty((0, 3), np.float32))
 
 
 @pytest.mark.parametrize("seconds", [0.1, 1.0])
@@ -190,11 +173,6 @@ def test_a_vehicles_motion_between_ten_samples_a_second_stays_within_the_noise_t
         error = se3.log(se3.between(step, se3.between(*motion.poses)))
         nees.append(error @ np.linalg.solve(covariance, error) / 6)
     assert np.mean(nees) < 1.0
-
-
-def at_rest(start_s: float, end_s: float) -> ImuSamples:
-    times = np.arange(round(start_s * 100), round(end_s * 100) + 1) / 100
-    return samples(times, np.zeros((len(times), 3)), np.tile(-GRAVITY, (len(times), 1)))
 
 
 def test_one_sample_cannot_be_summed_up():

@@ -34,9 +34,6 @@ def blind(frame: Frame) -> Frame:
     return replace(frame, scan=Scan(frame.scan.stamp_ns, np.empty((0, 3), np.float32)))
 
 
-# ---------------------------------------------------------------------------------------------- what is chosen
-
-
 class Truth:
     """An initial pose from the reference; knows the future."""
 

@@ -1,0 +1,28 @@
+"""Inertial samples, and states that they are integrated from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hybridlio.estimates import State
+from hybridlio.sensors import NS_PER_S, ImuNoise, ImuSamples
+
+GRAVITY = np.array([0.0, 0.0, -9.81])
+CERTAIN = 1e-18 * np.eye(15)
+NOISE = ImuNoise()
+
+
+def state_at(T: np.ndarray, velocity: np.ndarray, **changes: object) -> State:
+    state = State(0, T, velocity, np.zeros(3), np.zeros(3), GRAVITY, CERTAIN, 1e-18 * np.eye(3))
+    return replace(state, **changes)
+
+
+def samples(times_s: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> ImuSamples:
+    return ImuSamples(np.round(times_s * NS_PER_S).astype(np.int64), gyro, accel)
+
+
+def at_rest(start_s: float, end_s: float) -> ImuSamples:
+    times = np.arange(round(start_s * 100), round(end_s * 100) + 1) / 100
+    return samples(times, np.zeros((len(times), 3)), np.tile(-GRAVITY, (len(times), 1)))

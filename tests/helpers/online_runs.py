@@ -1,0 +1,27 @@
+"""Whole drives through the incremental backend."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from hybridlio import se3
+from hybridlio.estimates import RelativePose, State
+from hybridlio.graph.inertial_steps import InertialSteps
+from hybridlio.graph.online import IncrementalBackend
+
+
+def run(chain: Any) -> tuple[IncrementalBackend, list[State], list[RelativePose]]:
+    """The chain through the backend: states at all scans but the first, and the steps to them."""
+    backend = IncrementalBackend(InertialSteps(chain.calibration, chain.noise))
+    backend.start(chain.start)
+    states, steps = [], []
+    for frame, relative in zip(chain.frames[1:], chain.relative, strict=True):
+        states.append(backend.update(frame, relative))
+        steps.append(backend.last_step())
+    return backend, states, steps
+
+
+def pose_error(state: State, T_world_imu: np.ndarray) -> np.ndarray:
+    return se3.log(se3.between(state.T_world_imu, T_world_imu))
