@@ -21,6 +21,7 @@ from hybridlio.config import Config
 from hybridlio.errors import ConfigError, DataError, HybridLioError
 from hybridlio.files import write_whole
 from hybridlio.recordings import Recording
+from hybridlio.sources import check_made, check_names
 
 Progress = Callable[[int, int, str], None]
 
@@ -82,37 +83,51 @@ def run_batch(
         progress: called with recordings done, recordings in all, and the one that is done.
 
     Raises:
-        ConfigError: ``out`` holds runs of other recordings or with other settings, or an unknown engine.
+        ConfigError: ``out`` holds runs of other recordings or with other settings, an unknown engine, or settings that
+            no recording can be run with. Nothing has been run or removed then.
         MissingDependencyError: the engine is not installed.
     """
     config, out = config or Config(), Path(out).absolute()
+    if engines.is_remote(engine):
+        check_names(config.initial_pose, config.residual, config.backend)
+    else:
+        check_made(config)
     local = engine == engines.LOCAL
     jobs = max(1, min(jobs or engines.cores(), len(recordings))) if local else jobs
     threads = threads or (max(1, engines.cores() // jobs) if local and jobs else 1)
     todo = [Job(r, out / r.name, config, threads, without_imu) for r in recordings]
-    complete = {job.recording: _is_complete(job, overwrite) for job in todo}
-    out.mkdir(parents=True, exist_ok=True)
-    rows = {job.recording: _row(job, DONE_BEFORE if complete[job.recording] else NOT_RUN) for job in todo}
-    missing = [job for job in todo if not complete[job.recording]]
-    stopped: BaseException | None = None
-    try:
-        with engines.engine(engine, jobs, threads, scheduler):
-            for job, reason in _run_all(missing):
-                rows[job.recording] = _row(job, DONE if reason is None else FAILED, reason)
-                write_batch(Batch(out, tuple(rows.values())))
-                if progress is not None:
-                    counted = sum(row.status != NOT_RUN for row in rows.values())
-                    progress(counted, len(todo), job.recording.name)
-    except KeyboardInterrupt as error:
-        stopped = error
-        rows |= {job.recording: _row(job, DONE) for job in missing if _reached_its_end(_metrics(job.folder))}
+    done = {job.recording for job in todo if _is_complete(job, overwrite)}
+    missing = [job for job in todo if job.recording not in done]
+    with engines.engine(engine, jobs, threads, scheduler):
+        out.mkdir(parents=True, exist_ok=True)
+        for job in missing:
+            _clear(job)
+        rows = {job.recording: _row(job, DONE_BEFORE if job.recording in done else NOT_RUN) for job in todo}
+        stopped = _run_missing(missing, rows, out, progress)
     batch = Batch(out, tuple(rows.values()), stopped)
     write_batch(batch)
     return batch
 
 
+def _run_missing(
+    missing: list[Job], rows: dict[Recording, BatchRow], out: Path, progress: Progress | None
+) -> BaseException | None:
+    """Run jobs, and put in each one's row as it ends; what stopped them, if anything."""
+    try:
+        for job, reason in _run_all(missing):
+            rows[job.recording] = _row(job, DONE if reason is None else FAILED, reason)
+            write_batch(Batch(out, tuple(rows.values())))
+            if progress is not None:
+                counted = sum(row.status != NOT_RUN for row in rows.values())
+                progress(counted, len(rows), job.recording.name)
+    except KeyboardInterrupt as error:
+        rows |= {job.recording: _row(job, DONE) for job in missing if _reached_its_end(_metrics(job.folder))}
+        return error
+    return None
+
+
 def _is_complete(job: Job, overwrite: bool) -> bool:
-    """Whether the run is there; ready for a new one if not.
+    """Whether the run is there.
 
     Raises:
         ConfigError: another run is there.
@@ -124,11 +139,13 @@ def _is_complete(job: Job, overwrite: bool) -> bool:
                 f"{job.folder} holds a run of another recording or with other settings; choose another folder, or "
                 "--overwrite all that is there"
             )
-        if _reached_its_end(metrics):
-            return True
+        return _reached_its_end(metrics)
+    return False
+
+
+def _clear(job: Job) -> None:
     run_folder.clear(job.folder)
     (job.folder / JOB).unlink(missing_ok=True)
-    return False
 
 
 def _reached_its_end(metrics: dict[str, Any]) -> bool:

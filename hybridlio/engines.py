@@ -13,6 +13,11 @@ Task = tuple[Callable[..., Any], tuple[Any, ...]]
 LOCAL = "loky"
 
 
+def is_remote(name: str) -> bool:
+    """Whether an engine's workers may be on other machines, with other devices and files than this one."""
+    return name in _CONNECT
+
+
 def cores() -> int:
     """Cores that this process may use, by affinity and by a container's quota."""
     import joblib

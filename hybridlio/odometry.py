@@ -20,7 +20,7 @@ from hybridlio.late_imu import take_up_imu
 from hybridlio.record import Record
 from hybridlio.record_maker import RecordMaker, joined
 from hybridlio.sensors import Calibration, Frame, ImuNoise, ImuSamples
-from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES, Setup, check_names
+from hybridlio.sources import Setup, check_names, make_chosen
 from hybridlio.startup import start_state
 from hybridlio.sweep import compensation_noise, sweep_motion
 
@@ -140,29 +140,12 @@ class Odometry:
     def _begin(self, frame: Frame) -> Estimate:
         """Take the first frame: it defines the origin."""
         self._setup = _setup(self._config, frame)
-        self._make_sources()
+        self._initial_pose, self._residual, self._backend = make_chosen(self._chosen, self._setup)
         self._witness = Witness()
         self._residual.start(frame)
         self._first = frame
         covariance = np.eye(6) * 1e-12  # it defines the frame; GTSAM and files want it positive definite
         return Estimate(frame.index, frame.scan.stamp_ns, np.eye(4), covariance, None, None, None, {})
-
-    def _make_sources(self) -> None:
-        """Make what was chosen by name.
-
-        Raises:
-            ConfigError: it cannot be made as it is set, whatever the frame is, such as for want of its weights.
-        """
-        initial_pose, residual, backend = self._chosen
-        setup = self._setup
-        try:
-            self._initial_pose = (
-                INITIAL_POSE_SOURCES[initial_pose](setup) if isinstance(initial_pose, str) else initial_pose
-            )
-            self._residual = RESIDUAL_SOURCES[residual](setup) if isinstance(residual, str) else residual
-            self._backend = BACKENDS[backend](setup) if isinstance(backend, str) else backend
-        except DataError as error:
-            raise ConfigError(str(error)) from error
 
     def _start(self, frame: Frame) -> State:
         """Start the graph at the first frame, with the second one's samples to tell where down is."""

@@ -12,8 +12,8 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from hybridlio.datasets.registry import open_sequence, sequence_names
-from hybridlio.datasets.sequence import Sequence, part_of
+from hybridlio.datasets.registry import check_options, open_sequence, sequence_names
+from hybridlio.datasets.sequence import Sequence, frame_range, part_of
 from hybridlio.errors import ConfigError, DataError, HybridLioError
 from hybridlio.files import read_yaml
 
@@ -31,6 +31,9 @@ class Recording:
         raw_root: for KITTI odometry, where inertial data are.
         frames: the part ``A:B`` of it.
         name: what its run folder is called.
+
+    Raises:
+        ConfigError: no such reader, or ``frames`` is no range.
     """
 
     path: str
@@ -40,12 +43,16 @@ class Recording:
     frames: str | None = None
     name: str = ""
 
+    def __post_init__(self) -> None:
+        check_options(self.reader)
+        if self.frames is not None:
+            frame_range(self.frames)
+
     def open(self) -> Sequence:
         """Open it, or the part of it that is wanted.
 
         Raises:
-            DataError: there is no such recording, or it is malformed.
-            ConfigError: no such reader, or ``frames`` is no range.
+            DataError: there is no such recording, or it is malformed, or none of its scans is wanted.
         """
         found = open_sequence(self.path, sequence=self.sequence, reader=self.reader, raw_root=self.raw_root)
         return part_of(found, self.frames)
@@ -75,9 +82,10 @@ def find_recordings(
         reader, raw_root, frames: for all that do not say their own.
 
     Raises:
-        ConfigError: there is not a single one.
+        ConfigError: there is not a single one, no such ``reader`` or ``raw_root``, or ``frames`` is no range.
         DataError: a list file cannot be read, or is malformed.
     """
+    check_options(raw_root=raw_root)
     given = Recording("", sequence, reader, None if raw_root is None else str(raw_root), frames)
     wanted = [_with_defaults(item, given) for entry in data for item in _listed(entry)]
     found = list(dict.fromkeys(one for item in wanted for one in _each(item)))
@@ -106,9 +114,9 @@ def _read_list(file: Path) -> Iterator[Recording]:
         raise DataError(f"{file}: expected a list of recordings, one an entry")
     for number, entry in enumerate(entries, 1):
         item = _entry(entry, f"{file}, entry {number}")
-        below = replace(item, path=str(file.parent / Path(item.path).expanduser()))
+        below = _from(file.parent, item)
         found = list(_listed(below.path)) if Path(below.path).suffix not in _YAML + _TEXT else [below]
-        yield from (replace(item, path=one.path) for one in found)
+        yield from (replace(below, path=one.path) for one in found)
 
 
 def _lines(file: Path) -> list[dict[str, str]]:
@@ -139,7 +147,16 @@ def _entry(entry: Any, where: str) -> Recording:
     unknown = [key for key in values if key not in known]
     if unknown:
         raise DataError(f"{where}: unknown key {unknown[0]!r}; the keys are {', '.join(known)}")
-    return Recording(**{key: str(value) for key, value in values.items() if value is not None})
+    try:
+        return Recording(**{key: str(value) for key, value in values.items() if value is not None})
+    except ConfigError as error:
+        raise DataError(f"{where}: {error}") from None
+
+
+def _from(folder: Path, item: Recording) -> Recording:
+    """The item with its paths started from a folder."""
+    root = item.raw_root and str(folder / Path(item.raw_root).expanduser())
+    return replace(item, path=str(folder / Path(item.path).expanduser()), raw_root=root)
 
 
 def _with_defaults(item: Recording, given: Recording) -> Recording:
@@ -149,7 +166,7 @@ def _with_defaults(item: Recording, given: Recording) -> Recording:
 
 def _each(item: Recording) -> Iterator[Recording]:
     """The item once for every recording that it stands for, its path absolute."""
-    item = replace(item, path=str(Path(item.path).expanduser().absolute()))
+    item = _from(Path.cwd(), item)
     try:
         names = sequence_names(item.path, reader=item.reader)
     except HybridLioError:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
-from hybridlio.errors import ConfigError
+from hybridlio.errors import ConfigError, DataError
 
 if TYPE_CHECKING:  # the command line lists the names, and must start quickly
     from hybridlio.config import Config
@@ -142,6 +142,39 @@ BACKENDS: dict[str, Callable[[Setup], Backend]] = {
     "fixed-lag": _fixed_lag,
     "none": _no_backend,
 }
+
+
+Chosen = tuple["str | InitialPoseSource", "str | ResidualSource", "str | Backend"]
+
+
+def make_chosen(chosen: Chosen, setup: Setup) -> tuple[InitialPoseSource, ResidualSource, Backend]:
+    """Make those of the three that are names; objects are taken as they are.
+
+    Raises:
+        ConfigError: one cannot be made as it is set, such as for want of its weights.
+    """
+    initial_pose, residual, backend = chosen
+    try:
+        return (
+            INITIAL_POSE_SOURCES[initial_pose](setup) if isinstance(initial_pose, str) else initial_pose,
+            RESIDUAL_SOURCES[residual](setup) if isinstance(residual, str) else residual,
+            BACKENDS[backend](setup) if isinstance(backend, str) else backend,
+        )
+    except DataError as error:
+        raise ConfigError(str(error)) from error
+
+
+def check_made(config: Config) -> None:
+    """Check, without a recording, that the three can be made as they are set.
+
+    Raises:
+        ConfigError: there is no implementation of a name, or it cannot be made.
+    """
+    from hybridlio.sensors import Calibration, ImuNoise
+
+    chosen = (config.initial_pose, config.residual, config.backend)
+    check_names(*chosen)
+    make_chosen(chosen, Setup(config, Calibration(), config.imu_noise or ImuNoise()))
 
 
 def check_names(initial_pose: object, residual: object, backend: object) -> None:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.config import Config
-from hybridlio.datasets.registry import open_sequence, sequence_names
+from hybridlio.datasets.registry import check_options, open_sequence, sequence_names
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.deskew import constant_twist, deskew
 from hybridlio.errors import ConfigError, DataError
@@ -57,6 +57,9 @@ class DataOptions:
         sequences: which recordings, where a path holds several; None takes all.
         reader: as for ``open_sequence``.
         raw_root: KITTI's raw data, to take the IMU of KITTI odometry sequences from.
+
+    Raises:
+        ConfigError: no such reader, or no folder ``raw_root``.
     """
 
     cache: Path
@@ -64,6 +67,9 @@ class DataOptions:
     sequences: tuple[str, ...] | None = None
     reader: str | None = None
     raw_root: Path | None = None
+
+    def __post_init__(self) -> None:
+        check_options(self.reader, self.raw_root)
 
 
 def shards_of(

@@ -59,11 +59,9 @@ def batch(
     One that fails stops no other. The same command again runs only what is missing. DIR/batch.md sums up.
     """
     from hybridlio.batch import run_batch
-    from hybridlio.odometry import Odometry
     from hybridlio.recordings import find_recordings
 
     settings = common.settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
-    Odometry(config=settings)  # wrong names fail before the work
     found = find_recordings(data, sequence, reader, raw_root, frames)
     with progress("batch", "recordings") as tick:
         done = run_batch(

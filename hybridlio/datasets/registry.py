@@ -76,10 +76,21 @@ def sequence_names(path: str | os.PathLike[str], *, reader: str | None = None) -
     return tuple(_find(Path(path).expanduser().resolve(), reader)[1])
 
 
-def _find(root: Path, reader: str | None) -> tuple[str, dict[str, Path]]:
-    """The first reader that finds recordings at ``root``, and what it finds."""
+def check_options(reader: str | None = None, raw_root: str | os.PathLike[str] | None = None) -> None:
+    """Check what is said of many recordings at once, before any of them is opened.
+
+    Raises:
+        ConfigError: unknown ``reader``, or no folder ``raw_root``.
+    """
     if reader is not None and reader not in READERS:
         raise ConfigError(f"unknown reader {reader!r}; choose one of {', '.join(READERS)}")
+    if raw_root is not None and not Path(raw_root).expanduser().is_dir():
+        raise ConfigError(f"raw root {raw_root}: no such folder; give the one that holds KITTI's date folders")
+
+
+def _find(root: Path, reader: str | None) -> tuple[str, dict[str, Path]]:
+    """The first reader that finds recordings at ``root``, and what it finds."""
+    check_options(reader)
     if not root.is_dir():
         raise DataError(f"{root}: {'not a folder' if root.exists() else 'no such folder'}; give a recording's folder")
     tried = [reader] if reader else list(READERS)

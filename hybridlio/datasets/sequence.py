@@ -163,13 +163,24 @@ class Sequence:
         return tuple((int(k) + 1, float(steps[k])) for k in large)
 
 
-def part_of(sequence: Sequence, frames: str | None) -> Sequence:
-    """The frames ``A:B`` of a sequence, as Python counts them; all without a range."""
-    if frames is None:
-        return sequence
-    ends = frames.split(":")
+def frame_range(frames: str) -> tuple[int | None, int | None]:
+    """The ends of a range ``A:B``; None for one that is left out.
+
+    Raises:
+        ConfigError: it is no range.
+    """
     try:
-        start, stop = (int(end) if end.strip() else None for end in ends)
+        start, stop = (int(end) if end.strip() else None for end in frames.split(":"))
     except ValueError:
         raise ConfigError(f"frames {frames!r}: give a range such as 100:200, 100: or :200") from None
-    return sequence.part(start, stop)
+    return start, stop
+
+
+def part_of(sequence: Sequence, frames: str | None) -> Sequence:
+    """The frames ``A:B`` of a sequence, as Python counts them; all without a range.
+
+    Raises:
+        ConfigError: ``frames`` is no range.
+        DataError: no frame is left.
+    """
+    return sequence if frames is None else sequence.part(*frame_range(frames))

@@ -160,6 +160,41 @@ def test_the_exit_code_says_whether_any_recording_failed(tiny_drive, tmp_path):
     assert command(tiny_drive, *options, "--residual", "nonsense")[0] == 2
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--frames", "x"), "frames 'x': give a range"),
+        (("--reader", "x"), "unknown reader 'x'"),
+        (("--raw-root", "/gone"), "raw root /gone: no such folder"),
+        (("--initial-pose", "x"), "unknown initial pose 'x'"),
+        (("--engine", "steam"), "unknown engine 'steam'"),
+        (("--scheduler", "tcp://head:8786"), "no scheduler"),
+        (("--config", "/gone.yaml"), "/gone.yaml: cannot be read"),
+    ],
+)
+def test_an_option_that_no_recording_can_be_run_with_fails_once_before_anything(options, words, tmp_path):
+    code, said = command("/one", "/two", "-o", tmp_path / "out", *options)
+    assert code == 2
+    assert said.count(words) == 1, said
+    assert not (tmp_path / "out").exists()
+
+
+def test_settings_that_no_recording_can_be_run_with_remove_no_run(two, tmp_path):
+    run_batch(two[:1], tmp_path, QUICK, engine="threading")
+    without_weights = Config.model_validate({"residual": "network", "network": {"weights": "/gone.safetensors"}})
+    for settings, engine in ((without_weights, "threading"), (QUICK, "steam")):
+        with pytest.raises(ConfigError, match=r"gone\.safetensors|steam"):
+            run_batch(two[:1], tmp_path, settings, engine=engine, overwrite=True)
+    assert statuses(run_batch(two[:1], tmp_path, QUICK, engine="threading")) == [DONE_BEFORE]
+
+
+def test_what_one_recording_lacks_fails_for_it_alone(two, tmp_path):
+    beyond = Recording(two[0].path, frames="900:", name="beyond")
+    done = run_batch((beyond, two[0]), tmp_path, QUICK, engine="threading")
+    assert statuses(done) == [FAILED, DONE]
+    assert "no scans from 900" in done.rows[0].reason
+
+
 def test_a_fault_is_one_recordings_reason_and_its_log_shows_where(two, tmp_path, monkeypatch):
     monkeypatch.setattr("hybridlio.run_outputs.write_run", lambda *_: 1 // 0)
     done = run_batch(two[:1], tmp_path, QUICK, engine="sequential")

@@ -58,6 +58,16 @@ def test_a_yaml_list_holds_paths_or_mappings(drives):
     assert (second.name, second.frames) == ("west", "0:1")
 
 
+def test_the_raw_root_of_a_list_starts_from_its_own_folder_and_that_of_an_option_from_the_current_one(
+    drives, monkeypatch
+):
+    (drives / "list.yaml").write_text("- {path: north, raw_root: raw}\n- south\n")
+    monkeypatch.chdir(drives.parent)
+    one, two = find_recordings([drives / "list.yaml"], raw_root="drives")
+    assert one.raw_root == str(drives / "raw")
+    assert two.raw_root == str(drives)
+
+
 @pytest.mark.parametrize(
     ("file", "text", "words"),
     [
@@ -66,6 +76,8 @@ def test_a_yaml_list_holds_paths_or_mappings(drives):
         ("a.yaml", "path: x\n", "expected a list"),
         ("a.yaml", "- {path: x, speed: 3}\n", "entry 1: unknown key 'speed'"),
         ("a.yaml", "- {sequence: x}\n", "entry 1: expected a path"),
+        ("a.yaml", "- x\n- {path: x, frames: 3}\n", "entry 2: frames '3': give a range"),
+        ("a.yaml", "- {path: x, reader: tape}\n", "entry 1: unknown reader 'tape'"),
         ("a.yaml", "- [", r"a\.yaml: not YAML at line 1"),
     ],
 )
