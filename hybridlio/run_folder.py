@@ -11,7 +11,9 @@ import logging
 import os
 import shutil
 from collections.abc import Sequence as Items
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -66,23 +68,32 @@ class StoredRun:
 def new_run_folder(sequence: str, out: Path | None, overwrite: bool) -> Path:
     """The folder to write a run to, made now, so that a place without rights is noticed before the work.
 
-    Without ``out`` it is ``runs/<sequence>-<date-time>``.
+    Without ``out`` it is ``runs/<sequence>-<date-time>``, with a number behind where another run has that already.
 
     Raises:
         ConfigError: ``out`` holds a run already, and ``overwrite`` is not set.
         DataError: the folder cannot be made.
     """
-    if out is None:
-        now = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-        names = [f"{sequence}-{now}", *(f"{sequence}-{now}-{n}" for n in range(2, 100))]
-        out = next(path for name in names if not (path := Path("runs") / name).exists())
-    if (out / METRICS).exists() and not overwrite:
+    if out is not None and (out / METRICS).exists() and not overwrite:
         raise ConfigError(f"{out} holds a run already; choose another folder, or --overwrite it")
+    wanted = out or Path("runs") / f"{sequence}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
     try:
+        if out is None:
+            return _made_anew(wanted)
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise DataError(f"cannot make the run folder {out}: {error.strerror}; choose another with -o") from None
+        raise DataError(f"cannot make the run folder {wanted}: {error.strerror}; choose another with -o") from None
     return out
+
+
+def _made_anew(wanted: Path) -> Path:
+    """The folder, or one with a number behind its name, that was not there and that no other process makes."""
+    for number in count(1):
+        folder = wanted if number == 1 else wanted.with_name(f"{wanted.name}-{number}")
+        with suppress(FileExistsError):
+            folder.mkdir(parents=True)
+            return folder
+    raise AssertionError("numbers do not end")
 
 
 def clear(folder: Path) -> None:

@@ -1,8 +1,10 @@
 import json
 import re
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from threading import Barrier
 
 import numpy as np
 import pytest
@@ -189,6 +191,26 @@ def test_default_folders_are_named_after_the_sequence_and_never_shared(tmp_path,
     assert len(set(made)) == 3
     assert all(re.fullmatch(r"runs/town-\d{8}-\d{6}(-\d)?", str(path)) for path in made)
     assert all(path.is_dir() for path in made)
+
+
+def test_runs_that_begin_at_once_get_folders_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ready = Barrier(8)
+
+    def begin(_: int) -> Path:
+        ready.wait()
+        return run_folder.new_run_folder("town", None, overwrite=False)
+
+    with ThreadPoolExecutor(8) as runs:
+        assert len(set(runs.map(begin, range(8)))) == 8
+
+
+def test_a_place_where_no_folder_can_be_made_is_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("runs").write_text("a file")
+    for out in (None, Path("runs/mine")):
+        with pytest.raises(DataError, match="cannot make the run folder runs/"):
+            run_folder.new_run_folder("town", out, overwrite=False)
 
 
 def test_latest_points_at_the_newest_and_works_after_the_folder_above_moved(tmp_path):
