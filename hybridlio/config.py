@@ -4,31 +4,23 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterator
-from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from hybridlio.errors import ConfigError
 from hybridlio.files import read_yaml
 from hybridlio.keyframes import KeyframeSettings
 from hybridlio.learned.source_settings import LstmSettings, NetworkResidualSettings
+from hybridlio.ranges import SettingError
 from hybridlio.recent_scans import RecentScansSettings
-from hybridlio.scan_matching import ScanMatchingSettings
+from hybridlio.scan_matching_settings import ScanMatchingSettings
 from hybridlio.sensors import ImuNoise
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
-
-_POSITIVE = (
-    "max_range_m", "map_voxel_m", "source_voxel_m", "covariance_scale",
-    "registration.kernel_m", "registration.max_distance_m", "registration.max_iterations", "registration.threads",
-    "local_map.keyframe_m", "local_map.keyframe_deg", "local_map.voxel_m", "local_map.horizon_keyframes",
-    "local_map.radius_m", "local_map.neighbours", "local_map.threads",
-)  # fmt: skip
-_NOT_NEGATIVE = ("min_range_m", "min_points", "min_matched", "drift_share")
 
 
 class Config(BaseModel):
@@ -59,16 +51,6 @@ class Config(BaseModel):
     network: NetworkResidualSettings = Field(default_factory=NetworkResidualSettings)
     keyframes: KeyframeSettings = Field(default_factory=KeyframeSettings)
 
-    @field_validator("scan_matching")
-    @classmethod
-    def _within_range(cls, settings: ScanMatchingSettings) -> ScanMatchingSettings:
-        for name in (*_POSITIVE, *_NOT_NEGATIVE):
-            value = attrgetter(name)(settings)
-            if not (value > 0 if name in _POSITIVE else value >= 0):  # NaN is neither
-                wanted = "above 0" if name in _POSITIVE else "0 or more"
-                raise ConfigError(f"scan_matching.{name}: must be {wanted}, got {value}")
-        return settings
-
 
 def config_to_yaml(config: Config) -> str:
     """The configuration as YAML text that :func:`load_config` reads back."""
@@ -95,8 +77,6 @@ def parse_config(tree: object, where: str) -> Config:
     except ValidationError as error:
         wrong = "; ".join(map(_complaint, error.errors()))
         raise ConfigError(f"{where}: {wrong}. `hybridlio config` prints all keys with their defaults") from None
-    except ConfigError as error:  # settings that check themselves
-        raise ConfigError(f"{where}: {error}") from None
 
 
 def _complaint(error: ErrorDetails) -> str:
@@ -105,6 +85,9 @@ def _complaint(error: ErrorDetails) -> str:
     path = ".".join((*above, last))
     if not path:
         return f"expected settings, each with its key, got {error['input']!r:.40}"
+    cause = error.get("ctx", {}).get("error")
+    if isinstance(cause, SettingError):  # settings check themselves, and do not know where they stand
+        return f"{path}.{cause.name}: {cause.complaint}"
     if error["type"] not in ("extra_forbidden", "unexpected_keyword_argument"):
         return f"{path}: {error['msg'].lower()}"
     every = [".".join(keys) for keys in _keys(Config().model_dump())]

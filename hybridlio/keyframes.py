@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlio.errors import ConfigError, DataError
+from hybridlio.errors import DataError
 from hybridlio.estimates import Array
 from hybridlio.files import UNREADABLE_NPZ, writing_whole
 from hybridlio.packing import PackedCloud
+from hybridlio.ranges import above_0, expect
 from hybridlio.sensors import Scan
 from hybridlio.voxel import voxel_average
 
@@ -35,6 +36,9 @@ class KeyframeSettings:
         voxel_m: side of the voxels that thin it.
         max_range_m: points farther away are left out.
         max_points: with more points left, they are thinned evenly to so many.
+
+    Raises:
+        SettingError: a value is out of range.
     """
 
     __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
@@ -45,11 +49,9 @@ class KeyframeSettings:
     max_points: int = 5000
 
     def __post_init__(self) -> None:
-        if not (self.spacing_m > 0 and self.voxel_m > 0 and 0 < self.max_range_m < _FARTHEST_M and self.max_points > 0):
-            raise ConfigError(
-                f"keyframes: spacing_m, voxel_m and max_points must be positive, and max_range_m below "
-                f"{_FARTHEST_M:.0f}, got {self}"
-            )
+        above_0(self, "spacing_m", "voxel_m", "max_points")
+        within = 0 < self.max_range_m < _FARTHEST_M
+        expect(self, "max_range_m", within, f"above 0 and below {_FARTHEST_M:.0f}")
 
 
 @dataclass(frozen=True, eq=False)

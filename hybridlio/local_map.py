@@ -9,6 +9,7 @@ import numpy as np
 from hybridlio import se3
 from hybridlio.estimates import Array
 from hybridlio.map_cells import MapCells
+from hybridlio.ranges import above_0
 from hybridlio.surface import Surface
 
 _FRESH_SHARE = 0.12
@@ -28,6 +29,9 @@ class LocalMapSettings:
         radius_m: points farther from the keyframe are left out of the surface then.
         neighbours: points to fit a plane to for a normal.
         threads: for normals and trees.
+
+    Raises:
+        SettingError: a value is out of range.
     """
 
     __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
@@ -39,6 +43,9 @@ class LocalMapSettings:
     radius_m: float = 100.0
     neighbours: int = 10
     threads: int = 2
+
+    def __post_init__(self) -> None:
+        above_0(self, "keyframe_m", "keyframe_deg", "voxel_m", "horizon_keyframes", "radius_m", "neighbours", "threads")
 
 
 class LocalMap:

@@ -13,8 +13,8 @@ import numpy as np
 
 from hybridlio import se3
 from hybridlio.agreement import GATE, chi2_of
-from hybridlio.errors import ConfigError
 from hybridlio.estimates import Array, KeyframePose, RelativePose, ResidualSource, TakesBack
+from hybridlio.ranges import above_0, expect, from_0
 from hybridlio.sensors import Frame
 
 _FLOOR = np.diag(np.r_[np.full(3, 1e-4), np.full(3, 1e-3)] ** 2)  # no way is known better
@@ -29,6 +29,9 @@ class RecentScansSettings:
         distance_m, angle_deg: a scan this far from the last keyframe becomes one.
         shared: how much of a relative pose's covariance is noise of its two scans, half each, that their other
             relative poses have too.
+
+    Raises:
+        SettingError: a value is out of range.
     """
 
     __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
@@ -39,11 +42,9 @@ class RecentScansSettings:
     shared: float = 0.75
 
     def __post_init__(self) -> None:
-        if self.count < 0 or not self.distance_m > 0 or not self.angle_deg > 0 or not 0 <= self.shared < 1:
-            raise ConfigError(
-                "recent scans: need count >= 0, distance_m and angle_deg above 0, shared from 0 to below 1, got "
-                f"{self.count}, {self.distance_m}, {self.angle_deg}, {self.shared}"
-            )
+        from_0(self, "count")
+        above_0(self, "distance_m", "angle_deg")
+        expect(self, "shared", 0 <= self.shared < 1, "from 0 to below 1")
 
 
 class PairSource(ResidualSource, Protocol):

@@ -17,6 +17,7 @@ import numpy as np
 from hybridlio import se3
 from hybridlio.estimates import Array
 from hybridlio.information import newton_step
+from hybridlio.ranges import above_0
 from hybridlio.surface import Matches, Neighbours, Surface, System
 
 _ROTATION_CONVERGED_RAD = 2e-5
@@ -36,6 +37,9 @@ class RegistrationSettings:
         max_distance_m: nearest neighbours farther away do not count.
         max_iterations: Gauss-Newton steps.
         threads: for the nearest-neighbour search.
+
+    Raises:
+        SettingError: a value is out of range.
     """
 
     __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
@@ -44,6 +48,9 @@ class RegistrationSettings:
     max_distance_m: float = 1.0
     max_iterations: int = 30
     threads: int = 2
+
+    def __post_init__(self) -> None:
+        above_0(self, "kernel_m", "max_distance_m", "max_iterations", "threads")
 
 
 class Fit(NamedTuple):

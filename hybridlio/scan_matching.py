@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 
@@ -14,48 +13,12 @@ from hybridlio.estimates import Array, RelativePose
 from hybridlio.information import FLOOR_SIGMAS
 from hybridlio.local_map import LocalMap, LocalMapSettings
 from hybridlio.observability import Observed, observe
-from hybridlio.registration import Registration, RegistrationSettings
+from hybridlio.registration import Registration
+from hybridlio.scan_matching_settings import ScanMatchingSettings
 from hybridlio.sensors import NS_PER_S, Frame, Scan
 from hybridlio.start_search import COARSE_KERNEL_M, best_start, lies_better, motions
 from hybridlio.surface import Surface
 from hybridlio.voxel import voxel_average
-
-
-@dataclass(frozen=True)
-class ScanMatchingSettings:
-    """How scans are matched.
-
-    Attributes:
-        target: ``local-map`` of recent keyframes, or the ``last-scan`` alone.
-        min_range_m, max_range_m: points outside are not used.
-        map_voxel_m: side of the voxels that thin a scan for the map.
-        source_voxel_m: the same for the points that are registered.
-        min_points: with fewer points a scan is bridged by the initial pose.
-        min_matched: with a smaller share of points matched, too.
-        covariance_scale: how much larger the covariance is than independent residuals would make it; points on one
-            surface share its error.
-        drift_share: how much of a step's covariance adds up when the map has taken in a keyframe, once it has many;
-            the rest is scatter about the map. Not used with ``last-scan``, where all of it does.
-        start_speeds_m_s: forward speeds tried where the initial pose is unsure of the translation.
-        start_rates_deg_s: rates of turn tried with each where it is unsure of the rotation too.
-    """
-
-    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
-
-    target: Literal["local-map", "last-scan"] = "local-map"
-    min_range_m: float = 2.0
-    max_range_m: float = 100.0
-    map_voxel_m: float = 0.6
-    source_voxel_m: float = 1.0
-    min_points: int = 200
-    min_matched: float = 0.3
-    covariance_scale: float = 5.0
-    drift_share: float = 0.1
-    start_speeds_m_s: tuple[float, ...] = (0.0, -5.0, *(2.5 * i for i in range(1, 17)))
-    start_rates_deg_s: tuple[float, ...] = (0.0, -50.0, 50.0, -100.0, 100.0)
-    registration: RegistrationSettings = field(default_factory=RegistrationSettings)
-    local_map: LocalMapSettings = field(default_factory=LocalMapSettings)
-
 
 _UNSURE_TRANSLATION_M = 0.5
 _UNSURE_ROTATION_RAD = 0.02

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio import se3
-from hybridlio.errors import ConfigError, DataError
+from hybridlio.errors import DataError
 from hybridlio.geodesy import GeodeticPoint
+from hybridlio.ranges import expect
 
 NS_PER_S = 1_000_000_000
 FARTHEST_M = 1e4  # no lidar sees farther; what is there is broken data
@@ -137,7 +138,7 @@ class ImuNoise:
     ``*_bias_sigma`` say how far the biases may be from zero at power-up.
 
     Raises:
-        ConfigError: a value is negative or not finite.
+        SettingError: a value is negative or not finite.
     """
 
     __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
@@ -150,9 +151,8 @@ class ImuNoise:
     accel_bias_sigma_m_s2: float = 1.0e-1
 
     def __post_init__(self) -> None:
-        wrong = {name: value for name, value in vars(self).items() if not 0 <= value < np.inf}
-        if wrong:
-            raise ConfigError(f"imu_noise: expected numbers that are finite and 0 or more, got {wrong}")
+        for name, value in vars(self).items():
+            expect(self, name, 0 <= value < np.inf, "finite and 0 or more")
 
 
 @dataclass(frozen=True, eq=False)

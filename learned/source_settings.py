@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hybridlio.errors import ConfigError
+from hybridlio.ranges import above_0, expect, from_0, shares
 
 SHIPPED = "shipped"
 """In place of a path: the weights that come with the package."""
@@ -39,6 +39,9 @@ class NetworkResidualSettings:
             answer than noise explains; 0 always leaves the answer.
         kernel_m, max_distance_m: of the robust loss that weighs the answer.
         start_speeds_m_s: forward speeds tried, by the loss, where the initial pose is unsure of the translation.
+
+    Raises:
+        SettingError: a value is out of range.
     """
 
     __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
@@ -54,12 +57,7 @@ class NetworkResidualSettings:
     start_speeds_m_s: tuple[float, ...] = (0.0, -5.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0)
 
     def __post_init__(self) -> None:
-        if self.min_cells < 1 or not 0 <= self.min_matched <= 1 or self.refine_steps < 0:
-            raise ConfigError(
-                "network: need min_cells >= 1, min_matched within 0 and 1, refine_steps >= 0, got "
-                f"{self.min_cells}, {self.min_matched}, {self.refine_steps}"
-            )
-        positive = ("covariance_scale", "kernel_m", "max_distance_m")
-        wrong = [f"{name} {getattr(self, name)}" for name in positive if not getattr(self, name) > 0]
-        if wrong or not self.start_speeds_m_s:
-            raise ConfigError(f"network: {', '.join(wrong) or 'start_speeds_m_s'} must be positive or not empty")
+        above_0(self, "min_cells", "covariance_scale", "kernel_m", "max_distance_m")
+        from_0(self, "refine_steps")
+        shares(self, "min_matched")
+        expect(self, "start_speeds_m_s", len(self.start_speeds_m_s) > 0, "one number at least")

@@ -89,7 +89,7 @@ def read_simulation(path: Path) -> Simulation | None:
     """The sensors of ``simulation.json``; None where there is no file.
 
     Raises:
-        DataError: not JSON, or the lidar's name is unknown.
+        DataError: not JSON, the lidar's name is unknown, or the IMU's noise is not of numbers that it can be.
     """
     if not path.is_file():
         return None
@@ -99,7 +99,7 @@ def read_simulation(path: Path) -> Simulation | None:
         raise DataError(f"{path}: not JSON ({error})") from None
     if not isinstance(content, dict):
         raise DataError(f"{path}: expected an object with 'lidar' and 'imu_noise'")
-    return Simulation(_lidar(path, content), _imu_noise(content.get("imu_noise")))
+    return Simulation(_lidar(path, content), _imu_noise(path, content.get("imu_noise")))
 
 
 def _lidar(path: Path, content: dict[str, Any]) -> LidarModel:
@@ -109,7 +109,10 @@ def _lidar(path: Path, content: dict[str, Any]) -> LidarModel:
     return LIDAR_MODELS[name]
 
 
-def _imu_noise(values: dict[str, float] | None) -> ImuNoise | None:
+def _imu_noise(path: Path, values: dict[str, float] | None) -> ImuNoise | None:
     if not values:
         return None
-    return ImuNoise(**{f.name: float(values[f.name]) for f in fields(ImuNoise) if f.name in values})
+    try:
+        return ImuNoise(**{f.name: float(values[f.name]) for f in fields(ImuNoise) if f.name in values})
+    except (ValueError, TypeError) as error:
+        raise DataError(f"{path}: imu_noise: {error}") from None

@@ -1,5 +1,6 @@
+import pickle
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,9 @@ import yaml
 
 from hybridlio.config import Config, config_to_yaml, load_config, parse_config
 from hybridlio.errors import ConfigError
+from hybridlio.local_map import LocalMapSettings
+from hybridlio.registration import RegistrationSettings
+from hybridlio.scan_matching_settings import ScanMatchingSettings
 from hybridlio.sensors import ImuNoise
 
 
@@ -102,7 +106,7 @@ def test_an_unknown_key_at_any_level_is_an_error_that_gives_its_path(tmp_path: P
         ({"scan_matching": {"min_points": "many"}}, "scan_matching.min_points"),
         ({"scan_matching": 3}, "scan_matching"),
         ({"backend": 7}, "backend"),
-        ({"network": {"min_cells": 0}}, "network"),
+        ({"network": {"min_cells": 0}}, "network.min_cells"),
         ({"network": {"refine_steps": "some"}}, "network.refine_steps"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
@@ -158,19 +162,54 @@ def test_a_misspelt_or_misplaced_key_is_told_what_it_may_have_meant(tree: dict, 
         parse_config(tree, "here")
 
 
+SETTINGS = {
+    name: getattr(Config(), name) for name in ("scan_matching", "recent_scans", "network", "keyframes")
+} | {"imu_noise": ImuNoise()}  # fmt: skip
+
+
 @pytest.mark.parametrize("value", [-1, float("nan")])
-@pytest.mark.parametrize("path", [path for path, _ in leaves(Config().scan_matching) if "start_" not in path])
-def test_no_number_of_scan_matching_may_be_negative_or_none(path: str, value: float):
-    *above, last = path.split(".")
-    tree: dict = {last: value}
-    for key in reversed(above):
+@pytest.mark.parametrize("path", [f"{above}.{path}" for above, tree in SETTINGS.items() for path, _ in leaves(tree)])
+def test_no_number_may_be_negative_or_none_and_its_path_is_given(path: str, value: float):
+    tree: dict | float = value
+    for key in reversed(path.split(".")):
         tree = {key: tree}
-    with pytest.raises(ConfigError, match=rf"here: scan_matching\.{re.escape(path)}: "):
-        parse_config({"scan_matching": tree}, "here")
+    with pytest.raises(ConfigError, match=rf"here: {re.escape(path)}: ") as error:
+        parse_config(tree, "here")
+    assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", [f.name for f in fields(ImuNoise)])
-@pytest.mark.parametrize("value", [-1e-9, float("nan"), float("inf")])
-def test_noise_that_is_negative_or_endless_is_refused(name: str, value: float):
-    with pytest.raises(ConfigError, match=rf"here: imu_noise: .*{name}"):
-        parse_config({"imu_noise": {name: value}}, "here")
+@pytest.mark.parametrize(
+    ("changed", "wanted"),
+    [
+        ({"scan_matching": {"min_range_m": 50.0, "max_range_m": 40.0}}, "scan_matching.max_range_m: must be above min"),
+        ({"scan_matching": {"min_matched": 1.1}}, "scan_matching.min_matched: must be within 0 and 1, got 1.1"),
+        ({"scan_matching": {"start_speeds_m_s": []}}, "scan_matching.start_speeds_m_s: must be one number at least"),
+        ({"network": {"start_speeds_m_s": []}}, "network.start_speeds_m_s: must be one number at least"),
+        ({"keyframes": {"max_range_m": 1e6}}, "keyframes.max_range_m: must be above 0 and below 164"),
+        ({"imu_noise": {"gyro_rad_s_sqrt_hz": float("inf")}}, "imu_noise.gyro_rad_s_sqrt_hz: must be finite"),
+        (
+            {"recent_scans": {"shared": 1.0}, "keyframes": {"voxel_m": 0.0}},
+            "recent_scans.shared: .*; keyframes.voxel_m",
+        ),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_numbers_out_of_range_are_refused_and_all_of_them_named(changed: dict, wanted: str):
+    with pytest.raises(ConfigError, match=wanted):
+        parse_config(changed, "here")
+
+
+@pytest.mark.parametrize(
+    ("make", "wanted"),
+    [
+        (lambda: ScanMatchingSettings(map_voxel_m=-1), "ScanMatchingSettings.map_voxel_m: must be above 0, got -1"),
+        (lambda: ScanMatchingSettings(target="map"), "ScanMatchingSettings.target: must be local-map or last-scan"),
+        (lambda: RegistrationSettings(threads=0), "RegistrationSettings.threads: must be above 0, got 0"),
+        (lambda: LocalMapSettings(radius_m=float("nan")), "LocalMapSettings.radius_m: must be above 0, got nan"),
+        (lambda: ImuNoise(gyro_rad_s_sqrt_hz=-1), "ImuNoise.gyro_rad_s_sqrt_hz: must be finite and 0 or more, got -1"),
+    ],
+)
+def test_settings_made_in_python_are_checked_alike(make: Callable[[], object], wanted: str):
+    with pytest.raises(ConfigError, match=re.escape(wanted)) as error:
+        make()
+    assert str(pickle.loads(pickle.dumps(error.value))) == str(error.value)  # as from a batch's processes

@@ -143,7 +143,7 @@ def test_the_file_holds_plain_arrays_alone(rng: np.random.Generator, tmp_path: P
 
 @pytest.mark.parametrize("wrong", [{"spacing_m": 0.0}, {"voxel_m": -1.0}, {"max_range_m": 200.0}, {"max_points": 0}])
 def test_settings_that_mean_nothing_are_refused(wrong: dict[str, float]):
-    with pytest.raises(ConfigError, match="keyframes:"):
+    with pytest.raises(ConfigError, match="KeyframeSettings"):
         KeyframeSettings(**wrong)  # type: ignore[arg-type]
 
 

@@ -12,7 +12,8 @@ from hybridlio.datasets.sequence import Sequence
 from hybridlio.errors import DataError
 from hybridlio.estimates import RelativePose
 from hybridlio.initial_pose import unknown_motion_covariance
-from hybridlio.scan_matching import ScanMatching, ScanMatchingSettings
+from hybridlio.scan_matching import ScanMatching
+from hybridlio.scan_matching_settings import ScanMatchingSettings
 from hybridlio.sensors import Frame, Scan
 
 TARGETS = ("local-map", "last-scan")

@@ -41,7 +41,13 @@ class TestSimulatorsAdditions:
         assert sequence.lidar is LIDAR_MODELS["16-beam"]
         assert sequence.imu_noise == noise
 
-    @pytest.mark.parametrize("content", ["{", '{"lidar": "hdl-9"}', "[]"])
+    @pytest.mark.parametrize(
+        "content",
+        [
+            *("{", '{"lidar": "hdl-9"}', "[]"),
+            *(f'{{"lidar": "16-beam", "imu_noise": {noise}}}' for noise in ('{"gyro_rad_s_sqrt_hz": -1}', "[1]", "7")),
+        ],
+    )
     def test_a_malformed_description_is_named(self, drive: Path, content: str) -> None:
         (drive / "simulation.json").write_text(content)
         with pytest.raises(DataError, match=r"simulation\.json"):
