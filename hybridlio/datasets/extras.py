@@ -109,9 +109,11 @@ def _lidar(path: Path, content: dict[str, Any]) -> LidarModel:
     return LIDAR_MODELS[name]
 
 
-def _imu_noise(path: Path, values: dict[str, float] | None) -> ImuNoise | None:
+def _imu_noise(path: Path, values: Any) -> ImuNoise | None:
     if not values:
         return None
+    if not isinstance(values, dict):
+        raise DataError(f"{path}: imu_noise: expected an object of numbers")
     try:
         return ImuNoise(**{f.name: float(values[f.name]) for f in fields(ImuNoise) if f.name in values})
     except (ValueError, TypeError) as error:
