@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ import pytest
 from hybridlio import se3
 from hybridlio.agreement import GATE, GROSS, MOST_REJECTED, START_STEPS, Witness, chi2_of, widening
 from hybridlio.config import Config
-from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.estimates import KeyframePose, RelativePose
 from hybridlio.odometry import Estimate, Odometry
@@ -131,11 +129,6 @@ def test_scans_that_go_on_to_contradict_the_imu_are_trusted_until_one_agrees():
 
 
 # ---------------------------------------------------------------------------------------------------- in a drive
-
-
-@pytest.fixture(scope="module")
-def sequence(tiny_drive: Path) -> Sequence:
-    return open_sequence(tiny_drive)
 
 
 class Slipping(ScanMatching):

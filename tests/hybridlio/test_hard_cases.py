@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ import pytest
 
 from hybridlio import scan_matching, se3
 from hybridlio.config import Config
-from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.estimates import RelativePose
 from hybridlio.odometry import Odometry
@@ -20,11 +18,6 @@ from hybridlio.run import Run, run_odometry
 from hybridlio.scan_matching import ScanMatching
 from hybridlio.simulation.faults import block_sector, drop_scans, imu_bias, imu_gap
 from hybridlio.start_search import best_start
-
-
-@pytest.fixture(scope="module")
-def sequence(tiny_drive: Path) -> Sequence:
-    return open_sequence(tiny_drive)
 
 
 def ran(sequence: Sequence, **names: str) -> Run:

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scans import blind
 
 from hybridlio import se3
 from hybridlio.config import Config
-from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.errors import ConfigError, DataError, EstimationError
 from hybridlio.estimates import RelativePose
@@ -16,27 +16,13 @@ from hybridlio.graph.offline import smooth
 from hybridlio.initial_pose import NoResidual
 from hybridlio.odometry import Estimate, Odometry
 from hybridlio.record import Record
-from hybridlio.sensors import Frame, GpsFix, ImuSamples, Scan
-
-
-@pytest.fixture(scope="module")
-def sequence(tiny_drive: Path) -> Sequence:
-    return open_sequence(tiny_drive)
-
-
-@pytest.fixture(scope="module")
-def frames(sequence: Sequence) -> list[Frame]:
-    return list(sequence)
+from hybridlio.sensors import Frame, GpsFix, ImuSamples
 
 
 @pytest.fixture(scope="module")
 def driven(frames: list[Frame]) -> tuple[Odometry, list[Estimate]]:
     odometry = Odometry()
     return odometry, [odometry.step(frame) for frame in frames]
-
-
-def blind(frame: Frame) -> Frame:
-    return replace(frame, scan=Scan(frame.scan.stamp_ns, np.empty((0, 3), np.float32)))
 
 
 def quick() -> Odometry:

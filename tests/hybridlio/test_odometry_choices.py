@@ -3,35 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from scans import blind
 
 from hybridlio import se3
 from hybridlio.config import Config, parse_config
-from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.errors import ConfigError
 from hybridlio.estimates import RelativePose, State
 from hybridlio.initial_pose import Identity
 from hybridlio.odometry import Odometry
 from hybridlio.run import run_odometry
-from hybridlio.sensors import Frame, ImuNoise, Scan
-
-
-@pytest.fixture(scope="module")
-def sequence(tiny_drive: Path) -> Sequence:
-    return open_sequence(tiny_drive)
-
-
-@pytest.fixture(scope="module")
-def frames(sequence: Sequence) -> list[Frame]:
-    return list(sequence)
-
-
-def blind(frame: Frame) -> Frame:
-    return replace(frame, scan=Scan(frame.scan.stamp_ns, np.empty((0, 3), np.float32)))
+from hybridlio.sensors import Frame, ImuNoise
 
 
 class Truth:

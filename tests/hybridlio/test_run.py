@@ -6,18 +6,12 @@ import pytest
 
 from hybridlio import se3
 from hybridlio.config import Config
-from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence, part_of
 from hybridlio.errors import ConfigError, DataError, GraphError
 from hybridlio.initial_pose import NoResidual
 from hybridlio.odometry import Odometry
 from hybridlio.run import Run, run_odometry
 from hybridlio.sensors import Scan
-
-
-@pytest.fixture(scope="module")
-def sequence(tiny_drive) -> Sequence:
-    return open_sequence(tiny_drive)
 
 
 @pytest.fixture(scope="module")

@@ -35,12 +35,6 @@ def run(tiny_drive) -> Run:
     return run_of(tiny_drive)
 
 
-@pytest.fixture
-def without_pages(monkeypatch) -> None:
-    """Spare the test the report and its pictures, which take a second."""
-    monkeypatch.setattr("hybridlio.run_outputs.write_pages", lambda *_: None)
-
-
 @pytest.fixture(scope="module")
 def folder(run, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("run")

@@ -1,13 +1,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hybridlio import se3
-from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.errors import DataError
 from hybridlio.estimates import RelativePose
@@ -19,11 +17,6 @@ from hybridlio.sensors import Frame, Scan
 TARGETS = ("local-map", "last-scan")
 SURE = np.diag(np.r_[np.full(3, 0.01), np.full(3, 0.1)] ** 2)
 OFF = se3.exp(np.array([0.003, -0.002, 0.005, 0.12, -0.08, 0.05]))
-
-
-@pytest.fixture(scope="module")
-def sequence(tiny_drive: Path) -> Sequence:
-    return open_sequence(tiny_drive)
 
 
 @pytest.fixture(scope="module")

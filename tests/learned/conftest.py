@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from hybridlio import se3
+from hybridlio.learned.odometry_network import OdometryNetwork
 from hybridlio.learned.settings import LossSettings, NetworkSettings, OptimiserSettings, Recipe
 from hybridlio.learned.shards import ScanRecord, Shard, write_shard
+from hybridlio.learned.weights import save_weights
 from hybridlio.projection import MapGeometry, vertex_map
 
 GEOMETRY = MapGeometry(20.0, -20.0, 12, 60)
@@ -157,3 +160,16 @@ def seeing_recipe() -> Recipe:
 def tiny_recipe() -> Recipe:
     """A recipe that trains in a second."""
     return RECIPE
+
+
+@pytest.fixture
+def weights(seeing_recipe: Recipe, tmp_path: Path) -> Callable[..., Path]:
+    """Writes weights that know nothing yet, of a network with changed settings: δT is nearly the identity."""
+
+    def write(**changes: Any) -> Path:
+        recipe = replace(seeing_recipe, network=replace(seeing_recipe.network, residual_scale=1e-6, **changes))
+        torch.manual_seed(0)
+        save_weights(tmp_path / "w.safetensors", OdometryNetwork(recipe.network), recipe, {})
+        return tmp_path / "w.safetensors"
+
+    return write

@@ -1,0 +1,72 @@
+"""A simulated drive as everybody looks at it, and what tests of whole runs share."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from command_line import ok
+
+from hybridlio.config import Config
+from hybridlio.datasets.registry import open_sequence
+from hybridlio.datasets.sequence import Sequence
+from hybridlio.learned.source_settings import LstmSettings, NetworkResidualSettings
+from hybridlio.sensors import Frame, ImuNoise
+from hybridlio.sources import Setup
+
+
+@pytest.fixture(scope="session")
+def sequence(tiny_drive: Path) -> Sequence:
+    return open_sequence(tiny_drive)
+
+
+@pytest.fixture(scope="session")
+def frames(sequence: Sequence) -> list[Frame]:
+    """All 25; read them, do not change them."""
+    return list(sequence)
+
+
+@pytest.fixture(scope="session")
+def first_frames(frames: list[Frame]) -> list[Frame]:
+    """Eight, which are enough for a contract."""
+    return frames[:8]
+
+
+@pytest.fixture(scope="session")
+def learned_config(untrained_weights: Path) -> Config:
+    """What the learned sources need for the drive's lidar: the shipped weights are for another one."""
+    path = str(untrained_weights)
+    return Config(lstm=LstmSettings(path, "cpu"), network=NetworkResidualSettings(path, "cpu", min_cells=200))
+
+
+@pytest.fixture(scope="session")
+def setup(sequence: Sequence, learned_config: Config) -> Setup:
+    return Setup(learned_config, sequence.calibration, ImuNoise())
+
+
+@pytest.fixture
+def without_pages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spare the test the report and its pictures, which take a second."""
+    monkeypatch.setattr("hybridlio.run_outputs.write_pages", lambda *_: None)
+
+
+@pytest.fixture(scope="session")
+def finished_run(tiny_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run over the whole drive, without its pages; read it, do not change it."""
+    folder = tmp_path_factory.mktemp("cli") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hybridlio.run_outputs.write_pages", lambda *_: None)
+        ok("odometry", tiny_drive, "-o", folder)
+    return folder
+
+
+@pytest.fixture
+def plain_logging() -> Iterator[None]:
+    """The commands set the library's logger up; leave it as other tests expect it."""
+    yield
+    logger = logging.getLogger("hybridlio")
+    logger.handlers.clear()
+    logger.setLevel(logging.NOTSET)
+    logger.propagate = True
