@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from hybridlio import se3
 from hybridlio.errors import ConfigError, DataError
@@ -18,7 +19,7 @@ from hybridlio.learned.devices import at_run_time, on_device, pick_device
 from hybridlio.learned.loss_judge import CHI2_99, Judged, JudgedScan, LossJudge
 from hybridlio.learned.lstm_initial_pose import inertial
 from hybridlio.learned.maps import valid_cells
-from hybridlio.learned.odometry_network import NetworkInput, SeenScan
+from hybridlio.learned.odometry_network import SeenScan
 from hybridlio.learned.preparing import Mapped
 from hybridlio.learned.settings import Recipe
 from hybridlio.learned.source_settings import NetworkResidualSettings
@@ -29,6 +30,7 @@ from hybridlio.sensors import NS_PER_S, Frame, Scan
 _log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.float32] | NDArray[np.float64]
 Prepare = Callable[[Scan], Mapped]
 
 _UNSURE_TRANSLATION_M = 0.5
@@ -50,6 +52,20 @@ class _Seen:
     def judged(self) -> JudgedScan:
         vertices, normals = (part[0].cpu().numpy() for part in (self.maps.vertices, self.maps.normals))
         return JudgedScan.of_maps(vertices, normals, self.threads)
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """Two scans to be compared, ``dt_s`` apart, and what the network is told of the IMU between them."""
+
+    last: _Seen
+    current: _Seen
+    dt_s: float
+    features: tuple[Tensor, Tensor] | None
+
+    @property
+    def enough(self) -> bool:
+        return self.last.enough and self.current.enough
 
 
 class NetworkResidual:
@@ -80,8 +96,8 @@ class NetworkResidual:
         self._network = weights.network(self._device)
         self._prepare = prepare_for(weights.recipe)
         self._threads = torch.get_num_threads()
-        self._before: _Seen | None = None  # the scan before the last one
         self._last: _Seen | None = None
+        self._pair: _Pair | None = None  # of the last scan and the one before it
         self._step: tuple[Array, float] | None = None
 
     @property
@@ -95,8 +111,8 @@ class NetworkResidual:
         Raises:
             DataError: too few of its cells have a normal.
         """
-        self._step = None
-        self._before, self._last = None, self._look(frame.scan)
+        self._step = self._pair = None
+        self._last = self._look(frame.scan)
         if not self._last.enough:
             raise DataError(
                 f"frame {frame.index}: only {self._last.cells} cells of the network's maps "
@@ -111,25 +127,23 @@ class NetworkResidual:
 
     def propose(self, frame: Frame, initial: RelativePose) -> Array | None:
         """The network's ``T`` ``(4, 4)``, which nothing has judged yet; None with too little to see."""
-        last, current = self._take(frame)
-        if not (last.enough and current.enough):
+        pair = self._take(frame)
+        if not pair.enough:
             return None
-        dt_s = (current.stamp_ns - last.stamp_ns) / NS_PER_S
-        pose = self._ask(self._given(last, current, frame, dt_s), initial.pose, last, current)
-        self._step = (pose, dt_s)
+        pose = self._ask(pair, initial.pose)
+        self._step = (pose, pair.dt_s)
         return pose
 
     def judge(self, frame: Frame, initial: RelativePose) -> RelativePose:
         """What :meth:`refine` says of the frame that was last given to :meth:`propose`."""
-        last, current = self._before, self._last
-        assert last is not None
-        assert current is not None
-        dt_s = (current.stamp_ns - last.stamp_ns) / NS_PER_S
-        details = {"cells": float(current.cells), "last_cells": float(last.cells)}
-        if not (last.enough and current.enough):
-            why = f"{min(last.cells, current.cells)} cells with a normal, {self._settings.min_cells} are needed"
+        pair = self._pair
+        assert pair is not None
+        cells, dt_s = (pair.last.cells, pair.current.cells), pair.dt_s
+        details = {"cells": float(cells[1]), "last_cells": float(cells[0])}
+        if not pair.enough:
+            why = f"{min(cells)} cells with a normal, {self._settings.min_cells} are needed"
             return self._bridge(frame, initial, details, dt_s, why)
-        before, after = self._estimate(self._given(last, current, frame, dt_s), initial, dt_s, last, current)
+        before, after = self._estimate(pair, initial)
         details |= {"cost": after.cost, "initial_cost": before.cost, "matched": after.matched}
         if after.matched < self._settings.min_matched:
             return self._bridge(frame, initial, details, dt_s, f"only {after.matched:.0%} of the points have a match")
@@ -148,11 +162,8 @@ class NetworkResidual:
         """A scan relative to any earlier one, ``T_j_k``, by the points alone; ``initial``, not ok, where that fails."""
         if not (earlier.enough and current.enough):
             return replace(initial, ok=False)
-        dt_s, settings = (current.stamp_ns - earlier.stamp_ns) / NS_PER_S, self._network.settings
-        none, still = (torch.zeros(shape, device=self._device) for shape in ((1, settings.imu_samples, 6), (1, 3)))
-        dt = torch.tensor([dt_s], device=self._device)
-        given = NetworkInput(earlier.maps.vertices, current.maps.vertices, none, dt, still)
-        before, after = self._estimate(given, initial, dt_s, earlier, current)
+        nothing, still = np.zeros((self._network.settings.imu_samples, 6)), np.zeros(3)
+        before, after = self._estimate(self._paired(earlier, current, nothing, still), initial)
         if after.matched < self._settings.min_matched or self._is_worse(after, before):
             return replace(initial, ok=False)
         return self._answer(after, {})
@@ -162,13 +173,19 @@ class NetworkResidual:
         if self._step is not None:
             self._step = (initial.pose, self._step[1])
 
-    def _take(self, frame: Frame) -> tuple[_Seen, _Seen]:
+    def _take(self, frame: Frame) -> _Pair:
         """The last scan and the frame's, which is the last one from now on."""
         last, current = self._last, self._look(frame.scan)
         if last is None:
             raise DataError(f"frame {frame.index}: no scan before it; call start with the first frame")
-        self._before, self._last = last, current
-        return last, current
+        imu, velocity = inertial(frame.imu, frame, self._network.settings, self._step)
+        self._last, self._pair = current, self._paired(last, current, imu, velocity)
+        return self._pair
+
+    def _paired(self, last: _Seen, current: _Seen, imu: Rows, velocity: Rows) -> _Pair:
+        with at_run_time():
+            features = self._network.imu_features(on_device(imu, self._device), on_device(velocity, self._device))
+        return _Pair(last, current, (current.stamp_ns - last.stamp_ns) / NS_PER_S, features)
 
     def _look(self, scan: Scan) -> _Seen:
         prepared = self._prepare(scan)
@@ -180,39 +197,26 @@ class NetworkResidual:
             there = int(valid_cells(seen.normals).sum()) if prepared.usable else 0
         return _Seen(scan.stamp_ns, seen, there, there >= self._settings.min_cells, self._threads)
 
-    def _given(self, last: _Seen, current: _Seen, frame: Frame, dt_s: float) -> NetworkInput:
-        imu, velocity = inertial(frame.imu, frame, self._network.settings, self._step)
-        dt = torch.tensor([dt_s], device=self._device)
-        return NetworkInput(
-            last.maps.vertices,
-            current.maps.vertices,
-            on_device(imu, self._device),
-            dt,
-            on_device(velocity, self._device),
-        )
-
-    def _estimate(
-        self, given: NetworkInput, initial: RelativePose, dt_s: float, last: _Seen, current: _Seen
-    ) -> tuple[Judged, Judged]:
+    def _estimate(self, pair: _Pair, initial: RelativePose) -> tuple[Judged, Judged]:
         """The pose that the network starts from and its answer, both judged."""
-        judge = LossJudge(last.judged, current.judged, self._settings, self._threads)
-        before = min((judge.judge(T) for T in self._starts(initial, dt_s)), key=lambda j: j.cost)
-        answer = judge.judge(self._ask(given, before.pose, last, current))
+        judge = LossJudge(pair.last.judged, pair.current.judged, self._settings, self._threads)
+        before = min((judge.judge(T) for T in self._starts(initial, pair.dt_s)), key=lambda j: j.cost)
+        answer = judge.judge(self._ask(pair, before.pose))
         if len(answer.degenerate):  # where the scans say nothing, the initial pose knows better than the network
             way = answer.constrained(se3.log(se3.between(before.pose, answer.pose)))
             answer = judge.judge(se3.orthonormalise(before.pose @ se3.exp(way)))
         return before, judge.descend(answer)
 
-    def _ask(self, given: NetworkInput, start: Array, last: _Seen, current: _Seen) -> Array:
+    def _ask(self, pair: _Pair, start: Array) -> Array:
         """Where the network gets to from a pose ``(4, 4)``, and once more from there after a long way."""
-        found = self._once(given, start, last, current)
+        found = self._once(pair, start)
         way_m = float(np.linalg.norm(se3.between(start, found)[:3, 3]))
-        return found if way_m < _LONG_WAY_M else self._once(given, found, last, current)
+        return found if way_m < _LONG_WAY_M else self._once(pair, found)
 
-    def _once(self, given: NetworkInput, start: Array, last: _Seen, current: _Seen) -> Array:
+    def _once(self, pair: _Pair, start: Array) -> Array:
         with at_run_time():
-            features = self._network.imu_features(given)
-            found = self._network.refine_seen(last.maps, current.maps, on_device(start, self._device), features)
+            pose = on_device(start, self._device)
+            found = self._network.refine_seen(pair.last.maps, pair.current.maps, pose, pair.features)
             return se3.orthonormalise(found.pose[0].double().cpu().numpy())
 
     def _starts(self, initial: RelativePose, dt_s: float) -> list[Array]:

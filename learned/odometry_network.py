@@ -139,11 +139,11 @@ class OdometryNetwork(nn.Module):
                 poses.append(pose)
         return NetworkOutput(initial, tuple(poses))
 
-    def imu_features(self, given: NetworkInput) -> tuple[Tensor, Tensor] | None:
-        """What the residual network is told of the IMU; None but with ``imu="feature"``."""
+    def imu_features(self, imu: Tensor, velocity_m_s: Tensor) -> tuple[Tensor, Tensor] | None:
+        """What the residual network is told of the IMU; None but with ``imu="feature"``. See :class:`NetworkInput`."""
         if self.imu_network is None or self.settings.imu != "feature":
             return None
-        return self.imu_network.features(given.imu, given.velocity_m_s)
+        return self.imu_network.features(imu, velocity_m_s)
 
     def _from_imu(self, given: NetworkInput) -> tuple[Tensor, tuple[Tensor, Tensor] | None]:
         if self.settings.imu == "given":
@@ -154,7 +154,7 @@ class OdometryNetwork(nn.Module):
         if self.imu_network is None:
             return nothing, None
         if self.settings.imu == "feature":
-            return nothing, self.imu_features(given)
+            return nothing, self.imu_features(given.imu, given.velocity_m_s)
         return self.imu_network(given.imu, given.velocity_m_s, given.dt_s), None
 
 

@@ -134,6 +134,29 @@ def test_after_a_long_way_the_network_looks_once_more(weights, seen, monkeypatch
     assert np.allclose(starts[-1][0], STEP, atol=1e-6) == (looks == 2)
 
 
+def test_however_often_the_network_looks_it_is_told_of_the_imu_once_a_scan_and_of_the_velocity_before_it(
+    weights, seen, monkeypatch
+):
+    scans = [seen(np.linalg.matrix_power(STEP, k), seed=k) for k in range(3)]
+    residual = source(weights(imu="feature", velocity=True), scans, replace(FEW, refine_steps=0))
+    told, velocities = [], []
+    answer = type("Answer", (), {"pose": torch.tensor(STEP, dtype=torch.float32)[None]})
+    monkeypatch.setattr(residual._network, "refine_seen", lambda *given: (told.append(given[3]), answer)[1])
+    features = residual._network.imu_network.features
+    monkeypatch.setattr(
+        residual._network.imu_network,
+        "features",
+        lambda imu, v: (velocities.append(v[0].tolist()), features(imu, v))[1],
+    )
+    far = initial(np.array([0, 0, 0, 0.3, 0, 0]))
+    for k in (1, 2):
+        residual.propose(frame(k), far)
+        residual.judge(frame(k), far)
+    assert len(told) == 8  # twice each time, for the way is long
+    assert len({id(features) for features in told}) == len(velocities) == 2
+    assert np.allclose(velocities, [np.zeros(3), STEP[:3, :3].T @ STEP[:3, 3] / 0.1], atol=1e-5)
+
+
 def test_of_a_scan_with_too_little_to_see_nothing_is_proposed(weights, seen):
     residual = source(weights(), [seen(np.eye(4)), replace_points(seen(STEP, seed=1), 50)])
     assert residual.propose(frame(1), initial(OFF)) is None
