@@ -145,11 +145,3 @@ def euler_to_rotation(angles: Tensor) -> Tensor:
         -sp, cp * sr, cp * cr,
     ]  # fmt: skip
     return torch.stack(rows, dim=-1).reshape(*angles.shape[:-1], 3, 3)
-
-
-def rotation_to_euler(R: Tensor) -> Tensor:
-    """Roll, pitch, yaw ``(..., 3)`` in radians of rotations ``(..., 3, 3)``; pitch within ±π/2, away from its ends."""
-    pitch = torch.atan2(-R[..., 2, 0], (R[..., 0, 0] ** 2 + R[..., 1, 0] ** 2).sqrt())
-    roll = torch.atan2(R[..., 2, 1], R[..., 2, 2])
-    yaw = torch.atan2(R[..., 1, 0], R[..., 0, 0])
-    return torch.stack([roll, pitch, yaw], dim=-1)
