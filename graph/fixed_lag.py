@@ -29,6 +29,7 @@ class FixedLagBackend(IncrementalBackend):
     """
 
     name = "fixed-lag"
+    _forgets = True  # costs 2 % of an update; without, empty slots take 0.2 to 0.4 kB a scan
 
     def __init__(self, steps: InertialSteps, lag_scans: int = 100) -> None:
         super().__init__(steps)

@@ -31,6 +31,7 @@ class IncrementalBackend:
     """
 
     name = "incremental"
+    _forgets = False
 
     def __init__(self, steps: InertialSteps) -> None:
         self._steps = steps
@@ -44,7 +45,7 @@ class IncrementalBackend:
         self._scans = Scans(state.stamp_ns)
         self._state = state
         self._graph, self._values = factors.start_factors(state)
-        self._isam = incremental_solver()
+        self._isam = incremental_solver(self._forgets)
         self._isam.update(self._graph, self._values)
 
     def update(self, frame: Frame, relative: RelativePose) -> State:
@@ -111,7 +112,7 @@ class IncrementalBackend:
         self._isam.update(graph, values)
         if self._k == WARM_UP_STEPS - 1:
             self._values = self._isam.calculateEstimate()
-            self._isam = incremental_solver()
+            self._isam = incremental_solver(self._forgets)
             self._isam.update(self._graph, self._values)
 
     def _order(self, relative: RelativePose, new: gtsam.Values) -> gtsam.KeyGroupMap | None:

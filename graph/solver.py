@@ -27,9 +27,15 @@ _RELINEARISE = {
 }
 
 
-def incremental_solver() -> gtsam.ISAM2:
-    """An empty iSAM2 for graphs of poses ``x`` and ``m``, velocities ``v``, biases ``b``, gravity ``g`` …"""
-    return gtsam.ISAM2(make_isam_params(_RELINEARISE, _WILDFIRE_THRESHOLD))
+def incremental_solver(forgets: bool = False) -> gtsam.ISAM2:
+    """An empty iSAM2 for graphs of poses ``x`` and ``m``, velocities ``v``, biases ``b``, gravity ``g`` …
+
+    Args:
+        forgets: factors will leave, and new ones take their slots: looking for a free one goes through all slots.
+    """
+    params = make_isam_params(_RELINEARISE, _WILDFIRE_THRESHOLD)
+    params.findUnusedFactorSlots = forgets
+    return gtsam.ISAM2(params)
 
 
 def eager_solver() -> gtsam.ISAM2:

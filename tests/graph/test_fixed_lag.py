@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import gtsam
@@ -61,6 +62,17 @@ def test_memory_stops_growing_at_the_lag(chain: Callable[..., Any]) -> None:
     assert min(sizes[60:]) >= 5 * 40
 
 
+def test_factors_take_the_slots_of_those_that_are_forgotten(chain: Callable[..., Any]) -> None:
+    drive = chain(seed=6, steps=200, drift_share=0.1)
+    slots = {}
+    for name, backend in (("whole", IncrementalBackend), ("lagged", partial(FixedLagBackend, lag_scans=40))):
+        made = backend(InertialSteps(drive.calibration, drive.noise))
+        drive_through(made, drive)
+        slots[name] = made._isam.getFactorsUnsafe()
+    assert slots["whole"].nrFactors() == slots["whole"].size() > 4 * 200
+    assert slots["lagged"].size() < 1.5 * 4 * 82  # steps between lag and forgetting
+
+
 def test_a_lag_shorter_than_the_start_needs_is_refused() -> None:
     with pytest.raises(ConfigError, match="too short"):
         FixedLagBackend(InertialSteps(Calibration(), ImuNoise()), lag_scans=5)
@@ -74,8 +86,8 @@ def test_far_from_the_start_a_step_touches_no_more_of_the_graph_than_near_it(
     make = online.incremental_solver
 
     class Counting:
-        def __init__(self) -> None:
-            self._solver = make()
+        def __init__(self, *settings: Any) -> None:
+            self._solver = make(*settings)
 
         def update(self, graph: gtsam.NonlinearFactorGraph, *arguments: Any) -> None:
             result = self._solver.update(graph, *arguments)

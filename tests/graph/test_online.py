@@ -111,8 +111,8 @@ def test_a_straight_road_of_a_thousand_poses_with_imu_is_solved_without_touching
     solver = online.incremental_solver
 
     class Counting:
-        def __init__(self) -> None:
-            self._solver = solver()
+        def __init__(self, *settings: Any) -> None:
+            self._solver = solver(*settings)
 
         def update(self, *arguments: Any) -> None:
             eliminated.append(self._solver.update(*arguments).getVariablesReeliminated())
