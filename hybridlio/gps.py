@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.fix_alignment import MAX_SHIFT_S
+from hybridlio.ranges import expect, from_0
 
 Array = NDArray[np.float64]
 
@@ -23,12 +24,21 @@ class GpsOptions:
         max_shift_s: the clocks are no farther apart (also the shift's prior); 0 takes the stamps as they are.
         outages: times ``(start_ns, end_ns)`` whose fixes are left out.
         robust: how to treat those that may be wrong.
+
+    Raises:
+        SettingError: an antenna of not three finite numbers, a negative shift, or an outage that ends before it starts.
     """
 
     antenna_m: Array | None = None
     max_shift_s: float = MAX_SHIFT_S
     outages: Sequence[tuple[int, int]] = ()
     robust: str | None = "cauchy"
+
+    def __post_init__(self) -> None:
+        where = np.zeros(3) if self.antenna_m is None else np.asarray(self.antenna_m)
+        expect(self, "antenna_m", where.shape == (3,) and bool(np.isfinite(where).all()), "three finite numbers")
+        from_0(self, "max_shift_s")
+        expect(self, "outages", all(a <= b for a, b in self.outages), "pairs of start and end, in this order")
 
 
 @dataclass(frozen=True, eq=False)

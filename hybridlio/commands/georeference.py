@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hybridlio.commands.common import Verbose, guarded
+from hybridlio.commands.fixes import Antenna, MaxShift, gps_options
 from hybridlio.errors import ConfigError, DataError
 from hybridlio.terminal import complain, say
 
@@ -33,9 +34,8 @@ def georeference(
             help="Where on Earth the fixes' local frame has its origin (degrees, metres), if they do not say.",
         ),
     ] = None,
-    max_shift: Annotated[
-        float, typer.Option(metavar="S", min=0.0, help="The clocks of fixes and scans are no farther apart (seconds).")
-    ] = 2.0,
+    antenna: Antenna = None,
+    max_shift: MaxShift = None,
     _verbose: Verbose = 0,
 ) -> None:
     """Place a run on its GPS fixes as a whole, without bending it, and write it as CSV, GeoJSON and TUM."""
@@ -48,7 +48,10 @@ def georeference(
     path = next((p for p in (run / RECORD, run.parent / RECORD) if p.is_file()), None)
     if path is None:
         raise DataError(f"{run}: neither it nor the folder above has {RECORD}, which holds the fixes")
-    placed = place(Record.load(path), stored.trajectory, max_shift_s=max_shift, origin=_origin(origin))
+    record, options = Record.load(path), gps_options(antenna, max_shift)
+    placed = place(
+        record, stored.trajectory, antenna_m=options.antenna_m, max_shift_s=options.max_shift_s, origin=_origin(origin)
+    )
     fit = placed.alignment
     say(
         f"{stored.metrics['sequence']}: {int(fit.inliers.sum())} of {len(fit.used)} fixes agree, {fit.rmse_m:.2f} m "

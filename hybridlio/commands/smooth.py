@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hybridlio.commands.common import Verbose, guarded
+from hybridlio.commands.fixes import Antenna, MaxShift, Outages, gps_options
 from hybridlio.errors import ConfigError
 from hybridlio.terminal import complain, progress, say, say_table
 
 if TYPE_CHECKING:
+    from hybridlio.gps import GpsOptions
     from hybridlio.graph.offline import Smoothed
     from hybridlio.record import Record
 
@@ -32,6 +34,9 @@ def smooth(
     gps: Annotated[
         bool, typer.Option("--gps", help="Use the run's GPS fixes; their frame and their clock are found.")
     ] = False,
+    antenna: Antenna = None,
+    outage: Outages = None,
+    max_shift: MaxShift = None,
     robust: Annotated[
         str | None,
         typer.Option(
@@ -47,6 +52,8 @@ def smooth(
     from hybridlio.run_folder import KEYFRAMES, POSES, RECORD, REPORT, SMOOTHED, is_run_folder, read_run
     from hybridlio.run_outputs import write_smoothed
 
+    if not gps and not (antenna is None and outage is None and max_shift is None):
+        raise ConfigError("--antenna, --outage and --max-shift are about GPS fixes; give --gps too")
     stored = read_run(run)
     folder = run / SMOOTHED if out is None else out
     if folder.resolve() == run.resolve():
@@ -56,7 +63,8 @@ def smooth(
     record = Record.load(run / RECORD)
     if loops:
         record = replace(record, keyframes=Keyframes.load(run / KEYFRAMES))
-    smoothed = _smooth(record, loops, gps, robust)
+    start_ns = int(record.online.stamps_ns[0])
+    smoothed = _smooth(record, loops, gps and gps_options(antenna, max_shift, outage, start_ns), robust)
     findings = write_smoothed(folder, stored, record, smoothed)
     error = (
         f"error {smoothed.error_before:.4g} before, {smoothed.error_after:.4g} after {smoothed.iterations} iterations"
@@ -74,7 +82,7 @@ def smooth(
     say(f"report  {folder / REPORT}")
 
 
-def _smooth(record: Record, loops: bool, gps: bool, robust: str | None) -> Smoothed:
+def _smooth(record: Record, loops: bool, gps: bool | GpsOptions, robust: str | None) -> Smoothed:
     from hybridlio.graph.offline import smooth as optimise
 
     with progress("smoothing", "poses") as tick:

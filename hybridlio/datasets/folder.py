@@ -4,7 +4,8 @@ recording/
     scans/*.bin|.npy|.pcd|.ply   (or in lidar/, points/, velodyne/, data/, or directly in the folder)
     timestamps.txt or times.txt  one stamp a scan: seconds (1.5), whole nanoseconds, or ISO dates
     imu.csv                      optional; see `imu_csv`
-    calibration.yaml             T_imu_lidar as four rows of four; needed with imu.csv. Also T_camera_lidar, lidar
+    calibration.yaml             T_imu_lidar as four rows of four; needed with imu.csv. Also T_camera_lidar, lidar,
+                                 antenna_imu_m
     poses_tum.txt                optional reference: lidar poses on the stamps' clock
     gps.csv                      optional; see `extras.read_gps_csv`
 """
@@ -154,11 +155,11 @@ def read_calibration_yaml(path: Path, needs_imu: bool = False) -> tuple[Calibrat
     """Extrinsics and lidar of a ``calibration.yaml``; the identity and None where the file, or the entry, is missing.
 
     Raises:
-        DataError: not YAML, an unknown key or lidar, or a matrix that is no rigid transform; or no ``T_imu_lidar``
-            although there are inertial data that need it.
+        DataError: not YAML, an unknown key or lidar, an antenna that is nowhere, or a matrix that is no rigid
+            transform; or no ``T_imu_lidar`` although there are inertial data that need it.
     """
     content = read_yaml(path) if path.is_file() else {}
-    known = ("T_imu_lidar", "T_camera_lidar", "lidar")
+    known = ("T_imu_lidar", "T_camera_lidar", "lidar", "antenna_imu_m")
     if not isinstance(content, dict) or set(content) - set(known):
         raise DataError(f"{path}: expected only the keys {', '.join(known)}; {_HOW_TO_CALIBRATE}")
     lidar = content.get("lidar")
@@ -168,7 +169,8 @@ def read_calibration_yaml(path: Path, needs_imu: bool = False) -> tuple[Calibrat
     if T_imu_lidar is None and needs_imu:
         what = "lacks T_imu_lidar" if path.is_file() else "missing"
         raise DataError(f"{path}: {what}, and imu.csv needs it: {_HOW_TO_CALIBRATE}")
-    calibration = Calibration(np.eye(4) if T_imu_lidar is None else T_imu_lidar, T_camera_lidar)
+    antenna = _antenna(path, content.get("antenna_imu_m"))
+    calibration = Calibration(np.eye(4) if T_imu_lidar is None else T_imu_lidar, T_camera_lidar, antenna)
     return calibration, LIDAR_MODELS[lidar] if lidar else None
 
 
@@ -182,3 +184,15 @@ def _matrix(path: Path, name: str, value: Any) -> NDArray[np.float64] | None:
     if matrix.shape != (4, 4):
         raise DataError(f"{path}: {name} must be four rows of four numbers; {_HOW_TO_CALIBRATE}")
     return se3.check_pose(matrix, f"{path}: {name}")
+
+
+def _antenna(path: Path, value: Any) -> NDArray[np.float64] | None:
+    if value is None:
+        return None
+    try:
+        antenna = np.array(value, dtype=np.float64)
+    except (ValueError, TypeError):
+        antenna = np.empty(0)
+    if antenna.shape != (3,) or not np.isfinite(antenna).all():
+        raise DataError(f"{path}: antenna_imu_m must be three numbers, the GPS antenna in the IMU's frame")
+    return antenna

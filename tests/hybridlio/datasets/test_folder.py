@@ -194,6 +194,12 @@ class TestCalibration:
             file.write("lidar: 32-beam\n")
         assert open_sequence(folder).lidar is LIDAR_MODELS["32-beam"]
 
+    def test_the_gps_antenna_can_be_placed(self, folder: Path) -> None:
+        assert open_sequence(folder).calibration.antenna_imu_m is None
+        with (folder / "calibration.yaml").open("a") as file:
+            file.write("antenna_imu_m: [-0.3, 0.4, 1]\n")
+        np.testing.assert_array_equal(open_sequence(folder).calibration.antenna_imu_m, [-0.3, 0.4, 1.0])
+
     @pytest.mark.parametrize(
         "content",
         [
@@ -205,6 +211,10 @@ class TestCalibration:
             "lidar: hdl-9",
             "lidar: 16-beam",
             "lidar: [16-beam]",
+            *(
+                f"T_imu_lidar: {np.eye(4).tolist()}\nantenna_imu_m: {where}"
+                for where in ("[1, 2]", "{x: 1}", "[0, 0, .nan]")
+            ),
             "T_imu_lidar: [0.1, 0, 0.2, 0, 0, 0, 1]",
             "[",
             "",
