@@ -18,7 +18,7 @@ from hybridlio.scan_matching_settings import ScanMatchingSettings
 from hybridlio.sensors import NS_PER_S, Frame, Scan
 from hybridlio.start_search import COARSE_KERNEL_M, best_start, lies_better, motions
 from hybridlio.surface import Surface
-from hybridlio.voxel import voxel_average
+from hybridlio.voxel import voxel_average, voxel_pick
 
 _UNSURE_TRANSLATION_M = 0.5
 _UNSURE_ROTATION_RAD = 0.02
@@ -175,12 +175,12 @@ class ScanMatching:
         return share * covariance
 
     def _look(self, scan: Scan) -> SeenScan:
-        """The scan's points within range, one a voxel."""
+        """The scan's points within range, one a voxel, and a share of the same to register."""
         points = voxel_average(scan.points, None, self._settings.map_voxel_m)[0].astype(np.float64)
         range2 = np.einsum("ij,ij->i", points, points)
         near, far = self._settings.min_range_m, self._settings.max_range_m
         points = np.asarray(points[(range2 > near**2) & (range2 < far**2)])
-        source = voxel_average(points, None, self._settings.source_voxel_m)[0].astype(np.float64)
+        source = points.take(voxel_pick(points, self._settings.source_voxel_m), axis=0)
         return SeenScan(points, source, self._settings.local_map)
 
     def _take_in_keyframe(self) -> None:
