@@ -59,6 +59,11 @@ class LocalMap:
         self.keyframes = 0
         self.surface: Surface | None = None
 
+    @property
+    def alone(self) -> Array | None:
+        """``(4, 4)`` pose of the only keyframe; None where there are none or several."""
+        return self._keyframe if self.keyframes == 1 else None
+
     def wants(self, T_map_lidar: Array) -> bool:
         """Whether a scan at this pose should become a keyframe."""
         if self._keyframe is None:

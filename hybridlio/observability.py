@@ -7,6 +7,10 @@ there than here. So the cost is looked at half a metre to either side, where all
 minimum anew; a parabola through the three says where the minimum is, and the scatter of the points' rises how surely.
 
 Who does not know to a few decimetres where to start may ask more: what the costs up to two metres off make likely.
+
+A lidar's own pattern goes with it: where its rings fall on the ground, and by how much each beam is off, is the same
+from scan to scan. A scan lies best on another alone where it has not moved from it. Between smooth walls such minima
+were up to twelve times as deep as their scatter; so a minimum where the only other scan was is no sign.
 """
 
 from __future__ import annotations
@@ -30,6 +34,8 @@ _NEAR_M = 0.1  # a parabola through costs half a metre apart is good for so far
 _ROUNDS = 4
 _OFFSETS_M = np.linspace(-2.0, 2.0, 9)
 _TEMPER = 1.5  # times the scatter of a rise that makes a place e times less likely: so σ was true between smooth walls
+_SHARED = 4.0  # times the variance: the errors of what is weighed are alike from scan to scan, as the scene is
+_OWN_PATTERN_M = 0.5  # from a scan: there its own pattern may be what matches
 _TOLD = 0.9  # a variance that is hardly less than that of knowing nothing tells nothing
 
 
@@ -82,19 +88,21 @@ def observe(
     settings: RegistrationSettings,
     kernel_start_m: float = 0.0,
     far: bool = False,
+    alone: Array | None = None,
 ) -> Observed:
     """Register by the strong directions; along a weak one go to the parabola's minimum, where the points see it at all.
 
     Args:
         surface, source, initial, settings, kernel_start_m: as of :func:`hybridlio.registration.register`.
         far: nobody knows ``initial`` to a few decimetres: along what is not seen, weigh the costs farther off.
+        alone: ``(4, 4)`` where the one scan was that ``surface`` is made of; None for several.
     """
     found = register(surface, source, initial, settings, kernel_start_m)
     noise = surface.normal_noise
     basis, to_tangent = weak_basis(found.hessian, found.levers_m, noise.most)
     if not basis.shape[1]:
         return Observed(found, basis, np.empty((0, 6)), np.empty(0, dtype=bool), np.empty(0), noise.mean)
-    beside = _Beside(surface, source, settings, basis, to_tangent)
+    beside = _Beside(surface, source, settings, basis, to_tangent, alone)
     weak = beside.look(found)
     for _ in range(_ROUNDS):
         if not weak.way_m.any():
@@ -103,7 +111,7 @@ def observe(
         if np.abs(weak.way_m).max() < _NEAR_M:
             break
         weak = beside.look(found)
-    seen = np.isfinite(weak.sigmas_m)
+    seen = np.isfinite(weak.sigmas_m) & (not beside.may_match_itself(found.pose))
     sigmas_m = np.where(seen, weak.sigmas_m, UNKNOWN_SIGMA_M)
     if far and not seen.all():
         ways_m, here = np.zeros(len(seen)), beside.costs(found.pose)
@@ -131,6 +139,7 @@ class _Beside:
     settings: RegistrationSettings
     basis: Array
     to_tangent: Array
+    alone: Array | None
 
     def look(self, found: Registration) -> _Weak:
         """At both sides of ``found``, along each weak direction."""
@@ -149,8 +158,13 @@ class _Beside:
         ``here`` are the costs at the pose found. Each offset's likelihood falls with its rise over the rise's scatter.
         What the choice of offsets pretends to know is taken out again, as of a product of two normal distributions.
         """
-        rises = [self._step(found.pose, here, offset_m * direction)[1] for offset_m in _OFFSETS_M]
+        poses, rises = zip(*(self._step(found.pose, here, offset_m * direction) for offset_m in _OFFSETS_M), strict=True)
         depth = np.array([r.sum() / np.sqrt(r @ r + 1e-12) for r in rises]) / _TEMPER
+        trusted = np.array([not self.may_match_itself(pose) for pose in poses])
+        if not trusted.any():
+            return 0.0, UNKNOWN_SIGMA_M
+        between = np.interp(_OFFSETS_M, _OFFSETS_M[trusted], depth[trusted])
+        depth = np.where(trusted, depth, np.maximum(depth, between))
         weights = np.exp(depth.min() - depth)
         weights /= weights.sum()
         mean = float(weights @ _OFFSETS_M)
@@ -160,7 +174,13 @@ class _Beside:
         if variance > _TOLD * unknown:
             return 0.0, UNKNOWN_SIGMA_M
         told = 1 / (1 / variance - 1 / unknown)
-        return mean / variance * told, float(np.sqrt(told))
+        return mean / variance * told, float(np.sqrt(_SHARED * told))
+
+    def may_match_itself(self, pose: Array) -> bool:
+        """Whether the scan would lie so near to the only other one that its pattern falls on that one's."""
+        if self.alone is None:
+            return False
+        return bool(np.linalg.norm(pose[:3, 3] - self.alone[:3, 3]) < _OWN_PATTERN_M)
 
     def register(self, pose: Array, settings: RegistrationSettings) -> Registration:
         """Down the strong directions alone."""

@@ -137,7 +137,7 @@ class ScanMatching:
             return replace(initial, ok=False)
         settings, sigma_m = self._settings.registration, initial.translation_sigma_m
         wide = min(max(settings.kernel_m, sigma_m), 1.0)
-        observed = observe(earlier.surface, current.source, initial.pose, settings, wide)
+        observed = observe(earlier.surface, current.source, initial.pose, settings, wide, alone=np.eye(4))
         if observed.found.matched < self._settings.min_matched:
             return replace(initial, ok=False)
         covariance = self._covariance(observed, 1)
@@ -203,7 +203,7 @@ class ScanMatching:
         if sigma_m > _UNSURE_TRANSLATION_M:
             if self._path.twist is not None:  # who guesses no motion leaves it to this source to know the last one
                 moving = self._path.T_map_lidar @ se3.exp(self._path.twist * dt_s)
-                observed = observe(surface, seen.source, moving, settings, COARSE_KERNEL_M, far=True)
+                observed = observe(surface, seen.source, moving, settings, COARSE_KERNEL_M, True, self._map.alone)
                 if observed.found.matched >= self._settings.min_matched and observed.found.cost < _LOST_COST:
                     return observed
             turns = initial.covariance[:3, :3].trace() > _UNSURE_ROTATION_RAD**2
@@ -214,15 +214,16 @@ class ScanMatching:
 
     def _from_the_better(self, source: Array, start: Array, initial: RelativePose, kernel_start_m: float) -> Observed:
         """Register from ``start``, or from what was proposed, where the points lie better on the map there."""
-        surface, settings, far = self._map.surface, self._settings.registration, _is_vague(initial)
+        surface, settings = self._map.surface, self._settings.registration
+        far, alone = _is_vague(initial), self._map.alone
         assert surface is not None
         if initial.proposed is not None:
             proposed = self._path.T_map_lidar @ initial.proposed
             if lies_better(surface, source, proposed, start, kernel_start_m, settings.threads):
-                observed = observe(surface, source, proposed, settings, kernel_start_m, far)
+                observed = observe(surface, source, proposed, settings, kernel_start_m, far, alone)
                 if not observed.basis.shape[1]:  # the initial pose knows more of what the points hardly see
                     return observed
-        return observe(surface, source, start, settings, kernel_start_m, far)
+        return observe(surface, source, start, settings, kernel_start_m, far, alone)
 
     def _bridge(self, initial: RelativePose, points: int, observed: Observed | None) -> RelativePose:
         self._before, self._path = self._path, self._path.carried_on(initial)
