@@ -34,7 +34,7 @@ _NEAR_M = 0.1  # a parabola through costs half a metre apart is good for so far
 _ROUNDS = 4
 _OFFSETS_M = np.linspace(-2.0, 2.0, 9)
 _TEMPER = 1.5  # times the scatter of a rise that makes a place e times less likely: so σ was true between smooth walls
-_SHARED = 4.0  # times the variance: the errors of what is weighed are alike from scan to scan, as the scene is
+_SHARED = 2.0  # times the variance: the errors of what is weighed are alike from scan to scan, as the scene is
 _OWN_PATTERN_M = 0.5  # from a scan: there its own pattern may be what matches
 _TOLD = 0.9  # a variance that is hardly less than that of knowing nothing tells nothing
 
