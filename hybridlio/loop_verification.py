@@ -22,7 +22,7 @@ from hybridlio.keyframes import Keyframes
 from hybridlio.odometry_chain import Index, OdometryChain
 from hybridlio.registration import Registration, RegistrationSettings, fit_at, register
 from hybridlio.surface import Surface
-from hybridlio.voxel import voxel_average
+from hybridlio.voxel import voxel_average, voxel_pick
 
 
 def _registration() -> RegistrationSettings:
@@ -167,7 +167,8 @@ class Verifier:
         return Surface(points[known], normals[known], threads)
 
     def _make_source(self, k: int) -> _Source:
-        points = voxel_average(self._keyframes.points(k), None, self._settings.source_voxel_m)[0].astype(np.float64)
+        points = self._keyframes.points(k).astype(np.float64)
+        points = points.take(voxel_pick(points, self._settings.source_voxel_m), axis=0)
         surface = self._surface(k)
         index, _ = surface.nearest(points, self._settings.registration.threads)
         level = np.abs(surface.normals[index][:, 2]) > _LEVEL

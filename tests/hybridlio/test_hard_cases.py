@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,10 @@ from hybridlio.datasets.sequence import Sequence
 from hybridlio.estimates import RelativePose
 from hybridlio.odometry import Odometry
 from hybridlio.run import Run, run_odometry
-from hybridlio.scan_matching import ScanMatching
+from hybridlio.scan_matching import ScanMatching, SeenScan
+from hybridlio.sensors import Frame
 from hybridlio.simulation.faults import block_sector, drop_scans, imu_bias, imu_gap
+from hybridlio.simulation.scenarios import open_scenario
 from hybridlio.start_search import best_start
 
 
@@ -63,6 +66,25 @@ def test_without_scans_and_samples_the_covariance_says_what_is_not_known(sequenc
     assert sequence.reference is not None
     off = np.linalg.norm(run.trajectory.poses[:, :3, 3] - sequence.reference.poses[:, :3, 3], axis=1)
     assert (off[10:15] < 4 * np.array(spread[10:15])).all()
+
+
+def seen_by(frame: Frame) -> SeenScan:
+    source = ScanMatching()
+    source.start(frame)
+    assert source.seen is not None
+    return source.seen
+
+
+def test_between_smooth_walls_the_corners_along_the_ground_turn_no_scan(tmp_path: Path):
+    """They stay where they are in every scan: what roll they pretend adds up, and gravity with it to a wrong speed."""
+    corridor = open_scenario("corridor", tmp_path, seed=1, length_m=16.0)
+    assert corridor.reference is not None
+    steps = se3.between(corridor.reference.poses[:-1], corridor.reference.poses[1:])
+    seen, turns_rad = [seen_by(frame) for frame in corridor], []
+    for earlier, later, step in zip(seen[:-1], seen[1:], steps, strict=True):
+        guess = RelativePose(step, 1e-6 * np.eye(6), "truth")
+        turns_rad.append(se3.log(se3.between(step, ScanMatching().pair(earlier, later, guess).pose))[0])
+    assert abs(np.mean(turns_rad)) < 5e-5
 
 
 # ----------------------------------------------------------------------------------- what an initial pose may cost

@@ -144,3 +144,28 @@ def test_where_there_is_nothing_to_be_told_far_off_is_no_better(rng: np.random.G
     observed = observe(surface, inside, off_by(0.5), SETTINGS, far=True)
     assert len(observed.degenerate) == 3
     assert (np.sqrt(np.diag(observed.covariance(1.0)))[3:5] > 1.5).all()
+
+
+def rings(rng: np.random.Generator, cloud: Cloud) -> np.ndarray:
+    """A scan of them whose every point carries the same error as in any other: a lidar's own pattern."""
+    return cloud[0] + 0.04 * np.sin(3 * cloud[0][:, :1]) * cloud[1] + 0.005 * rng.standard_normal(cloud[0].shape)
+
+
+def test_a_lidars_own_pattern_is_no_sign_that_it_stood_still_beside_the_only_other_scan(rng: np.random.Generator):
+    walls = bend(rng, 1e6, 6000)
+    surface, source = Surface(rings(rng, walls), walls[1], 1), rings(rng, walls)
+    start = se3.exp(np.array([0.0, 0.0, 0.0, 0.2, 0.0, 0.0]))
+    deceived = observe(surface, source, start, SETTINGS, far=True)
+    observed = observe(surface, source, start, SETTINGS, far=True, alone=np.eye(4))
+    assert deceived.seen.all()
+    assert abs(deceived.found.pose[0, 3]) < 0.05
+    assert not observed.seen.any()
+    assert np.sqrt(observed.covariance(1.0)[3, 3]) > 1.0
+
+
+def test_where_it_moved_far_from_the_only_other_scan_it_is_seen_by_bushes(rng: np.random.Generator):
+    where = rng.uniform(-25, 25, (20, 2))
+    surface = leaning(rng, joined(ground(rng, 8000), bushes(rng, where, 60)), 0.03)
+    source = scan(rng, joined(ground(rng, 7000), bushes(rng, where, 16)))
+    alone = off_by(1.0)
+    assert observe(surface, source, off_by(0.3), SETTINGS, 0.3, alone=alone).seen.all()

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from hybridlio import voxel
 from hybridlio.errors import ConfigError, DataError
-from hybridlio.voxel import voxel_average, voxel_to_count
+from hybridlio.voxel import voxel_average, voxel_pick, voxel_to_count
 
 
 def street(seed: int, count: int = 110_000) -> np.ndarray:
@@ -121,6 +121,30 @@ def test_a_cloud_of_no_points_stays_empty():
     cloud = voxel_to_count(np.empty((0, 3)), np.empty((0, 3)))
     assert cloud.points.shape == cloud.normals.shape == (0, 3)
     assert voxel_average(np.empty((0, 3)), None, 0.3)[0].shape == (0, 3)
+
+
+def test_what_is_picked_are_points_that_were_there_the_nearest_to_each_voxels_mean():
+    points = street(3, 2000)
+    means, _ = voxel_average(points, None, 1.0)
+    picked = points[voxel_pick(points, 1.0)]
+    off2 = ((points[:, None] - means) ** 2).sum(axis=2)
+    inside = (np.floor(points[:, None]) == np.floor(picked)).all(axis=2)
+    assert picked.shape == means.shape
+    for k in range(len(means)):
+        own = np.flatnonzero(inside[:, k])
+        assert off2[own, k].min() == pytest.approx(((picked[k] - means[k]) ** 2).sum(), abs=1e-6)
+
+
+def test_what_is_picked_in_a_corner_lies_on_one_of_its_walls():
+    t = np.linspace(0.01, 0.99, 50)
+    corner = np.concatenate([np.column_stack([t, 0 * t, 0 * t]), np.column_stack([0 * t, t, 0 * t])])
+    (mean,), (picked,) = voxel_average(corner, None, 1.0)[0], corner[voxel_pick(corner, 1.0)]
+    assert mean[:2].min() > 0.2
+    assert picked[:2].min() == 0
+
+
+def test_of_no_points_none_is_picked():
+    assert voxel_pick(np.empty((0, 3)), 1.0).shape == (0,)
 
 
 def test_points_that_are_not_finite_are_left_out():
