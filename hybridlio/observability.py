@@ -161,8 +161,8 @@ class _Beside:
         poses, rises = zip(
             *(self._step(found.pose, here, offset_m * direction) for offset_m in _OFFSETS_M), strict=True
         )
-        depth = np.array([r.sum() / np.sqrt(r @ r + 1e-12) for r in rises]) / _TEMPER
-        trusted = np.array([not self.may_match_itself(pose) for pose in poses])
+        depth = np.array([r.sum() / np.sqrt(r @ r + 1e-12) for _, r in tries]) / _TEMPER
+        trusted = np.array([not self.may_match_itself(pose) for pose, _ in tries])
         if not trusted.any():
             return 0.0, UNKNOWN_SIGMA_M
         between = np.interp(_OFFSETS_M, _OFFSETS_M[trusted], depth[trusted])
