@@ -158,9 +158,7 @@ class _Beside:
         ``here`` are the costs at the pose found. Each offset's likelihood falls with its rise over the rise's scatter.
         What the choice of offsets pretends to know is taken out again, as of a product of two normal distributions.
         """
-        poses, rises = zip(
-            *(self._step(found.pose, here, offset_m * direction) for offset_m in _OFFSETS_M), strict=True
-        )
+        tries = [self._step(found.pose, here, offset_m * direction) for offset_m in _OFFSETS_M]
         depth = np.array([r.sum() / np.sqrt(r @ r + 1e-12) for _, r in tries]) / _TEMPER
         trusted = np.array([not self.may_match_itself(pose) for pose, _ in tries])
         if not trusted.any():
