@@ -70,8 +70,12 @@ def voxel_pick(points: ArrayLike, voxel_size_m: float) -> NDArray[np.intp]:
     points = _checked(points, None)[0]
     labels, count = voxel_labels(points, voxel_size_m)
     off = points - label_means(points, labels, count).take(labels, axis=0)
-    order = np.lexsort((np.einsum("ij,ij->i", off, off), labels))
-    return order[np.diff(labels[order], prepend=-1) > 0]
+    off2, least = np.einsum("ij,ij->i", off, off), np.full(count, np.inf, np.float32)
+    np.minimum.at(least, labels, off2)
+    nearest = np.flatnonzero(off2 <= least.take(labels))[::-1]
+    picked = np.empty(count, np.intp)
+    picked[labels[nearest]] = nearest  # of several as near, the first: the last that is written
+    return picked
 
 
 def voxel_labels(points: Floats, voxel_size_m: float) -> tuple[NDArray[np.intp], int]:
