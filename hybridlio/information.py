@@ -112,7 +112,7 @@ def _without(held: Array, information: Array, to_tangent: Array) -> tuple[Array,
     """Eigenvalues and eigenvectors of the scaled Hessian beside ``held``, and which of them are not held."""
     beside = np.eye(6) - held @ held.T
     values, vectors = np.linalg.eigh(beside @ (information * np.outer(to_tangent, to_tangent)) @ beside)
-    return values, vectors, np.abs(held.T @ vectors).max(axis=0) < _HALF
+    return values, vectors, np.abs(held.T @ vectors).max(axis=0, initial=0.0) < _HALF
 
 
 def newton_step(
@@ -125,13 +125,13 @@ def newton_step(
 ) -> Array:
     """The step ``(6,)`` to the minimum of the quadratic, at most ``limit_m``, and none along degenerate directions.
 
-    ``held`` ``(6, D)``, orthonormal in the units of :func:`scaled_spectrum`, says along which instead.
+    ``held`` ``(6, D)``, orthonormal in the units of :func:`scaled_spectrum`, says along which instead; D may be 0.
 
     (Zhang, Kaess, Singh, "On degeneracy of optimization-based state estimation problems", ICRA 2016.)
     """
     values, vectors, scale = scaled_spectrum(information, levers_m)
     strong = strong_directions(information, values, normal_noise)
-    if held is not None and held.shape[1]:
+    if held is not None:
         values, vectors, strong = _without(held, information, scale)
     inverse = np.where(strong, 1 / np.maximum(values, 1e-12), 0.0)
     reduced = -(vectors @ (inverse * (vectors.T @ (scale * gradient))))

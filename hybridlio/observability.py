@@ -29,7 +29,10 @@ from hybridlio.surface import Surface
 _STEP_M = 0.5  # more than neighbours lie apart, so that points find others there
 _STEPS = 6  # down the other directions, there
 _SEEN = 4.5  # times the scatter: between smooth walls the rise was at most 3.5 times that, in a field 6 and more
+_NARROW = 0.3  # of the kernel, where points are brought to points
 _SEEN_SCALE = 6.0  # of a seen direction's variance: the few points that see it stand on a few trunks, and share errors
+_OPEN = 3  # weak directions on open ground: ahead, sideways, the turn
+_NEAR_SCALE = 20.0  # the same of points brought to points
 _NEAR_M = 0.1  # a parabola through costs half a metre apart is good for so far
 _ROUNDS = 4
 _OFFSETS_M = np.linspace(-2.0, 2.0, 9)
@@ -50,8 +53,7 @@ class Observed:
         along: ``(D, 6)`` tangent vectors: how the pose changes for each metre that it is taken along one. Between walls
             that bend it turns.
         seen: ``(D,)`` of which of them the points surely say something.
-        sigmas_m: ``(D,)`` standard deviation along each: of what is seen as if the points were independent, of what is
-            not as it is, 10 m where nothing is known.
+        sigmas_m: ``(D,)`` standard deviation along each, 10 m where nothing is known.
         normal_noise: how much of a point's information, per point, its normal's noise pretends.
     """
 
@@ -76,8 +78,7 @@ class Observed:
         """
         found = self.found
         strong = covariance_of(found.hessian, found.sigma_m, scale, found.levers_m, self.normal_noise, held=self.basis)
-        sigmas_m = np.where(self.seen, np.sqrt(_SEEN_SCALE), 1.0) * self.sigmas_m
-        weak = self.along * np.minimum(sigmas_m, UNKNOWN_SIGMA_M)[:, None]
+        weak = self.along * np.minimum(self.sigmas_m, UNKNOWN_SIGMA_M)[:, None]
         return np.asarray(strong + weak.T @ weak)
 
 
@@ -89,13 +90,17 @@ def observe(
     kernel_start_m: float = 0.0,
     far: bool = False,
     alone: Array | None = None,
+    points: Array | None = None,
 ) -> Observed:
     """Register by the strong directions; along a weak one go to the parabola's minimum, where the points see it at all.
+
+    From there what thin things there are says more, point by point, under a kernel too narrow to find the way there.
 
     Args:
         surface, source, initial, settings, kernel_start_m: as of :func:`hybridlio.registration.register`.
         far: nobody knows ``initial`` to a few decimetres: along what is not seen, weigh the costs farther off.
         alone: ``(4, 4)`` where the one scan was that ``surface`` is made of; None for several.
+        points: ``(M, 3)`` more of the scan's, which tell more of thin things; by default ``source``.
     """
     found = register(surface, source, initial, settings, kernel_start_m)
     noise = surface.normal_noise
@@ -112,7 +117,8 @@ def observe(
             break
         weak = beside.look(found)
     seen = np.isfinite(weak.sigmas_m) & (not beside.may_match_itself(found.pose))
-    sigmas_m = np.where(seen, weak.sigmas_m, UNKNOWN_SIGMA_M)
+    found, sigmas_m = beside.closer(found, weak.sigmas_m, seen, source if points is None else points)
+    sigmas_m = np.where(seen, sigmas_m, UNKNOWN_SIGMA_M)
     if far and not seen.all():
         ways_m, here = np.zeros(len(seen)), beside.costs(found.pose)
         for i in np.flatnonzero(~seen):
@@ -181,6 +187,35 @@ class _Beside:
         if self.alone is None:
             return False
         return bool(np.linalg.norm(pose[:3, 3] - self.alone[:3, 3]) < _OWN_PATTERN_M)
+
+    def closer(
+        self, found: Registration, wide_sigmas_m: Array, seen: NDArray[np.bool_], points: Array
+    ) -> tuple[Registration, Array]:
+        """``found``, at where ``points`` lie nearest, and standard deviations ``(D,)`` along what is ``seen``.
+
+        ``wide_sigmas_m`` are those of the minimum seen, as of independent points. It stands but in the open, where all
+        of the ground is seen: beside walls what makes no plane is mostly their edges, along which points lie near by
+        chance. And it stands where one does not come to the same place from either side.
+        """
+        if len(seen) < _OPEN or not seen.all():
+            return found, np.sqrt(_SEEN_SCALE) * wide_sigmas_m
+        held, narrow = np.empty((6, 0)), replace(self.settings, kernel_m=_NARROW * self.settings.kernel_m)
+        beside = _NEAR_M * self.to_tangent * self.basis.sum(axis=1)
+        near, other = (
+            register(
+                self.surface, points, found.pose @ se3.exp(way), narrow, self.settings.kernel_m, held,
+                thick_as_points=True,
+            )
+            for way in (beside, -beside)
+        )  # fmt: skip
+        to_weak = (self.basis / self.to_tangent[:, None]).T
+        apart_m, way_m = (to_weak @ se3.log(se3.between(near.pose, pose)) for pose in (other.pose, found.pose))
+        if np.abs(apart_m).max() > narrow.kernel_m or np.abs(way_m).max() > _STEP_M:
+            return found, np.sqrt(_SEEN_SCALE) * wide_sigmas_m
+        noise = self.surface.normal_noise.mean
+        covariance = covariance_of(near.hessian, near.sigma_m, _NEAR_SCALE, found.levers_m, noise)
+        sigmas_m = np.sqrt(np.einsum("ij,jk,ik->i", to_weak, covariance, to_weak))
+        return replace(found, pose=near.pose), sigmas_m
 
     def register(self, pose: Array, settings: RegistrationSettings) -> Registration:
         """Down the strong directions alone."""

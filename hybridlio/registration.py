@@ -17,6 +17,7 @@ import numpy as np
 from hybridlio import se3
 from hybridlio.estimates import Array
 from hybridlio.information import newton_step
+from hybridlio.point_matches import MixedMatches, MixedNeighbours
 from hybridlio.ranges import above_0
 from hybridlio.surface import Matches, Neighbours, Surface, System
 
@@ -108,6 +109,7 @@ def register(
     settings: RegistrationSettings,
     kernel_start_m: float = 0.0,
     held: Array | None = None,
+    thick_as_points: bool = False,
 ) -> Registration:
     """Find the pose that lays ``source`` on ``surface``.
 
@@ -121,12 +123,15 @@ def register(
         settings: kernel, distances, limits.
         kernel_start_m: a wider kernel to begin with, halved at every step; for an uncertain ``initial``.
         held: ``(6, D)`` directions that stay, of :func:`hybridlio.information.newton_step`, instead of the weak ones.
+        thick_as_points: bring scan points to the surface's where those make no plane, see
+            :mod:`hybridlio.point_matches`.
     """
     kernel_m, threads = max(settings.kernel_m, kernel_start_m), settings.threads
     descent = _Descent(settings, initial, kernel_m, held, surface.normal_noise.most)
-    neighbours = Neighbours(surface, source, threads)
+    neighbours = MixedNeighbours(surface, source, threads)
+    look = neighbours.mixed if thick_as_points else neighbours.matches
     for _ in range(_MOST_MATCHES):
-        again = descent.by(neighbours.matches(descent.pose, max(settings.max_distance_m, 3 * descent.kernel_m)))
+        again = descent.by(look(descent.pose, max(settings.max_distance_m, 3 * descent.kernel_m)))
         if not again:
             break
     return descent.outcome(len(source))
@@ -141,10 +146,10 @@ class _Descent:
         self.pose, self.kernel_m, self._normal_noise = pose, kernel_m, normal_noise
         self._settings, self._held = settings, held
         self._steps, self._converged = 0, False
-        self._matches: Matches
+        self._matches: Matches | MixedMatches
         self._system: System
 
-    def by(self, matches: Matches) -> bool:
+    def by(self, matches: Matches | MixedMatches) -> bool:
         """Go down as far as the matches are good for; whether others may be better then."""
         self._matches, levers_m, way, length = matches, matches.levers_m, np.zeros(6), np.inf
         while self._steps < self._settings.max_iterations:

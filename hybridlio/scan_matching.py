@@ -137,7 +137,9 @@ class ScanMatching:
             return replace(initial, ok=False)
         settings, sigma_m = self._settings.registration, initial.translation_sigma_m
         wide = min(max(settings.kernel_m, sigma_m), 1.0)
-        observed = observe(earlier.surface, current.source, initial.pose, settings, wide, alone=np.eye(4))
+        observed = observe(
+            earlier.surface, current.source, initial.pose, settings, wide, alone=np.eye(4), points=current.points
+        )
         if observed.found.matched < self._settings.min_matched:
             return replace(initial, ok=False)
         covariance = self._covariance(observed, 1)
@@ -203,27 +205,28 @@ class ScanMatching:
         if sigma_m > _UNSURE_TRANSLATION_M:
             if self._path.twist is not None:  # who guesses no motion leaves it to this source to know the last one
                 moving = self._path.T_map_lidar @ se3.exp(self._path.twist * dt_s)
-                observed = observe(surface, seen.source, moving, settings, COARSE_KERNEL_M, True, self._map.alone)
+                alone, points = self._map.alone, seen.points
+                observed = observe(surface, seen.source, moving, settings, COARSE_KERNEL_M, True, alone, points)
                 if observed.found.matched >= self._settings.min_matched and observed.found.cost < _LOST_COST:
                     return observed
             turns = initial.covariance[:3, :3].trace() > _UNSURE_ROTATION_RAD**2
             rates_deg_s = self._settings.start_rates_deg_s if turns else (0.0,)
             starts = [start @ step for step in motions(self._settings.start_speeds_m_s, rates_deg_s, dt_s)]
             start = best_start(surface, seen.source, seen.points, starts, settings)
-        return self._from_the_better(seen.source, start, initial, kernel_start_m)
+        return self._from_the_better(seen, start, initial, kernel_start_m)
 
-    def _from_the_better(self, source: Array, start: Array, initial: RelativePose, kernel_start_m: float) -> Observed:
+    def _from_the_better(self, seen: SeenScan, start: Array, initial: RelativePose, kernel_start_m: float) -> Observed:
         """Register from ``start``, or from what was proposed, where the points lie better on the map there."""
         surface, settings = self._map.surface, self._settings.registration
         far, alone = _is_vague(initial), self._map.alone
         assert surface is not None
         if initial.proposed is not None:
             proposed = self._path.T_map_lidar @ initial.proposed
-            if lies_better(surface, source, proposed, start, kernel_start_m, settings.threads):
-                observed = observe(surface, source, proposed, settings, kernel_start_m, far, alone)
+            if lies_better(surface, seen.source, proposed, start, kernel_start_m, settings.threads):
+                observed = observe(surface, seen.source, proposed, settings, kernel_start_m, far, alone, seen.points)
                 if not observed.basis.shape[1]:  # the initial pose knows more of what the points hardly see
                     return observed
-        return observe(surface, source, start, settings, kernel_start_m, far, alone)
+        return observe(surface, seen.source, start, settings, kernel_start_m, far, alone, seen.points)
 
     def _bridge(self, initial: RelativePose, points: int, observed: Observed | None) -> RelativePose:
         self._before, self._path = self._path, self._path.carried_on(initial)

@@ -155,6 +155,11 @@ class Neighbours:
 
     def matches(self, pose: Array, reach_m: float) -> Matches:
         """The planes of the points at a pose; points without a neighbour within reach are left out."""
+        index, source = self.within(pose, reach_m)
+        return Matches.of(pose, source, self._surface.planes(index))
+
+    def within(self, pose: Array, reach_m: float) -> tuple[NDArray[np.int64], Array]:
+        """Index ``(M,)`` of the neighbours within reach at a pose, and the points ``(M, 3)`` that have them."""
         moved = self._source @ pose[:3, :3].T + pose[:3, 3]
         self._look(moved)
         off = moved - self._surface.points.take(self._index, axis=0)
@@ -162,7 +167,7 @@ class Neighbours:
         index, source = self._index, self._source
         if len(near) < len(source):
             index, source = index[near], source.take(near, axis=0)
-        return Matches.of(pose, source, self._surface.planes(index))
+        return index, source
 
     def _look(self, moved: Array) -> None:
         if self._asked is None:

@@ -169,3 +169,45 @@ def test_where_it_moved_far_from_the_only_other_scan_it_is_seen_by_bushes(rng: n
     source = scan(rng, joined(ground(rng, 7000), bushes(rng, where, 16)))
     alone = off_by(1.0)
     assert observe(surface, source, off_by(0.3), SETTINGS, 0.3, alone=alone).seen.all()
+
+
+def tree_points(rng: np.random.Generator, where: np.ndarray, points: int) -> np.ndarray:
+    """On trunks of 20 cm, three metres high: too thick for planes of ten points."""
+    angle, height = rng.uniform(-np.pi, np.pi, (2, len(where), points))
+    around = 0.1 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.concatenate([where[:, None] + around, height[..., None] / 2], axis=-1).reshape(-1, 3)
+
+
+def between_trunks(rng: np.random.Generator) -> tuple[Surface, np.ndarray, np.ndarray]:
+    """Ground and trunks whose planes lean anywhere, and of a scan what is registered and all its points."""
+    where, (flat, upright) = rng.uniform(-25, 25, (20, 2)), ground(rng, 8000)
+    trunks = tree_points(rng, where, 100)
+    lean = rng.standard_normal(trunks.shape)
+    normals = np.concatenate([upright, lean / np.linalg.norm(lean, axis=1, keepdims=True)])
+    weights = np.concatenate([np.ones(len(flat)), np.full(len(trunks), 0.6)])
+    surface = Surface(np.concatenate([flat, trunks]), normals, 1, weights)
+    seen = np.concatenate([ground(rng, 7000)[0], tree_points(rng, where, 30)])
+    points = scan(rng, (seen, seen), 0.01)
+    return surface, np.concatenate([points[:7000], points[7000::2]]), points
+
+
+def test_between_trunks_points_know_the_place_to_two_centimetres(rng: np.random.Generator):
+    surface, source, points = between_trunks(rng)
+    observed = observe(surface, source, off_by(0.1, -0.1), SETTINGS, 0.1, points=points)
+    assert observed.basis.shape == (6, 3)
+    assert observed.seen.all()
+    assert np.abs(error(observed)[3:5]).max() < 0.02
+    assert np.abs(error(observed)[2]) < 1e-3
+
+
+def test_points_that_lead_nowhere_in_particular_change_nothing(rng: np.random.Generator):
+    """From either side they come to rest elsewhere: what was seen half a metre off stands, as unsure as that is."""
+    surface, source, points = between_trunks(rng)
+    start, kernel_m = off_by(0.1, -0.1), 0.1
+    anywhere = np.concatenate([points[:7000], rng.uniform([-25, -25, -1], [25, 25, 1], (600, 3))])
+    lost = observe(surface, source, start, SETTINGS, kernel_m, points=anywhere)
+    close = observe(surface, source, start, SETTINGS, kernel_m, points=points)
+    assert lost.seen.all()
+    assert np.abs(error(lost)[3:5]).max() < 0.1
+    sigmas, close_sigmas = (np.sqrt(np.diag(one.covariance(1.0)))[3:5] for one in (lost, close))
+    assert (sigmas > 2 * close_sigmas).all()
