@@ -6,14 +6,14 @@ takes in, one in ten: fitting them to all would take longer than anything else t
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio import se3
 from hybridlio.cell_table import CellTable, cells_of
 from hybridlio.estimates import Array
+from hybridlio.loose_points import LoosePoints
+from hybridlio.planes import LEAST, Fitted, Planes, fit_planes, of_several_rings
 from hybridlio.point_tree import build_tree, threads_for
 from hybridlio.surface import Surface
 
@@ -21,23 +21,8 @@ Index = NDArray[np.intp]
 
 MOST = 10  # points a cell
 _APART_M = 0.1
-_THIN_M = 0.15  # so thick a plane counts half
-_LEAST = 5  # neighbours that make a plane
-_RING_RAD = np.deg2rad(0.1)  # beams of spinning lidars are 0.3° apart and more
-_LEAST_OF_OTHERS = 2  # of ten
-
-
-class Planes(NamedTuple):
-    """Points with the planes about them, map frame.
-
-    Attributes:
-        points, normals: ``(M, 3)`` each.
-        weights: ``(M,)``, how much each plane counts.
-    """
-
-    points: Array
-    normals: Array
-    weights: Array
+_SPARSE_RANGE_M = 20.0  # within it 64 beams leave no point without another beam's beside it; 16 beams one in six
+_SPARSE = 0.05
 
 
 class MapCells:
@@ -52,14 +37,15 @@ class MapCells:
 
     def __init__(self, side_m: float, horizon: int, neighbours: int, threads: int) -> None:
         self._side_m, self._horizon, self._neighbours, self._threads = side_m, horizon, neighbours, threads
-        self._table = CellTable()
+        self._table, self._loose = CellTable(), LoosePoints()
         self._parts: list[Planes] = []  # of every insertion since what was forgotten was dropped
         self._insertions = 0
 
     def insert(self, points: Array, T_map_lidar: Array, known: Surface | None) -> Planes:
         """Take in what there is room for of a scan's points ``(N, 3)``, lidar frame; ``known`` is of the points so far.
 
-        Points that lie beside one of ``known``, or that have no neighbours to make a plane, are left out.
+        Points that lie beside one of ``known``, or that have no neighbours to make a plane, are left out. Where the
+        neighbours of a sparse scan's are of one beam, the last keyframes' are asked.
 
         Returns:
             those taken in.
@@ -69,10 +55,15 @@ class MapCells:
         taken = _with_room(MOST - self._table.held(cells), labels)
         if known is not None and len(taken):
             taken = taken[known.nearest(moved[taken], self._threads)[1] >= _APART_M**2]
-        taken, normals, weights = _with_planes(points, taken, self._neighbours, self._threads)
+        own, planes, alone = _with_planes(points, taken, self._neighbours, self._threads)
+        if not _are_sparse(points[taken], points[alone]):
+            alone = alone[:0]  # what is farther away needs no help, and planes of several scans are less sure
+        helped, others = self._loose.take_in(moved[alone], self._threads)
+        taken = np.concatenate([own, alone[helped]])
         self._table.hit(cells, np.bincount(labels[taken], minlength=len(cells)), self._insertions)
         self._insertions += 1
-        new = Planes(moved[taken], normals @ T_map_lidar[:3, :3].T, weights)
+        normals = np.concatenate([planes.normals @ T_map_lidar[:3, :3].T, others.normals])
+        new = Planes(moved[taken], normals, np.concatenate([planes.weights, others.weights]))
         self._parts.append(new)
         return new
 
@@ -88,6 +79,12 @@ class MapCells:
         return everything
 
 
+def _are_sparse(points: Array, alone: Array) -> bool:
+    """Whether of the points near the lidar too many are ``alone``, with none of another beam beside them."""
+    near, near_alone = (np.einsum("ij,ij->i", p, p) < _SPARSE_RANGE_M**2 for p in (points, alone))
+    return bool(near_alone.sum() > _SPARSE * near.sum())
+
+
 def _with_room(room: NDArray[np.int64], cells: Index) -> Index:
     """Which points find room, where ``cells`` ``(N,)`` they lie in have ``room`` for so many each."""
     candidates = np.flatnonzero(room[cells] > 0)
@@ -97,35 +94,12 @@ def _with_room(room: NDArray[np.int64], cells: Index) -> Index:
     return np.sort(order[rank < room[ordered]])
 
 
-def _with_planes(points: Array, wanted: Index, neighbours: int, threads: int) -> tuple[Index, Array, Array]:
-    """Those of ``wanted`` whose nearest points make a plane, its normals ``(M, 3)``, of least spread, and weights.
-
-    A hedge's points make no plane, and pull a scan anywhere: what a scan's points lie off planes was seen to grow with
-    their thickness, the root mean square along the normal. On simulated drives weights by the inverse square of that
-    are the best (half at 3 cm); with real scans and poses so narrow a choice makes paths longer than they are.
-    """
+def _with_planes(points: Array, wanted: Index, neighbours: int, threads: int) -> tuple[Index, Fitted, Index]:
+    """Those of ``wanted`` whose nearest points make a plane, the planes, and those whose nearest are of one beam."""
     neighbours = min(neighbours, len(points))
-    if neighbours < _LEAST or not len(wanted):
-        return wanted[:0], np.empty((0, 3)), np.empty(0)
+    if neighbours < LEAST or not len(wanted):
+        return wanted[:0], fit_planes(np.empty((0, LEAST, 3))), wanted[:0]
     worth = threads_for(2 * len(wanted), threads)  # ten neighbours take twice as long as one or two
     index, _ = build_tree(points, threads).batch_knn_search(points[wanted], neighbours, worth)
-    several = _of_several_rings(points, index)
-    near = points.take(index[several], axis=0)
-    near -= near.mean(axis=1, keepdims=True)
-    spread, axes = np.linalg.eigh(near.transpose(0, 2, 1) @ near)
-    thick2 = np.maximum(spread[:, 0], 0.0) / neighbours
-    return wanted[several], np.asarray(axes[:, :, 0]), np.asarray(_THIN_M**2 / (_THIN_M**2 + thick2))
-
-
-def _of_several_rings(points: Array, near: NDArray[np.uint64]) -> NDArray[np.bool_]:
-    """Whether those of the points ``(N, 3)``, lidar frame, that ``near`` ``(M, K)`` numbers are of more than one beam.
-
-    One beam's points lie on a cone about the lidar's axis: whatever it hits, their plane is the cone's. On a far wall
-    its normal stands upright, and the next scan's ring would be pulled to the height of this one's.
-    """
-    elevation_rad = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
-    beams_rad = np.sort(elevation_rad[near], axis=1)
-    count = beams_rad.shape[1]
-    middle_rad = (beams_rad[:, (count - 1) // 2] + beams_rad[:, count // 2]) / 2  # np.median takes three times as long
-    others = np.abs(beams_rad - middle_rad[:, None]) > _RING_RAD
-    return np.asarray(others.sum(axis=1) >= _LEAST_OF_OTHERS)
+    several = of_several_rings(points, index)
+    return wanted[several], fit_planes(points.take(index[several], axis=0)), wanted[~several]
