@@ -17,10 +17,11 @@ from pathlib import Path
 import numpy as np
 from lockstep import Pass, run_in_lockstep
 from numpy.typing import NDArray
-from peers import drift_of, opened, trajectory_of
+from peers import ahead_of_speed, drift_of, opened, trajectory_of
 from systems import our_systems, peer_systems
 
 from hybridlio import se3, tables
+from hybridlio.datasets.sequence import Sequence
 from hybridlio.estimates import Array
 from hybridlio.metrics import evaluate
 from hybridlio.terminal import progress
@@ -38,8 +39,31 @@ def apart(a: Array, b: Array, steps: int) -> Array:
 
 def of_reference(reference: Array, a: Array, b: Array, steps: int) -> Array:
     """The reference's own part; 0 where the systems' errors are too much alike, or too large, to tell."""
-    to_a, to_b, between = (apart(x, y, steps) ** 2 for x, y in ((reference, a), (reference, b), (a, b)))
-    return np.sqrt(np.maximum((to_a + to_b - between) / 2, 0.0))
+    return own_part(*(apart(x, y, steps) for x, y in ((reference, a), (reference, b), (a, b))))
+
+
+def own_part(to_a: Array, to_b: Array, between: Array) -> Array:
+    """The error of one whose difference from two others is known, and the others' from each other."""
+    return np.sqrt(np.maximum((to_a**2 + to_b**2 - between**2) / 2, 0.0))
+
+
+def forward_table(sequence: Sequence, passes: dict[str, Pass], lengths: list[int]) -> list[dict[str, str]]:
+    """The same of the way forward alone, beside the forward speed's, with what each of the three errs by itself."""
+    ahead = {name: ahead_of_speed(trajectory_of(one), sequence)[0] for name, one in passes.items() if one.error is None}
+    (_, ours), *peers = ahead.items()
+    rows = []
+    for steps in lengths:
+        for peer, theirs in peers:
+            to_ours, to_theirs, between = (
+                1000 * np.std(ways[steps:] - ways[:-steps], keepdims=True) for ways in (ours, theirs, ours - theirs)
+            )
+            differences = (to_ours, to_theirs, between)
+            own = (to_ours, to_theirs, between), (to_ours, between, to_theirs), (to_theirs, between, to_ours)
+            names = "ours to the speed", "its to the speed", "ours to its", "the speed's own", "ours", "its"
+            values = [*differences, *(own_part(*three) for three in own)]
+            row = {"steps": str(steps), "peer": peer}
+            rows.append(row | {name: f"{value.item():.0f} mm" for name, value in zip(names, values, strict=True)})
+    return rows
 
 
 def scatter_of_drift(stamps_ns: NDArray[np.int64], a: Array, b: Array, error: Array) -> Array:
@@ -96,8 +120,12 @@ def main() -> None:
     systems = our_systems("preintegration", "scan-matching", "fixed-lag") | peer_systems(options.peers, sequence)
     with progress(sequence.name) as tick:
         passes = run_in_lockstep(systems, again, len(sequence), 1, tick)
-    rows = table(sequence.reference, passes, [int(text) for text in options.steps.split(",")])
+    lengths = [int(text) for text in options.steps.split(",")]
+    rows = table(sequence.reference, passes, lengths)
     print("\n" + tables.to_markdown(rows, ("steps", "peer")))
+    if sequence.forward_speed_m_s is not None:
+        forward = forward_table(sequence, passes, lengths)
+        print("\nthe way forward, but for what is off on average:\n\n" + tables.to_markdown(forward, ("steps", "peer")))
 
 
 if __name__ == "__main__":
