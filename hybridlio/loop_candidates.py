@@ -12,6 +12,7 @@ from hybridlio import se3
 from hybridlio.estimates import Array
 from hybridlio.odometry_chain import OdometryChain
 from hybridlio.place_recognition import DescriptorSettings, compare, describe, ring_key, spectrum
+from hybridlio.ranges import above_0, from_0, shares
 
 Index = NDArray[np.int64]
 
@@ -29,6 +30,9 @@ class CandidateSettings:
         per_keyframe: so many of the most alike are looked at closely.
         apart_m: along the path, from one of these to the next.
         compared: so many of the possible places, those of the nearest ring keys, are compared at every turn.
+
+    Raises:
+        SettingError: a value is out of range.
     """
 
     min_path_m: float = 40.0
@@ -40,6 +44,11 @@ class CandidateSettings:
     apart_m: float = 20.0
     compared: int = 100
     descriptor: DescriptorSettings = field(default_factory=DescriptorSettings)
+
+    def __post_init__(self) -> None:
+        above_0(self, "odometry_sigmas", "odometry_scale", "per_keyframe", "compared")
+        from_0(self, "min_path_m", "reach_m", "apart_m")
+        shares(self, "max_distance")
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ from scipy.special import gammaincinv
 from hybridlio import se3
 from hybridlio.estimates import Array
 from hybridlio.odometry_chain import Index, OdometryChain
+from hybridlio.ranges import above_0, expect, from_0
 
 Flags = NDArray[np.bool_]
 
@@ -29,12 +30,20 @@ class ConsistencySettings:
         odometry_scale: how much larger odometry's covariances are taken to be than they claim.
         witness_m: a loop needs another one, both of whose ends are this near along the path, that agrees with it.
         least_apart_m: and at least one of whose ends is this far.
+
+    Raises:
+        SettingError: a value is out of range.
     """
 
     inlier_share: float = 0.999
     odometry_scale: float = 4.0
     witness_m: float = 30.0
     least_apart_m: float = 1.0
+
+    def __post_init__(self) -> None:
+        expect(self, "inlier_share", 0 < self.inlier_share < 1, "above 0 and below 1")
+        above_0(self, "odometry_scale")
+        from_0(self, "witness_m", "least_apart_m")
 
 
 _STARTS = 32  # sets that are grown, from the loops which agree with most others

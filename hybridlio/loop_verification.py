@@ -20,6 +20,7 @@ from hybridlio.estimates import Array
 from hybridlio.information import NORMAL_NOISE, covariance_of, degenerate_directions
 from hybridlio.keyframes import Keyframes
 from hybridlio.odometry_chain import Index, OdometryChain
+from hybridlio.ranges import above_0, expect, from_0, shares
 from hybridlio.registration import Registration, RegistrationSettings, fit_at, register
 from hybridlio.surface import Surface
 from hybridlio.voxel import voxel_average, voxel_pick
@@ -43,6 +44,9 @@ class VerificationSettings:
         max_difference_m, max_difference_deg: between the registrations of either cloud to the other's surroundings.
         covariance_scale: how much larger the covariance is than independent residuals would make it.
         registration: kernel, distances, limits.
+
+    Raises:
+        SettingError: a value is out of range.
     """
 
     reach_m: float = 10.0
@@ -56,6 +60,12 @@ class VerificationSettings:
     max_difference_deg: float = 0.5
     covariance_scale: float = 6.0
     registration: RegistrationSettings = field(default_factory=_registration)
+
+    def __post_init__(self) -> None:
+        above_0(self, "surface_voxel_m", "source_voxel_m", "max_difference_m", "max_difference_deg", "covariance_scale")
+        from_0(self, "reach_m", "min_standing")
+        shares(self, "min_matched", "max_cost")
+        expect(self, "neighbours", self.neighbours >= 3, "3 or more, as a plane needs")
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.estimates import Array
+from hybridlio.ranges import above_0, expect
 
 Floats = NDArray[np.float32]
 
@@ -27,6 +28,9 @@ class DescriptorSettings:
         range_m: points farther away are left out.
         height_m: heights above the ground count up to here.
         beside_m: positions to the left of the path that a place is drawn from too.
+
+    Raises:
+        SettingError: a value is out of range.
     """
 
     rings: int = 20
@@ -34,6 +38,10 @@ class DescriptorSettings:
     range_m: float = 70.0
     height_m: float = 8.0
     beside_m: tuple[float, ...] = (0.0, 3.5, -3.5)
+
+    def __post_init__(self) -> None:
+        above_0(self, "rings", "sectors", "range_m", "height_m")
+        expect(self, "beside_m", len(self.beside_m) > 0, "one position at least")
 
 
 def describe(points: Array, settings: DescriptorSettings) -> Floats:

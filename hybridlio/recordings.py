@@ -18,6 +18,7 @@ from hybridlio.errors import ConfigError, DataError, HybridLioError
 from hybridlio.files import read_yaml
 
 _YAML, _TEXT = (".yaml", ".yml"), (".txt", ".list")
+_ANGLE = "vertical_angle_deg"
 
 
 @dataclass(frozen=True)
@@ -30,10 +31,11 @@ class Recording:
         reader: a name of :data:`hybridlio.datasets.registry.READERS`; guessed without it.
         raw_root: for KITTI odometry, where inertial data are.
         frames: the part ``A:B`` of it.
+        vertical_angle_deg: raise its points by this angle; None for what the recording needs.
         name: what its run folder is called.
 
     Raises:
-        ConfigError: no such reader, or ``frames`` is no range.
+        ConfigError: no such reader, ``frames`` is no range, or the angle is over 5°.
     """
 
     path: str
@@ -41,10 +43,11 @@ class Recording:
     reader: str | None = None
     raw_root: str | None = None
     frames: str | None = None
+    vertical_angle_deg: float | None = None
     name: str = ""
 
     def __post_init__(self) -> None:
-        check_options(self.reader)
+        check_options(self.reader, vertical_angle_deg=self.vertical_angle_deg)
         if self.frames is not None:
             frame_range(self.frames)
 
@@ -54,10 +57,16 @@ class Recording:
         Raises:
             DataError: there is no such recording, or it is malformed, or none of its scans is wanted.
         """
-        found = open_sequence(self.path, sequence=self.sequence, reader=self.reader, raw_root=self.raw_root)
+        found = open_sequence(
+            self.path,
+            sequence=self.sequence,
+            reader=self.reader,
+            raw_root=self.raw_root,
+            vertical_angle_deg=self.vertical_angle_deg,
+        )
         return part_of(found, self.frames)
 
-    def to_json_dict(self) -> dict[str, str | None]:
+    def to_json_dict(self) -> dict[str, str | float | None]:
         """What tells it from others, as plain values."""
         return {key: value for key, value in asdict(self).items() if key != "name"}
 
@@ -68,6 +77,7 @@ def find_recordings(
     reader: str | None = None,
     raw_root: str | Path | None = None,
     frames: str | None = None,
+    vertical_angle_deg: float | None = None,
 ) -> tuple[Recording, ...]:
     """Every recording that is meant, once, under names of their own.
 
@@ -76,17 +86,19 @@ def find_recordings(
 
     Args:
         data: paths, patterns (``drives/*``), or files that list them: ``.yaml`` with paths, or with mappings of
-            :class:`Recording`'s ``path``, ``sequence``, ``reader``, ``raw_root`` and ``frames``; or text with a path,
-            and perhaps a sequence, a line. Paths in a file start from its folder.
+            :class:`Recording`'s attributes but ``name``; or text with a path, and perhaps a sequence, a line. Paths in
+            a file start from its folder.
         sequence: which recordings, with commas between, where a path holds several.
-        reader, raw_root, frames: for all that do not say their own.
+        reader, raw_root, frames, vertical_angle_deg: for all that do not say their own.
 
     Raises:
-        ConfigError: there is not a single one, no such ``reader`` or ``raw_root``, or ``frames`` is no range.
+        ConfigError: there is not a single one, no such ``reader`` or ``raw_root``, ``frames`` is no range, or the angle
+            is over 5°.
         DataError: a list file cannot be read, or is malformed.
     """
     check_options(raw_root=raw_root)
-    given = Recording("", sequence, reader, None if raw_root is None else str(raw_root), frames)
+    root = None if raw_root is None else str(raw_root)
+    given = Recording("", sequence, reader, root, frames, vertical_angle_deg)
     wanted = [_with_defaults(item, given) for entry in data for item in _listed(entry)]
     found = list(dict.fromkeys(one for item in wanted for one in _each(item)))
     if not found:
@@ -147,8 +159,12 @@ def _entry(entry: Any, where: str) -> Recording:
     unknown = [key for key in values if key not in known]
     if unknown:
         raise DataError(f"{where}: unknown key {unknown[0]!r}; the keys are {', '.join(known)}")
+    angle = values.get(_ANGLE)
+    if angle is not None and (isinstance(angle, bool) or not isinstance(angle, int | float)):
+        raise DataError(f"{where}: {_ANGLE} {angle!r}: give a number of degrees")
+    said = {key: str(value) for key, value in values.items() if value is not None and key != _ANGLE}
     try:
-        return Recording(**{key: str(value) for key, value in values.items() if value is not None})
+        return Recording(**said, vertical_angle_deg=angle)
     except ConfigError as error:
         raise DataError(f"{where}: {error}") from None
 
@@ -160,7 +176,7 @@ def _from(folder: Path, item: Recording) -> Recording:
 
 
 def _with_defaults(item: Recording, given: Recording) -> Recording:
-    own = {key: value for key, value in asdict(item).items() if value}
+    own = {key: value for key, value in asdict(item).items() if value not in (None, "")}
     return Recording(**(asdict(given) | own))
 
 

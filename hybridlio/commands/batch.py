@@ -39,6 +39,7 @@ def batch(
     backend: common.BackendName = None,
     config: common.ConfigFile = None,
     frames: common.Frames = None,
+    vertical_angle: common.VerticalAngle = None,
     jobs: Annotated[
         int | None, typer.Option("-j", "--jobs", min=1, help="Recordings at a time; by default one for each core.")
     ] = None,
@@ -62,7 +63,7 @@ def batch(
     from hybridlio.recordings import find_recordings
 
     settings = common.settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
-    found = find_recordings(data, sequence, reader, raw_root, frames)
+    found = find_recordings(data, sequence, reader, raw_root, frames, vertical_angle)
     with progress("batch", "recordings") as tick:
         done = run_batch(
             found, out, settings, jobs=jobs, threads=threads, engine=engine, scheduler=scheduler, overwrite=overwrite,

@@ -142,8 +142,10 @@ def open_data(
 ) -> Sequence:
     """The recording that the options mean, or the asked-for part of it."""
     from hybridlio.datasets.registry import open_sequence
-    from hybridlio.datasets.sequence import part_of
+    from hybridlio.datasets.sequence import frame_range, part_of
 
+    if frames is not None:
+        frame_range(frames)  # a misspelt range is said before a large recording is looked through
     whole = open_sequence(
         data, sequence=sequence, reader=reader, raw_root=raw_root, vertical_angle_deg=vertical_angle_deg
     )

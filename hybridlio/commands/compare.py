@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,6 +12,9 @@ from hybridlio.commands.common import guarded
 from hybridlio.errors import ConfigError
 from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
 from hybridlio.terminal import complain, progress, say, say_table
+
+if TYPE_CHECKING:
+    from hybridlio.compare import Comparison
 
 
 def _several(names: tuple[str, ...]) -> str:
@@ -59,9 +62,17 @@ def compare(
     if out is not None:
         write_comparison(out, comparison)
         say(f"written to {out / 'compare.md'} and {out / 'compare.json'}")
-    failed = [row for row in comparison.rows if row.error]
-    for row in failed:
-        complain(f"error: {row.initial_pose} + {row.residual} ended after {row.scans} scans: {row.error}")
+    _finish(comparison)
+
+
+def _finish(comparison: Comparison) -> None:
+    """Say why runs ended early, a reason that they share once, and exit with the code that belongs to it."""
+    failed: dict[tuple[str, int], list[str]] = {}
+    for row in comparison.rows:
+        if row.error:
+            failed.setdefault((row.error, row.scans), []).append(f"{row.initial_pose} + {row.residual}")
+    for (error, scans), names in failed.items():
+        complain(f"error: {', '.join(names)} ended after {scans} scans: {error}")
     if failed:
         raise typer.Exit(common.FAILED)
 

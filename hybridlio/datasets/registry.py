@@ -10,6 +10,7 @@ from pathlib import Path
 
 from hybridlio.datasets import folder, kitti_odometry, kitti_raw
 from hybridlio.datasets.sequence import Sequence
+from hybridlio.datasets.vertical_angle import check_angle
 from hybridlio.errors import ConfigError, DataError
 
 
@@ -76,12 +77,18 @@ def sequence_names(path: str | os.PathLike[str], *, reader: str | None = None) -
     return tuple(_find(Path(path).expanduser().resolve(), reader)[1])
 
 
-def check_options(reader: str | None = None, raw_root: str | os.PathLike[str] | None = None) -> None:
+def check_options(
+    reader: str | None = None,
+    raw_root: str | os.PathLike[str] | None = None,
+    vertical_angle_deg: float | None = None,
+) -> None:
     """Check what is said of many recordings at once, before any of them is opened.
 
     Raises:
-        ConfigError: unknown ``reader``, or no folder ``raw_root``.
+        ConfigError: unknown ``reader``, no folder ``raw_root``, or ``vertical_angle_deg`` is over 5°.
     """
+    if vertical_angle_deg is not None:
+        check_angle(vertical_angle_deg)
     if reader is not None and reader not in READERS:
         raise ConfigError(f"unknown reader {reader!r}; choose one of {', '.join(READERS)}")
     if raw_root is not None and not Path(raw_root).expanduser().is_dir():

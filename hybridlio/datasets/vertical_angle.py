@@ -65,9 +65,18 @@ def raised(load: Callable[[int], Scan], angle_deg: float | None) -> Callable[[in
     """
     if angle_deg is None or angle_deg == 0:
         return load
+    check_angle(angle_deg)
+    return RaisedScans(load, angle_deg)
+
+
+def check_angle(angle_deg: float) -> None:
+    """Check an angle to raise points by.
+
+    Raises:
+        ConfigError: it is not finite or over 5°.
+    """
     if not abs(angle_deg) <= _LARGEST_DEG:
         raise ConfigError(f"vertical_angle_deg: {angle_deg} is no calibration error; give at most {_LARGEST_DEG:.0f}°")
-    return RaisedScans(load, angle_deg)
 
 
 def kitti_raised(

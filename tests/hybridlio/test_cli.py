@@ -91,6 +91,7 @@ def test_a_configuration_is_printed_changed_and_used(tiny_drive, tmp_path, witho
         (("odometry", "DRIVE", "--sequence", "7"), "'7'"),
         (("odometry", "DRIVE", "--reader", "rosbag"), "'rosbag'"),
         (("odometry", "DRIVE", "--frames", "x"), "'x'"),
+        (("odometry", "nowhere", "--frames", "x"), "'x'"),  # which is known before the recording is looked for
         (("odometry", "DRIVE", "--config", "none.yaml"), "none.yaml"),
         (("compare", "DRIVE", "--initial-pose", "kalman,guess"), "'guess'"),
         (("compare", "DRIVE", "--residual", ","), "no name"),

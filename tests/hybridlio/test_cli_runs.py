@@ -147,3 +147,17 @@ def test_the_vertical_angle_can_be_set(tiny_drive, tmp_path, without_pages):
         ok("odometry", tiny_drive, "--vertical-angle", angle, "--frames", ":3", "-o", tmp_path / name)
         heights.append(float(Keyframes.load(tmp_path / name / "keyframes.npz").points(0)[:, 2].mean()))
     assert heights[1] > heights[0] + 0.05
+
+
+def test_a_reason_that_combinations_share_is_said_once(tiny_drive, monkeypatch):
+    from hybridlio.errors import GraphError
+    from hybridlio.graph.online import IncrementalBackend
+
+    def fail(self, frame, relative):
+        raise GraphError("no")
+
+    monkeypatch.setattr(IncrementalBackend, "update", fail)
+    said = refused(1, "compare", tiny_drive, "--initial-pose", "kalman,identity", "--residual", "none",
+                   "--backend", "incremental", "--frames", ":3")  # fmt: skip
+    assert "kalman + none, identity + none ended after" in said
+    assert said.count("error: ") == 1

@@ -11,6 +11,10 @@ import yaml
 from hybridlio.config import Config, config_to_yaml, load_config, parse_config
 from hybridlio.errors import ConfigError
 from hybridlio.local_map import LocalMapSettings
+from hybridlio.loop_candidates import CandidateSettings
+from hybridlio.loop_consistency import ConsistencySettings
+from hybridlio.loop_verification import VerificationSettings
+from hybridlio.place_recognition import DescriptorSettings
 from hybridlio.registration import RegistrationSettings
 from hybridlio.scan_matching_settings import ScanMatchingSettings
 from hybridlio.sensors import ImuNoise
@@ -206,6 +210,11 @@ def test_numbers_out_of_range_are_refused_and_all_of_them_named(changed: dict, w
         (lambda: ScanMatchingSettings(target="map"), "ScanMatchingSettings.target: must be local-map or last-scan"),
         (lambda: RegistrationSettings(threads=0), "RegistrationSettings.threads: must be above 0, got 0"),
         (lambda: LocalMapSettings(radius_m=float("nan")), "LocalMapSettings.radius_m: must be above 0, got nan"),
+        (lambda: VerificationSettings(neighbours=2), "VerificationSettings.neighbours: must be 3 or more"),
+        (lambda: VerificationSettings(max_cost=1.5), "VerificationSettings.max_cost: must be within 0 and 1, got 1.5"),
+        (lambda: CandidateSettings(compared=0), "CandidateSettings.compared: must be above 0, got 0"),
+        (lambda: ConsistencySettings(inlier_share=1.0), "ConsistencySettings.inlier_share: must be above 0 and below"),
+        (lambda: DescriptorSettings(beside_m=()), "DescriptorSettings.beside_m: must be one position at least"),
         (lambda: ImuNoise(gyro_rad_s_sqrt_hz=-1), "ImuNoise.gyro_rad_s_sqrt_hz: must be finite and 0 or more, got -1"),
     ],
 )

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -68,6 +69,21 @@ def test_the_raw_root_of_a_list_starts_from_its_own_folder_and_that_of_an_option
     assert two.raw_root == str(drives)
 
 
+def test_points_are_raised_as_a_recording_says_and_else_as_the_option_does(drives, monkeypatch):
+    (drives / "list.yaml").write_text("- {path: north, vertical_angle_deg: 0}\n- south\n")
+    own, other = find_recordings([drives / "list.yaml"], vertical_angle_deg=1.0)
+    assert (own.vertical_angle_deg, other.vertical_angle_deg) == (0, 1.0)
+    np.array([[10.0, 0.0, 0.0, 0.5]], np.float32).tofile(drives / "north/scans/000000.bin")
+    for angle_deg in (None, 0.0, 1.0):
+        (x, _, z) = replace(own, vertical_angle_deg=angle_deg).open()[0].scan.points[0]
+        assert np.rad2deg(np.arctan2(z, x)) == pytest.approx(angle_deg or 0.0, abs=1e-5)
+
+
+def test_an_angle_that_is_no_calibration_error_is_refused_before_any_recording_is_looked_for(tmp_path):
+    with pytest.raises(ConfigError, match="vertical_angle_deg: 9"):
+        find_recordings([tmp_path / "gone"], vertical_angle_deg=9.0)
+
+
 @pytest.mark.parametrize(
     ("file", "text", "words"),
     [
@@ -78,6 +94,8 @@ def test_the_raw_root_of_a_list_starts_from_its_own_folder_and_that_of_an_option
         ("a.yaml", "- {sequence: x}\n", "entry 1: expected a path"),
         ("a.yaml", "- x\n- {path: x, frames: 3}\n", "entry 2: frames '3': give a range"),
         ("a.yaml", "- {path: x, reader: tape}\n", "entry 1: unknown reader 'tape'"),
+        ("a.yaml", "- {path: x, vertical_angle_deg: high}\n", "entry 1: vertical_angle_deg 'high': give a number"),
+        ("a.yaml", "- {path: x, vertical_angle_deg: 9}\n", "entry 1: vertical_angle_deg: 9 is no calibration error"),
         ("a.yaml", "- [", r"a\.yaml: not YAML at line 1"),
     ],
 )
