@@ -19,10 +19,12 @@ from hybridlio.keyframes import KeyframeMaker
 from hybridlio.late_imu import take_up_imu
 from hybridlio.record import Record
 from hybridlio.record_maker import RecordMaker, joined
-from hybridlio.sensors import Calibration, Frame, ImuNoise, ImuSamples
+from hybridlio.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples
 from hybridlio.sources import Setup, check_names, make_chosen
 from hybridlio.startup import start_state
 from hybridlio.sweep import compensation_noise, sweep_motion
+
+_STARTS_WITHOUT_IMU = 3  # then the first step changes no more
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +113,7 @@ class Odometry:
         with _timed(seconds, "initial pose"):
             initial = self._initial_pose.predict(frame, state)
         relative = self._refine(frame, initial, state, seconds)
-        if self._state is None and relative.ok and self._first.scan.time_offsets_ns is not None:
+        if self._state is None and relative.ok:
             relative = self._restart(self._first, frame, relative, state)
         with _timed(seconds, "graph"):
             relative, agreement = self._compare(frame, initial, relative, state)
@@ -142,10 +144,22 @@ class Odometry:
         self._setup = _setup(self._config, frame)
         self._initial_pose, self._residual, self._backend = make_chosen(self._chosen, self._setup)
         self._witness = Witness()
-        self._residual.start(frame)
+        self._residual.start(self._turned_back(frame))
         self._first = frame
         covariance = np.eye(6) * 1e-12  # it defines the frame; GTSAM and files want it positive definite
         return Estimate(frame.index, frame.scan.stamp_ns, np.eye(4), covariance, None, None, None, {})
+
+    def _turned_back(self, first: Frame) -> Frame:
+        """The first frame with its sweep's turn taken out, which is known where the speed is not.
+
+        The second scan is compensated for no more by its first initial pose. Scans that the same speed has distorted
+        fit; one with its turn and one without end centimetres and milliradians off.
+        """
+        if first.scan.time_offsets_ns is None:
+            return first
+        standing = constant_twist(np.eye(4), first.scan.stamp_ns - NS_PER_S, first.scan.stamp_ns)
+        motion = sweep_motion(first, standing, np.zeros(3), self._setup.calibration)
+        return replace(first, scan=deskew(first.scan, motion))
 
     def _start(self, frame: Frame) -> State:
         """Start the graph at the first frame, with the second one's samples to tell where down is."""
@@ -168,9 +182,9 @@ class Odometry:
         turned = None
         with _timed(seconds, "motion compensation"):
             if frame.scan.time_offsets_ns is not None:
-                turned = compensation_noise(frame.scan, self._setup.imu_noise)
+                turned = compensation_noise(frame, self._setup.imu_noise)
                 step = constant_twist(initial.pose, state.stamp_ns, frame.scan.stamp_ns)
-                motion = sweep_motion(frame, step, state, self._setup.calibration)
+                motion = sweep_motion(frame, step, state.gyro_bias_rad_s, self._setup.calibration)
                 frame = replace(frame, scan=deskew(frame.scan, motion))
         self._compensated = frame.scan
         with _timed(seconds, "residual"):
@@ -188,11 +202,20 @@ class Odometry:
         return relative, agreement
 
     def _restart(self, first: Frame, frame: Frame, found: RelativePose, state: State) -> RelativePose:
-        """Do the first step again: only now is it known how fast the first two scans moved."""
-        step = constant_twist(found.pose, first.scan.stamp_ns, frame.scan.stamp_ns)
-        motion = sweep_motion(first, step, state, self._setup.calibration)
-        self._residual.start(replace(first, scan=deskew(first.scan, motion)))
-        return self._refine(frame, found, state, {})
+        """Do the first step again: only now is it known how fast the first two scans moved.
+
+        Without IMU the turn, too, was looked for among a few at first; from about the right one the search gets better,
+        and so does the compensation.
+        """
+        compensated = first.scan.time_offsets_ns is not None
+        for _ in range(int(compensated) if state.has_imu else _STARTS_WITHOUT_IMU):
+            step = constant_twist(found.pose, first.scan.stamp_ns, frame.scan.stamp_ns)
+            motion = sweep_motion(first, step, state.gyro_bias_rad_s, self._setup.calibration)
+            self._residual.start(replace(first, scan=deskew(first.scan, motion)))
+            found = self._refine(frame, found, state, {})
+            if not found.ok:
+                break
+        return found
 
     def _lidar_pose(self, state: State) -> tuple[Array, Array]:
         T_imu_lidar = self._setup.calibration.T_imu_lidar
