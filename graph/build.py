@@ -62,7 +62,7 @@ class Builder:
             graph.add(self.other(other, robust))
         for key in sorted(self.data.fixed, key=self.data.places.__getitem__):
             graph.add(self.held(key))
-        for key, noise in chains_without_bias(self.data):
+        for _, key, noise in chains_without_bias(self.data):
             graph.add(self.bias_start(key, noise))
         return graph
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,8 +50,16 @@ def components(data: GraphData) -> list[list[Key]]:
     return groups(data, ("between", "imu"))
 
 
-def chains_without_bias(data: GraphData) -> list[tuple[Key, ImuNoise]]:
-    """First pose and noise of each chain of inertial factors whose biases nothing measures."""
+class Chain(NamedTuple):
+    """Poses that inertial factors join; ``start`` is the first of them that has samples, ``noise`` theirs."""
+
+    keys: list[Key]
+    start: Key
+    noise: ImuNoise
+
+
+def chains_without_bias(data: GraphData) -> list[Chain]:
+    """Each chain of inertial factors whose biases nothing measures."""
     measured = {factor.keys[0] for factor in data.others.values() if factor.kind == "bias"}
     first: dict[Key, ImuNoise] = {}
     for factor in data.others.values():
@@ -60,7 +69,7 @@ def chains_without_bias(data: GraphData) -> list[tuple[Key, ImuNoise]]:
     for chain in groups(data, ("imu",)) if first else []:
         starts = [key for key in chain if key in first]
         if starts and not measured & set(chain):
-            found.append((starts[0], first[starts[0]]))
+            found.append(Chain(chain, starts[0], first[starts[0]]))
     return found
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable
 from typing import Any
 
 import gtsam
@@ -14,7 +14,7 @@ from hybridlio.errors import ConfigError, GraphError
 from hybridlio.estimates import Array
 from hybridlio.graph import coordinates as co
 from hybridlio.graph.build import Builder
-from hybridlio.graph.checks import chains_without_bias, check_determined
+from hybridlio.graph.checks import Chain, chains_without_bias, check_determined
 from hybridlio.graph.edge_table import Rows
 from hybridlio.graph.graph_data import GraphData
 from hybridlio.graph.guess import Guess, is_reached
@@ -48,6 +48,7 @@ class OnlineSolver:
         self._slots: dict[Hashable, int] = {}  # of factors by id, of what holds a pose or starts a bias by name
         self._moving: set[int] = set()  # places of poses with a velocity
         self._biased: set[int] = set()
+        self._carried: set[int] = set()  # those whose biases poses that have left the lag tell
         self._poses = self._oldest = 0
         self._left = Rows(co.IDENTITY[graph.dimension].shape)
 
@@ -191,14 +192,22 @@ class OnlineSolver:
         found += [(("held", key), builder.held(key)) for key in news.fixed]
         dropped: list[Hashable] = [("held", key) for key in news.freed if ("held", key) in self._slots]
         if any(factor.kind in ("imu", "bias") for factor in news.others.values()):
-            wanted = {("start", key): noise for key, noise in chains_without_bias(self._graph)}
-            have = {name for name in self._slots if isinstance(name, tuple) and name[0] == "start"}
-            found += [(name, builder.bias_start(name[1], noise)) for name, noise in wanted.items() if name not in have]
-            dropped += [name for name in have if name not in wanted]
+            starts, ended = self._bias_starts()
+            found += [(("start", chain.start), builder.bias_start(chain.start, chain.noise)) for chain in starts]
+            dropped += ended
         for name, factor in found:
             names.append(name)
             graph.add(factor)
         return graph, names, dropped
+
+    def _bias_starts(self) -> tuple[list[Chain], list[Hashable]]:
+        """Chains whose biases have yet to be started, and names of the starts that something else has replaced."""
+        chains = chains_without_bias(self._graph)
+        wanted = {("start", chain.start) for chain in chains}
+        have = {name for name in self._slots if isinstance(name, tuple) and name[0] == "start"}
+        places = self._graph.places
+        unknown = [chain for chain in chains if not any(places[key] in self._carried for key in chain.keys)]
+        return [chain for chain in unknown if ("start", chain.start) not in have], list(have - wanted)
 
     def _leaving(self, news: News, values: gtsam.Values) -> Array:
         """Coordinates of the poses that this update marginalises, as they are before it."""
@@ -234,6 +243,7 @@ class OnlineSolver:
         self._moving.difference_update(places)
         self._biased.difference_update(places)
         gone = self._graph.concerning(places)
+        self._carry_biases(gone)
         for key in self._graph.keys_at(places):
             self._slots.pop(("held", key), None)
             self._slots.pop(("start", key), None)
@@ -242,6 +252,12 @@ class OnlineSolver:
         if self._forget:
             self._graph.drop(gone, places, leaving)
             self._reader.forget(gone)
+
+    def _carry_biases(self, gone: Iterable[int]) -> None:
+        """Know the poses whose biases those that have left the lag tell: no start may tell them again."""
+        left = [self._graph.others[number] for number in gone if number in self._graph.others]
+        places = {self._graph.places[key] for factor in left if factor.kind == "imu" for key in factor.keys}
+        self._carried = {place for place in self._carried | places if place >= self._oldest}
 
     def _keys_of(self, places: range) -> list[Key]:
         return self._graph.keys_at(places)

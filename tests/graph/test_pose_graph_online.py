@@ -224,21 +224,29 @@ def test_a_straight_chain_of_5000_poses_solves_online(backend):
     assert side == pytest.approx(1e-4 * np.sqrt(5020**3 / 3), rel=0.01)
 
 
-@pytest.mark.parametrize("backend", ["incremental", "fixed-lag"])
-def test_inertial_factors_come_online(chain, backend):
+@pytest.mark.parametrize("bias", [False, True], ids=["biases unknown", "bias given"])
+@pytest.mark.parametrize(
+    ("backend", "lag", "forget"),
+    [("incremental", 80, False), ("fixed-lag", 80, False), ("fixed-lag", 25, False), ("fixed-lag", 25, True)],
+)
+def test_inertial_factors_come_online(chain, backend, lag, forget, bias):
     drive = chain(3, steps=60)
     T = drive.calibration.T_imu_lidar
     g = drive.gravity / np.linalg.norm(drive.gravity)
     up = se3.exp(np.r_[np.cross(-g, [0, 0, 1.0]), np.zeros(3)])  # small, so that sine and angle are one
-    graph = PoseGraph()
-    graph.add_prior(0, up @ drive.poses[0], sigmas=1e-3)
-    solver = graph.online(backend, lag=80)
+    graph, whole = PoseGraph(), PoseGraph()
+    for one in (graph, whole):
+        one.add_prior(0, up @ drive.poses[0], sigmas=1e-3)
+        if bias:
+            one.add_bias(0, [0.2, 0.0, 0.0], [0.0, 0.0, 0.01], sigmas=[0.01] * 3 + [1e-3] * 3)
+    solver = graph.online(backend, lag=lag, forget=forget)
     for k, (frame, relative) in enumerate(zip(drive.frames[1:], drive.relative, strict=True)):
         covariance = se3.rotate_covariance(relative.covariance, T)
-        graph.add_between(k, k + 1, T @ relative.pose @ se3.inverse(T), covariance)
-        graph.add_imu(k, k + 1, frame.imu, drive.noise)
+        for one in (graph, whole):
+            one.add_between(k, k + 1, T @ relative.pose @ se3.inverse(T), covariance)
+            one.add_imu(k, k + 1, frame.imu, drive.noise)
         solver.update()
-    best = graph.optimize(tolerance=1e-10)
+    best = whole.optimize(tolerance=1e-10)
     assert sigmas_off(best.pose(60), solver.pose(60), best.covariance(60)) < 0.3
     np.testing.assert_allclose(solver.velocity(60), best.velocity(60), atol=0.02)
     for mine, theirs, atol in zip(solver.bias(60), best.bias(60), (0.02, 1e-3), strict=True):
