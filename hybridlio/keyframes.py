@@ -82,6 +82,11 @@ class Keyframes:
     def __len__(self) -> int:
         return len(self.rows)
 
+    def until(self, row: int) -> Keyframes:
+        """Those of the estimates before ``row``."""
+        count = int(np.searchsorted(self.rows, row))
+        return Keyframes(self.rows[:count], self.stamps_ns[:count], self.clouds[:count])
+
     def points(self, k: int) -> Array:
         """Points ``(n, 3)`` of keyframe ``k`` in metres."""
         return self.clouds[k].astype(np.float64) * RESOLUTION_M
@@ -121,14 +126,12 @@ class Keyframes:
 
 
 class KeyframeMaker:
-    """Takes every scan of a run in order and keeps one every few metres."""
+    """Takes the scans of a run in order, from the second on, and keeps one every few metres."""
 
     def __init__(self, settings: KeyframeSettings) -> None:
         self._settings = settings
         self._position: Array | None = None
-        self._rows: list[int] = []
-        self._stamps: list[int] = []
-        self._clouds: list[PackedCloud] = []
+        self._kept: list[tuple[int, int, PackedCloud]] = []  # row, stamp, points
         self._step = min(max(round(settings.voxel_m / RESOLUTION_M), 1), 256)
 
     def offer(self, row: int, scan: Scan, pose: Array) -> bool:
@@ -145,16 +148,14 @@ class KeyframeMaker:
         cloud = compact(scan.points, self._settings)
         if len(cloud) < _MIN_POINTS:
             return False
+        self._kept.append((row, scan.stamp_ns, PackedCloud.of(cloud, self._step)))
         self._position = position.copy()
-        self._rows.append(row)
-        self._stamps.append(scan.stamp_ns)
-        self._clouds.append(PackedCloud.of(cloud, self._step))
         return True
 
     def keyframes(self) -> Keyframes:
         """All so far."""
-        clouds = tuple(cloud.cloud() for cloud in self._clouds)
-        return Keyframes(np.array(self._rows, np.int64), np.array(self._stamps, np.int64), clouds)
+        rows, stamps = (np.array([kept[i] for kept in self._kept], np.int64) for i in (0, 1))
+        return Keyframes(rows, stamps, tuple(cloud.cloud() for _, _, cloud in self._kept))
 
 
 def compact(points: NDArray[np.float32], settings: KeyframeSettings) -> NDArray[np.int16]:

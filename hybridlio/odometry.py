@@ -96,19 +96,17 @@ class Odometry:
             DataError: frames out of order, or a first scan without points.
             ConfigError: IMU samples without extrinsics, or a source that cannot be made as it is set.
         """
-        self._made.heard(frame.gps)
         if frame.calibration is None and len(frame.imu):
             raise ConfigError(
                 f"frame {frame.index} carries IMU samples but no calibration: set Frame.calibration (T_imu_lidar)"
             )
         if self._first is None:
-            return self._keep(self._begin(frame))
+            return self._keep(self._begin(frame), frame)
         if frame.scan.stamp_ns <= self._made.last_ns:
             raise DataError(f"frame {frame.index}: its stamp is not after the last frame's; give frames in order")
         state = self._state if self._state is not None else self._start(frame)
         if self._state is not None and not state.has_imu and len(frame.imu):
             state = self._take_up_imu(frame, state)
-        self._made.felt(frame.imu)
         seconds: dict[str, float] = {}
         with _timed(seconds, "initial pose"):
             initial = self._initial_pose.predict(frame, state)
@@ -125,11 +123,12 @@ class Odometry:
         with _timed(seconds, "keyframes"):
             self._keyframes.offer(len(self._made), self._compensated, pose)
         return self._keep(
-            Estimate(frame.index, frame.scan.stamp_ns, pose, covariance, initial, relative, step, seconds, agreement)
-        )  # fmt: skip
+            Estimate(frame.index, frame.scan.stamp_ns, pose, covariance, initial, relative, step, seconds, agreement),
+            frame,
+        )
 
-    def record(self) -> Record:
-        """Everything so far, for smoothing and for files.
+    def record(self, scans: int | None = None) -> Record:
+        """Everything so far, or the first ``scans`` of it, for smoothing and for files.
 
         Raises:
             EstimationError: there are fewer than two frames yet.
@@ -137,7 +136,8 @@ class Odometry:
         if self._state is None:
             raise EstimationError("a record needs at least two frames; call step for more")
         setup = self._setup
-        return self._made.record(self._start_state, setup.calibration, setup.imu_noise, self._keyframes.keyframes())
+        keyframes = self._keyframes.keyframes()
+        return self._made.record(self._start_state, setup.calibration, setup.imu_noise, keyframes, scans)
 
     def _begin(self, frame: Frame) -> Estimate:
         """Take the first frame: it defines the origin."""
@@ -223,10 +223,10 @@ class Odometry:
         covariance = se3.rotate_covariance(state.covariance[:6, :6], T_lidar_imu)
         return T_lidar_imu @ state.T_world_imu @ T_imu_lidar, covariance
 
-    def _keep(self, estimate: Estimate) -> Estimate:
+    def _keep(self, estimate: Estimate, frame: Frame) -> Estimate:
         initial, relative = estimate.initial, estimate.relative
         step = None if initial is None or relative is None else (initial, relative)
-        self._made.add(estimate.stamp_ns, estimate.pose, estimate.covariance, step)
+        self._made.add(estimate.stamp_ns, estimate.pose, estimate.covariance, step, frame.imu, frame.gps)
         return estimate
 
 

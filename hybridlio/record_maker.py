@@ -22,57 +22,65 @@ class RecordMaker:
     """Takes in a run's estimates, samples and fixes."""
 
     def __init__(self) -> None:
-        self._scans = 0
-        self._last_ns = 0
         self._recent: list[_Kept] = []
         self._packed: list[dict[str, PackedArray]] = []
         self._imu: list[ImuSamples] = []
         self._gps: list[GpsFix] = []
 
     def __len__(self) -> int:
-        return self._scans
+        return _AT_ONCE * len(self._packed) + len(self._recent)
 
     @property
     def last_ns(self) -> int:
-        """The last scan's stamp."""
-        return self._last_ns
-
-    def heard(self, gps: tuple[GpsFix, ...]) -> None:
-        """Take in fixes."""
-        self._gps.extend(gps)
-
-    def felt(self, imu: ImuSamples) -> None:
-        """Take in inertial samples."""
-        self._imu.append(imu)
+        """The last scan's stamp; 0 before the first."""
+        return self._recent[-1].stamp_ns if self._recent else 0
 
     def add(
-        self, stamp_ns: int, pose: Array, covariance: Array, step: tuple[RelativePose, RelativePose] | None = None
+        self,
+        stamp_ns: int,
+        pose: Array,
+        covariance: Array,
+        step: tuple[RelativePose, RelativePose] | None = None,
+        imu: ImuSamples | None = None,
+        gps: tuple[GpsFix, ...] = (),
     ) -> None:
-        """Take in a scan's estimate, and but for the first scan the initial and the refined relative pose."""
-        self._scans, self._last_ns = self._scans + 1, stamp_ns
-        self._recent.append(_Kept(stamp_ns, pose, covariance, step))
-        if len(self._recent) >= _AT_ONCE:
-            self._packed.append(packed(_arrays(self._recent)))
-            self._recent = []
+        """Take in a scan's estimate, or where that is interrupted nothing that :meth:`record` would tell.
 
-    def record(self, start: State, calibration: Calibration, noise: ImuNoise, keyframes: Keyframes) -> Record:
-        """All so far."""
+        Args:
+            stamp_ns: the scan's stamp.
+            pose, covariance: of the scan.
+            step: the initial and the refined relative pose; the first scan has none.
+            imu, gps: samples and fixes since the scan before.
+        """
+        if len(self._recent) > _AT_ONCE:
+            together = packed(_arrays(self._recent[:-1]))
+            self._packed, self._recent = [*self._packed, together], self._recent[-1:]
+        self._imu.append(imu or ImuSamples.empty())
+        self._gps.extend(gps)
+        self._recent.append(_Kept(stamp_ns, pose, covariance, step))  # last: with it the scan is there
+
+    def record(
+        self, start: State, calibration: Calibration, noise: ImuNoise, keyframes: Keyframes, scans: int | None = None
+    ) -> Record:
+        """All so far, or the first ``scans`` of it."""
         parts = [*map(unpacked, self._packed), *([_arrays(self._recent)] if self._recent else [])]
         steps = [step for arrays in parts for step in _steps(arrays)]
         stamps, poses, covariances = (
-            np.concatenate([arrays[f"online_{name}"] for arrays in parts]) for name in ("ns", "poses", "covariances")
+            np.concatenate([arrays[f"online_{name}"] for arrays in parts])[:scans]
+            for name in ("ns", "poses", "covariances")
         )
+        steps, last_ns = steps[: len(stamps) - 1], int(stamps[-1])
         return Record(
             online=Trajectory(stamps, poses, covariances),
             initial=tuple(initial for initial, _ in steps),
             relative=tuple(relative for _, relative in steps),
-            # a step that failed or was interrupted may have added more
-            imu=joined(self._imu).between(start.stamp_ns, self._last_ns),
-            gps=tuple(fix for fix in self._gps if fix.stamp_ns <= self._last_ns),
+            # an interrupt may have left more
+            imu=joined(self._imu).between(start.stamp_ns, last_ns),
+            gps=tuple(fix for fix in self._gps if fix.stamp_ns <= last_ns),
             start=start,
             calibration=calibration,
             imu_noise=noise,
-            keyframes=keyframes,
+            keyframes=keyframes.until(len(stamps)),
         )
 
 

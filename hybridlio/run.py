@@ -119,7 +119,8 @@ class Run:
     @property
     def record(self) -> Record | None:
         """What smoothing needs; None for less than two estimates."""
-        return self.odometry.record() if len(self.estimates) > 1 else None
+        # an interrupt between the two may leave the odometry one scan ahead
+        return self.odometry.record(len(self.estimates)) if len(self.estimates) > 1 else None
 
 
 def run_odometry(sequence: Sequence, odometry: Odometry, progress: Progress | None = None) -> Run:

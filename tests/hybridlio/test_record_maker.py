@@ -1,8 +1,12 @@
+import sys
+
 import numpy as np
+import pytest
 
 from hybridlio import se3
 from hybridlio.estimates import KeyframePose, RelativePose
-from hybridlio.keyframes import KeyframeMaker, KeyframeSettings
+from hybridlio.keyframes import KeyframeMaker, Keyframes, KeyframeSettings
+from hybridlio.record import Record
 from hybridlio.record_maker import RecordMaker, joined
 from hybridlio.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.startup import start_state
@@ -63,17 +67,66 @@ def test_steps_that_have_become_arrays_are_as_they_were(rng: np.random.Generator
             np.testing.assert_array_equal(b.covariance, a.covariance)
 
 
-def test_what_came_after_the_last_estimate_is_no_part_of_the_record():
-    made, stamps = RecordMaker(), np.arange(0, 5 * STEP_NS, STEP_NS // 10)
-    made.add(0, np.eye(4), np.eye(6))
-    made.add(2 * STEP_NS, np.eye(4), np.eye(6))
-    for part in (stamps[:21], stamps[20:]):
-        made.felt(ImuSamples(part, np.zeros((len(part), 3)), np.zeros((len(part), 3))))
-    made.heard(tuple(GpsFix(stamp, np.zeros(3), np.eye(3)) for stamp in (STEP_NS, 3 * STEP_NS)))
-    keyframes = KeyframeMaker(KeyframeSettings()).keyframes()
-    record = made.record(start_state(0, ImuSamples.empty(), ImuNoise()), Calibration(), ImuNoise(), keyframes)
-    np.testing.assert_array_equal(record.imu.stamps_ns, stamps[:21])
-    assert [fix.stamp_ns for fix in record.gps] == [STEP_NS]
+def five_scans() -> RecordMaker:
+    made = RecordMaker()
+    for k in range(5):
+        stamps = np.arange(max(k - 1, 0) * STEP_NS, k * STEP_NS + 1, STEP_NS // 10)
+        samples = ImuSamples(stamps, np.zeros((len(stamps), 3)), np.zeros((len(stamps), 3)))
+        fix = GpsFix(k * STEP_NS, np.zeros(3), np.eye(3))
+        step = RelativePose(np.eye(4), np.eye(6), "here")
+        made.add(k * STEP_NS, np.eye(4), np.eye(6), (step, step) if k else None, samples, (fix,))
+    return made
+
+
+def record_of(made: RecordMaker, keyframes: Keyframes, scans: int | None = None) -> Record:
+    return made.record(start_state(0, ImuSamples.empty(), ImuNoise()), Calibration(), ImuNoise(), keyframes, scans)
+
+
+def three_keyframes() -> Keyframes:
+    """Of scans 1, 3 and 4."""
+    rows = np.array([1, 3, 4])
+    return Keyframes(rows, rows * STEP_NS, tuple(np.full((1, 3), row, np.int16) for row in rows))
+
+
+def test_the_first_scans_of_a_record_bring_what_belongs_to_them_and_no_more():
+    record = record_of(five_scans(), three_keyframes(), scans=4)
+    assert record.online.stamps_ns.tolist() == [0, STEP_NS, 2 * STEP_NS, 3 * STEP_NS]
+    assert len(record.initial) == len(record.relative) == 3
+    assert record.imu.stamps_ns.tolist() == list(range(0, 3 * STEP_NS + 1, STEP_NS // 10))
+    assert [fix.stamp_ns for fix in record.gps] == record.online.stamps_ns.tolist()
+    assert record.keyframes.rows.tolist() == [1, 3]
+    assert [cloud[0, 0] for cloud in record.keyframes.clouds] == [1, 3]
+    assert len(record_of(five_scans(), three_keyframes()).online) == 5
+
+
+@pytest.mark.parametrize("scans", [3, 50, 51, 120])
+def test_an_interrupt_while_a_scan_is_taken_in_leaves_the_scans_before(monkeypatch, scans):
+    """At any line of it, as a signal may come between any two."""
+    step = RelativePose(np.eye(4), np.eye(6), "here")
+    for line in range(1, 12):
+        made = RecordMaker()
+        for k in range(scans):
+            made.add(k * STEP_NS, np.eye(4), np.eye(6), (step, step) if k else None)
+        lines = iter(range(1, 100))
+
+        def tracer(frame, event, _arg, lines=lines, stop=line):
+            if frame.f_code is not RecordMaker.add.__code__:
+                return None
+            if event == "line" and next(lines) == stop:
+                raise KeyboardInterrupt
+            return tracer
+
+        sys.settrace(tracer)
+        try:
+            made.add(scans * STEP_NS, np.eye(4), np.eye(6), (step, step))
+        except KeyboardInterrupt:
+            assert len(made) == scans
+            assert made.last_ns == (scans - 1) * STEP_NS
+        finally:
+            sys.settrace(None)
+        record = record_of(made, KeyframeMaker(KeyframeSettings()).keyframes())
+        assert record.online.stamps_ns.tolist() == [k * STEP_NS for k in range(len(made))]
+        assert len(record.relative) == len(made) - 1
 
 
 def test_samples_on_a_common_border_are_taken_once():

@@ -1,4 +1,5 @@
 import logging
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -8,9 +9,16 @@ from hybridlio import se3
 from hybridlio.config import Config
 from hybridlio.datasets.sequence import Sequence, part_of
 from hybridlio.errors import ConfigError, DataError, GraphError
+from hybridlio.graph import PoseGraph
+from hybridlio.graph.offline import smooth
 from hybridlio.initial_pose import NoResidual
+from hybridlio.keyframes import KeyframeMaker, KeyframeSettings
 from hybridlio.odometry import Odometry
+from hybridlio.packing import PackedCloud
+from hybridlio.record import Record
+from hybridlio.record_maker import RecordMaker
 from hybridlio.run import Run, run_odometry
+from hybridlio.run_outputs import write_run
 from hybridlio.sensors import Scan
 
 
@@ -111,6 +119,33 @@ def test_an_interrupt_keeps_what_was_estimated(whole, sequence):
     assert run.done == 9
     np.testing.assert_array_equal(run.trajectory.poses, whole.trajectory.poses[:9])
     assert len(run.record.online) == 9
+
+
+@pytest.mark.parametrize("within", [KeyframeMaker.offer, PackedCloud.of, RecordMaker.add, Odometry.step])
+def test_an_interrupt_at_the_end_of_any_bookkeeping_leaves_a_run_that_can_be_smoothed(within, sequence, tmp_path):
+    """When a call returns for the seventh time, its work done, and its caller's not."""
+    returned = iter(range(1, 100))
+
+    def tracer(frame, event, _arg):
+        if frame.f_code is not within.__code__:
+            return None
+        if event == "return" and next(returned) == 7:
+            raise KeyboardInterrupt
+        return tracer
+
+    config = Config(residual="none", keyframes=KeyframeSettings(spacing_m=1e-6))
+    sys.settrace(tracer)
+    try:
+        run = run_odometry(sequence, Odometry(config=config))
+    finally:
+        sys.settrace(None)
+    assert isinstance(run.stopped, KeyboardInterrupt)
+    record = run.record
+    assert len(record.online) == len(run.estimates) > 4
+    assert (record.keyframes.rows < len(record.online)).all()
+    write_run(tmp_path / "run", run, config)
+    assert len(smooth(Record.load(tmp_path / "run/odometry.npz")).trajectory) == run.done
+    assert len(PoseGraph.load(tmp_path / "run/graph.g2o")) == run.done
 
 
 class Failing(NoResidual):
