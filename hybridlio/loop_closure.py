@@ -8,7 +8,6 @@ with odometry and with one another are kept. What is wrong all the same is left 
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -101,10 +100,6 @@ class LoopSearch:
     loops: tuple[Loop, ...]
     rejected: tuple[RejectedLoop, ...]
     seconds: dict[str, float]
-
-    def reasons(self) -> dict[str, int]:
-        """How many candidates each stage rejected."""
-        return dict(Counter(one.stage for one in self.rejected))
 
 
 def find_loops(record: Record, settings: LoopSettings | None = None, progress: Progress | None = None) -> LoopSearch:

@@ -1,12 +1,12 @@
-"""A run as one self-contained HTML file: pictures inside it, nothing fetched from anywhere; or its pictures alone."""
+"""A run as one self-contained HTML file: pictures inside it, nothing fetched from anywhere."""
 
 from __future__ import annotations
 
 import base64
 import os
 import platform
+from collections.abc import Mapping
 from importlib import metadata, resources
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,46 +22,40 @@ from hybridlio.report_data import DrawnPath, Findings, ReportData, find
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Findings", "ReportData", "find", "save_pictures", "write_report"]
+__all__ = ["Findings", "ReportData", "find", "pictures", "write_report"]
 
 _PACKAGES = ("numpy", "scipy", "gtsam", "small_gicp", "open3d", "torch", "filterpy")
 _FRAMES_LISTED = 200
 
 
-def write_report(path: str | os.PathLike[str], data: ReportData, findings: Findings | None = None) -> None:
+def write_report(
+    path: str | os.PathLike[str],
+    data: ReportData,
+    findings: Findings | None = None,
+    drawn: Mapping[str, bytes] | None = None,
+) -> None:
     """Write the report, whole or not at all.
 
     Args:
         path: the HTML file.
         data: the run.
         findings: of the same data, where they are computed already.
+        drawn: its :func:`pictures` as PNG, where they are drawn already.
 
     Raises:
         DataError: the place cannot be written to.
     """
     import jinja2
 
+    from hybridlio.plots import to_png
+
     findings = find(data) if findings is None else findings
+    drawn = {name: to_png(figure) for name, figure in pictures(data, findings).items()} if drawn is None else drawn
     text = resources.files("hybridlio").joinpath("report.html.jinja").read_text(encoding="utf-8")
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    write_whole(path, environment.from_string(text).render(_page(data, findings)))
-
-
-def save_pictures(folder: str | os.PathLike[str], data: ReportData, findings: Findings | None = None) -> list[Path]:
-    """Write the figures as PNG files (``trajectory.png``, ``drift.png`` …) into a folder, and say which.
-
-    Raises:
-        DataError: the place cannot be written to.
-    """
-    from hybridlio.plots import to_png
-
-    paths = []
-    for name, figure in pictures(data, find(data) if findings is None else findings).items():
-        write_whole(path := Path(folder) / f"{name}.png", to_png(figure))
-        paths.append(path)
-    return paths
+    write_whole(path, environment.from_string(text).render(_page(data, findings, drawn)))
 
 
 def pictures(data: ReportData, findings: Findings) -> dict[str, Figure]:
@@ -88,10 +82,8 @@ def pictures(data: ReportData, findings: Findings) -> dict[str, Figure]:
     return out
 
 
-def _page(data: ReportData, findings: Findings) -> dict[str, Any]:
-    from hybridlio.plots import to_png
-
-    inline = {name: base64.b64encode(to_png(f)).decode() for name, f in pictures(data, findings).items()}
+def _page(data: ReportData, findings: Findings, drawn: Mapping[str, bytes]) -> dict[str, Any]:
+    inline = {name: base64.b64encode(png).decode() for name, png in drawn.items()}
     second = data.first_scan + 1  # the scan that the first step leads to
     bridged = [] if data.ok is None else _ranges(np.flatnonzero(~np.asarray(data.ok, bool)) + second)
     degenerate = [] if data.degenerate is None else _ranges(np.flatnonzero(data.degenerate) + second)

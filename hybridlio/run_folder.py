@@ -9,7 +9,6 @@ import datetime
 import json
 import logging
 import os
-import shutil
 from collections.abc import Sequence as Items
 from contextlib import suppress
 from dataclasses import dataclass
@@ -71,11 +70,11 @@ def new_run_folder(sequence: str, out: Path | None, overwrite: bool) -> Path:
     Without ``out`` it is ``runs/<sequence>-<date-time>``, with a number behind where another run has that already.
 
     Raises:
-        ConfigError: ``out`` holds a run already, and ``overwrite`` is not set.
+        ConfigError: ``out`` holds a run already, or files by the names of a run's, and ``overwrite`` is not set.
         DataError: the folder cannot be made.
     """
-    if out is not None and (out / METRICS).exists() and not overwrite:
-        raise ConfigError(f"{out} holds a run already; choose another folder, or --overwrite it")
+    if out is not None and not overwrite:
+        _check_free(out)
     wanted = out or Path("runs") / f"{sequence}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
     try:
         if out is None:
@@ -84,6 +83,16 @@ def new_run_folder(sequence: str, out: Path | None, overwrite: bool) -> Path:
     except OSError as error:
         raise DataError(f"cannot make the run folder {wanted}: {error.strerror}; choose another with -o") from None
     return out
+
+
+def _check_free(out: Path) -> None:
+    if (out / METRICS).exists():
+        raise ConfigError(f"{out} holds a run already; choose another folder, or --overwrite it")
+    there = [name for name in (*FILES, SMOOTHED) if (out / name).exists()]
+    if there:
+        raise ConfigError(
+            f"{out} holds {there[0]} and is no finished run; choose another folder, or --overwrite such files"
+        )
 
 
 def _made_anew(wanted: Path) -> Path:
@@ -97,11 +106,12 @@ def _made_anew(wanted: Path) -> Path:
 
 
 def clear(folder: Path) -> None:
-    """Remove a run's files, what says that it is complete first; leave anything else in the folder."""
-    (folder / METRICS).unlink(missing_ok=True)
-    for name in FILES:
-        (folder / name).unlink(missing_ok=True)
-    shutil.rmtree(folder / SMOOTHED, ignore_errors=True)
+    """Remove a run's files and those of its smoothing, what says that it is complete first; leave anything else."""
+    for one in (folder, folder / SMOOTHED):
+        for name in (METRICS, *FILES):
+            (one / name).unlink(missing_ok=True)
+    with suppress(OSError):  # not there, or something of somebody else's is in it
+        (folder / SMOOTHED).rmdir()
 
 
 def point_latest_at(folder: Path) -> None:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from hybridlio.gps import GpsFit
     from hybridlio.graph.loops import ClosedLoops
     from hybridlio.graph.offline import Smoothed
+    from hybridlio.loop_closure import Loop
 
 _ONLINE, _SMOOTHED = "odometry", "smoothed"
 _TOLD = 20
@@ -64,8 +65,9 @@ def write_pages(folder: Path, data: ReportData, findings: Findings) -> None:
     """Write ``report.html``, and the picture of the path alone."""
     from hybridlio.plots import to_png
 
-    write_report(folder / run_folder.REPORT, data, findings)
-    write_whole(folder / run_folder.PICTURE, to_png(pictures(data, findings)["trajectory"]))
+    drawn = {name: to_png(figure) for name, figure in pictures(data, findings).items()}
+    write_report(folder / run_folder.REPORT, data, findings, drawn)
+    write_whole(folder / run_folder.PICTURE, drawn["trajectory"])
 
 
 def T_pose_files(run: Run) -> Any:
@@ -184,16 +186,29 @@ def write_smoothed(folder: Path, stored: run_folder.StoredRun, record: Record, s
     trajectory, T = smoothed.trajectory, stored.T_camera_lidar
     steps = Steps(se3.between(trajectory.poses[:-1], trajectory.poses[1:]), smoothed.step_covariances)
     run_folder.write_trajectory(folder, trajectory, T, steps, stored.stamps_before)
-    fit: GpsFit | None = smoothed.found.get("gps")
-    closed: ClosedLoops | None = smoothed.found.get("loops")
-    loops = () if closed is None else closed.kept
+    loops = _closed_loops(smoothed)
     edges = [*record.edges, *((loop.earlier, loop.later, loop.as_relative_pose()) for loop in loops)]
     run_folder.write_graph(folder, trajectory.poses, edges, len(stored.stamps_before))
     if stored.reference is not None:
         write_tum(folder / run_folder.REFERENCE, stored.reference)
-    data = ReportData(
+    findings = find(data := _smoothed_report_data(stored, record, smoothed, steps))
+    write_pages(folder, data, findings)
+    run_folder.write_metrics(folder, _smoothed_metrics(stored, smoothed, findings.evaluations.get(_SMOOTHED)))
+    return findings
+
+
+def _closed_loops(smoothed: Smoothed) -> tuple[Loop, ...]:
+    closed: ClosedLoops | None = smoothed.found.get("loops")
+    return () if closed is None else closed.kept
+
+
+def _smoothed_report_data(stored: run_folder.StoredRun, record: Record, smoothed: Smoothed, steps: Steps) -> ReportData:
+    fit: GpsFit | None = smoothed.found.get("gps")
+    closed: ClosedLoops | None = smoothed.found.get("loops")
+    loops = _closed_loops(smoothed)
+    return ReportData(
         name=stored.metrics["sequence"],
-        estimate=trajectory,
+        estimate=smoothed.trajectory,
         reference=stored.reference,
         estimate_name=_SMOOTHED,
         others={_ONLINE: stored.trajectory},
@@ -208,16 +223,19 @@ def write_smoothed(folder: Path, stored: run_folder.StoredRun, record: Record, s
         | ({} if fit is None else {"GPS": fit.summary()}),
         warnings=stored.metrics["notes"],
     )
-    findings = find(data)
-    write_pages(folder, data, findings)
+
+
+def _smoothed_metrics(
+    stored: run_folder.StoredRun, smoothed: Smoothed, evaluation: Evaluation | None
+) -> dict[str, Any]:
+    fit: GpsFit | None = smoothed.found.get("gps")
+    closed: ClosedLoops | None = smoothed.found.get("loops")
     kept = ("hybridlio", "sequence", "pose_file_frame", "T_camera_lidar", "frames", "frames_done", "notes")
     figures = {name: stored.metrics[name] for name in kept if name in stored.metrics}
     figures |= {name: getattr(smoothed, name) for name in ("error_before", "error_after", "iterations", "converged")}
-    figures |= {"path_length_m": trajectory.length_m}
+    figures |= {"path_length_m": smoothed.trajectory.length_m}
     if closed is not None:
         figures |= {"loops": closed.to_json_dict(len(stored.stamps_before))}
     if fit is not None:
         figures |= {"gps": fit.to_json_dict()}
-    judged = findings.evaluations.get(_SMOOTHED)
-    run_folder.write_metrics(folder, figures | (judged.to_json_dict() if judged is not None else {}))
-    return findings
+    return figures | (evaluation.to_json_dict() if evaluation is not None else {})

@@ -10,7 +10,7 @@ from hybridlio import se3
 from hybridlio.errors import DataError
 from hybridlio.metrics import Steps, evaluate
 from hybridlio.metrics_table import figures
-from hybridlio.report import ReportData, find, pictures, save_pictures, write_report
+from hybridlio.report import ReportData, find, pictures, write_report
 from hybridlio.trajectory import Trajectory
 
 SIGMAS = [*np.radians([0.03, 0.03, 0.05]).tolist(), 0.02, 0.01, 0.02]
@@ -175,14 +175,6 @@ def test_a_reference_of_another_time_is_a_warning_and_not_the_end(data: ReportDa
     elsewhen = Trajectory(data.reference.stamps_ns - 10**18, data.reference.poses)
     write_report(tmp_path / "r.html", dataclasses.replace(data, reference=elsewhen))
     assert "only 0 poses of the same time" in (tmp_path / "r.html").read_text()
-
-
-def test_pictures_can_be_had_alone(data: ReportData, tmp_path: Path) -> None:
-    paths = save_pictures(tmp_path / "pictures", ReportData("a", data.others["before smoothing"], data.reference))
-    assert {p.name for p in paths} == {"trajectory.png", "drift.png"}
-    for path in paths:
-        assert path.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
-        assert path.read_bytes().endswith(b"IEND\xaeB`\x82")
 
 
 def test_the_drawn_lines_are_the_data(data: ReportData) -> None:
