@@ -1,6 +1,6 @@
 """KITTI 00 in full: a peer's odometry smoothed with the recording's own IMU and GPS.
 
-python benchmarks/kitti_00.py DATA [odometry imu gps outage …] [--outages 60]
+python benchmarks/kitti_00.py DATA [odometry imu gps outage …] [--outage-s 60]
 
 DATA holds `results/kiss_icp_00/00_poses_kitti.txt` (KISS-ICP's odometry, 4,541 poses), `kitti_imu_100hz`
 (accelerometer, gyroscope and GPS fixes of the same drive), and `kitti_odometry` with calibration, times and truth.

@@ -21,6 +21,7 @@ from hybridlio.graph.edges import Edges, edges_of, loops_of
 from hybridlio.graph.graph_data import GraphData
 from hybridlio.graph.initial import find
 from hybridlio.graph.levenberg import Progress, needs_orthogonal, parameters, poses_of
+from hybridlio.graph.solver import reason
 
 _INLIER_SHARE = 0.99  # of right factors have a χ² below the bound
 GRADUATION = 1.4  # the paper's
@@ -110,4 +111,4 @@ class _Weighted:
         try:
             return gtsam.LevenbergMarquardtOptimizer(graph, values, self._params).optimize()
         except RuntimeError as error:
-            raise GraphError(f"the graph cannot be solved: {' '.join(str(error).split())}") from error
+            raise GraphError(f"the graph cannot be solved: {reason(error)}") from error

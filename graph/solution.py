@@ -17,7 +17,7 @@ from hybridlio.graph.build import Builder
 from hybridlio.graph.graph_data import GraphData
 from hybridlio.graph.keys import Key
 from hybridlio.graph.levenberg import Solved
-from hybridlio.graph.solver import incremental_solver
+from hybridlio.graph.solver import incremental_solver, reason
 
 
 class Solution:
@@ -151,7 +151,7 @@ class Solution:
         try:
             isam.update(self._solved.graph, self._solved.values)
         except RuntimeError as error:
-            raise GraphError(f"covariances: {' '.join(str(error).split())}") from error
+            raise GraphError(f"covariances: {reason(error)}") from error
         return isam
 
     def _at(self, key: Key) -> int:

@@ -85,6 +85,7 @@ def run_batch(
     Raises:
         ConfigError: ``out`` holds runs of other recordings or with other settings, an unknown engine, or settings that
             no recording can be run with. Nothing has been run or removed then.
+        DataError: the folder cannot be made.
         MissingDependencyError: the engine is not installed.
     """
     config, out = config or Config(), Path(out).absolute()
@@ -99,7 +100,7 @@ def run_batch(
     done = {job.recording for job in todo if _is_complete(job, overwrite)}
     missing = [job for job in todo if job.recording not in done]
     with engines.engine(engine, jobs, threads, scheduler):
-        out.mkdir(parents=True, exist_ok=True)
+        _make(out)
         for job in missing:
             _clear(job)
         rows = {job.recording: _row(job, DONE_BEFORE if job.recording in done else NOT_RUN) for job in todo}
@@ -107,6 +108,13 @@ def run_batch(
     batch = Batch(out, tuple(rows.values()), stopped)
     write_batch(batch)
     return batch
+
+
+def _make(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"cannot make the folder {out}: {error.strerror}; choose another with -o") from None
 
 
 def _run_missing(

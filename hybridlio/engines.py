@@ -88,11 +88,11 @@ def _dask(scheduler: str | None, jobs: int | None) -> Iterator[None]:
     except ImportError as error:
         raise MissingDependencyError("the engine dask is not installed: pip install distributed") from error
     address = scheduler or dask.config.get("scheduler-address", None)
+    if address is None and (connected := _or_none(get_client)) is not None:
+        with connected.as_current():
+            yield
+        return
     try:
-        if address is None and (connected := _or_none(get_client)) is not None:
-            with connected.as_current():
-                yield
-            return
         client = Client(address) if address else Client(n_workers=jobs or cores(), threads_per_worker=1)
     except OSError as error:
         raise ConfigError(f"no Dask scheduler at {address}: {error}") from error

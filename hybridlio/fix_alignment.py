@@ -6,6 +6,7 @@ and the singular value decomposition", JAS 1988), with positions and the directi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -110,7 +111,7 @@ class _Fit:
         return self._stamps + round(shift_s * NS_PER_S)
 
     def best_shift(self, most_s: float) -> float:
-        grid = np.arange(-most_s, most_s + _GRID_S / 2, _GRID_S)
+        grid = np.linspace(-most_s, most_s, 2 * math.ceil(most_s / _GRID_S) + 1)
         # the same fixes for every shift, or leaving out some would look like fitting better
         kept = self._path.covers(self._at(-most_s)) & self._path.covers(self._at(most_s))
         kept = kept if kept.sum() >= _LEAST_FIXES else self._path.covers(self._stamps)

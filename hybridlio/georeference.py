@@ -114,7 +114,6 @@ def write_georeferenced(folder: Path, placed: Georeferenced) -> list[Path]:
     Raises:
         DataError: a file cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     write_tum(folder / POSES_ENU, placed.trajectory)
     if placed.origin is None:
         return [folder / POSES_ENU]

@@ -9,7 +9,8 @@ import numpy as np
 from hybridlio import se3
 from hybridlio.estimates import Array
 from hybridlio.map_cells import MapCells
-from hybridlio.ranges import above_0
+from hybridlio.planes import LEAST_NEIGHBOURS
+from hybridlio.ranges import above_0, expect
 from hybridlio.surface import Surface
 
 _FRESH_SHARE = 0.12
@@ -45,7 +46,8 @@ class LocalMapSettings:
     threads: int = 2
 
     def __post_init__(self) -> None:
-        above_0(self, "keyframe_m", "keyframe_deg", "voxel_m", "horizon_keyframes", "radius_m", "neighbours", "threads")
+        above_0(self, "keyframe_m", "keyframe_deg", "voxel_m", "horizon_keyframes", "radius_m", "threads")
+        expect(self, "neighbours", self.neighbours >= LEAST_NEIGHBOURS, f"{LEAST_NEIGHBOURS} or more, as a plane needs")
 
 
 class LocalMap:

@@ -20,6 +20,7 @@ from hybridlio.estimates import Array
 from hybridlio.information import NORMAL_NOISE, covariance_of, degenerate_directions
 from hybridlio.keyframes import Keyframes
 from hybridlio.odometry_chain import Index, OdometryChain
+from hybridlio.planes import LEAST_NEIGHBOURS
 from hybridlio.ranges import above_0, expect, from_0, shares
 from hybridlio.registration import Registration, RegistrationSettings, fit_at, register
 from hybridlio.surface import Surface
@@ -65,7 +66,7 @@ class VerificationSettings:
         above_0(self, "surface_voxel_m", "source_voxel_m", "max_difference_m", "max_difference_deg", "covariance_scale")
         from_0(self, "reach_m", "min_standing")
         shares(self, "min_matched", "max_cost")
-        expect(self, "neighbours", self.neighbours >= 3, "3 or more, as a plane needs")
+        expect(self, "neighbours", self.neighbours >= LEAST_NEIGHBOURS, f"{LEAST_NEIGHBOURS} or more, as a plane needs")
 
 
 @dataclass(frozen=True, eq=False)

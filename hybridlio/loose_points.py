@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.estimates import Array
-from hybridlio.planes import LEAST, Fitted, fit_planes
+from hybridlio.planes import LEAST_NEIGHBOURS, Fitted, fit_planes
 from hybridlio.point_tree import build_tree, threads_for
 
 Index = NDArray[np.intp]
@@ -35,8 +35,8 @@ class LoosePoints:
         """
         self._recent = [*self._recent, points][-_KEYFRAMES:]
         everything = np.concatenate(self._recent)
-        if len(everything) < LEAST or not len(points):
-            return np.empty(0, np.intp), fit_planes(np.empty((0, LEAST, 3)))
+        if len(everything) < LEAST_NEIGHBOURS or not len(points):
+            return np.empty(0, np.intp), fit_planes(np.empty((0, LEAST_NEIGHBOURS, 3)))
         count, worth = min(_NEIGHBOURS, len(everything)), threads_for(2 * len(points), threads)
         index, distance2 = build_tree(everything, threads).batch_knn_search(points, count, worth)
         near = np.flatnonzero(distance2[:, -1] < _REACH_M**2)

@@ -13,7 +13,7 @@ from hybridlio import se3
 from hybridlio.cell_table import CellTable, cells_of
 from hybridlio.estimates import Array
 from hybridlio.loose_points import LoosePoints
-from hybridlio.planes import LEAST, Fitted, Planes, fit_planes, of_several_rings
+from hybridlio.planes import LEAST_NEIGHBOURS, Fitted, Planes, fit_planes, of_several_rings
 from hybridlio.point_tree import build_tree, threads_for
 from hybridlio.surface import Surface
 
@@ -97,8 +97,8 @@ def _with_room(room: NDArray[np.int64], cells: Index) -> Index:
 def _with_planes(points: Array, wanted: Index, neighbours: int, threads: int) -> tuple[Index, Fitted, Index]:
     """Those of ``wanted`` whose nearest points make a plane, the planes, and those whose nearest are of one beam."""
     neighbours = min(neighbours, len(points))
-    if neighbours < LEAST or not len(wanted):
-        return wanted[:0], fit_planes(np.empty((0, LEAST, 3))), wanted[:0]
+    if neighbours < LEAST_NEIGHBOURS or not len(wanted):
+        return wanted[:0], fit_planes(np.empty((0, LEAST_NEIGHBOURS, 3))), wanted[:0]
     worth = threads_for(2 * len(wanted), threads)  # ten neighbours take twice as long as one or two
     index, _ = build_tree(points, threads).batch_knn_search(points[wanted], neighbours, worth)
     several = of_several_rings(points, index)

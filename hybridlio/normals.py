@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybridlio.errors import ConfigError
+from hybridlio.planes import LEAST_NEIGHBOURS
 from hybridlio.voxel import label_means, voxel_labels
 
 Floats = NDArray[np.float32]
 
-_LEAST = 5  # small_gicp fits no plane to fewer neighbours
 _TABLE_CELLS = 1 << 24
 
 
@@ -41,10 +41,10 @@ def estimate_normals(
     Raises:
         ConfigError: fewer than five neighbours, no thread, or a side out of range.
     """
-    if neighbours < _LEAST or threads < 1 or not thin_m >= 0 or not support_m > 0:
+    if neighbours < LEAST_NEIGHBOURS or threads < 1 or not thin_m >= 0 or not support_m > 0:
         raise ConfigError(
-            f"normals: need at least {_LEAST} neighbours, 1 thread, thin_m of 0 or more and support_m above 0, "
-            f"got {neighbours}, {threads}, {thin_m}, {support_m}"
+            f"normals: need at least {LEAST_NEIGHBOURS} neighbours, 1 thread, thin_m of 0 or more and support_m above "
+            f"0, got {neighbours}, {threads}, {thin_m}, {support_m}"
         )
     points = np.asarray(points, dtype=np.float32).reshape(-1, 3)
     if np.isfinite(points).all():  # by far the common case, and cheaper than a flag a row
@@ -89,7 +89,7 @@ def _has_support(places: Floats, side_m: float) -> NDArray[np.bool_]:
     """Whether five places lie in the 3 × 3 × 3 cubes around each, and not all in one place."""
     columns = np.ascontiguousarray(places.T)
     low, extent = columns.min(axis=1), np.ptp(columns, axis=1).astype(np.float64)
-    if len(places) < _LEAST or not extent.any():
+    if len(places) < LEAST_NEIGHBOURS or not extent.any():
         return np.zeros(len(places), bool)
     # a point far outside would make the table huge: coarser cubes then
     while np.prod(np.floor(extent / side_m) + 3) > _TABLE_CELLS:
@@ -103,4 +103,4 @@ def _has_support(places: Floats, side_m: float) -> NDArray[np.bool_]:
         around[step:] += count[:-step]
         around[:-step] += count[step:]
         count = around
-    return np.asarray(count[key] >= _LEAST)
+    return np.asarray(count[key] >= LEAST_NEIGHBOURS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from hybridlio.errors import ConfigError, DataError, EstimationError
 from hybridlio.estimates import Array, Backend, InitialPoseSource, RelativePose, ResidualSource, State, TakesBack
 from hybridlio.keyframes import KeyframeMaker
 from hybridlio.late_imu import take_up_imu
+from hybridlio.ranges import above_0
 from hybridlio.record import Record
 from hybridlio.record_maker import RecordMaker, joined
 from hybridlio.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples
@@ -232,6 +233,7 @@ class Odometry:
 
 def _setup(config: Config, frame: Frame) -> Setup:
     noise = config.imu_noise or frame.imu_noise or ImuNoise()
+    above_0(noise, *(field.name for field in fields(noise)))  # an IMU without noise is a simulator's only
     return Setup(config, frame.calibration or Calibration(), noise)
 
 

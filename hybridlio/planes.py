@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hybridlio.estimates import Array
 
-LEAST = 5  # neighbours that make a plane
+LEAST_NEIGHBOURS = 5  # that make a plane; small_gicp, too, fits none to fewer
 _THIN_M = 0.15  # so thick a plane counts half
 _RING_RAD = np.deg2rad(0.1)  # beams of spinning lidars are 0.3° apart and more
 _LEAST_OF_OTHERS = 2  # of ten

@@ -23,7 +23,6 @@ Array = NDArray[np.float64]
 
 FORMAT_VERSION = 2
 _READABLE = (1, 2)  # the first had no poses relative to keyframes
-# what NumPy, zip and the checks of the parts raise at a file that is cut off, damaged or something else
 
 
 @dataclass(frozen=True, eq=False)

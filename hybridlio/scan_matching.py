@@ -26,6 +26,7 @@ _VAGUE_M = 0.1  # as far as ground's rings are seen to pull
 _LEVER_M = 10.0  # half of the points are nearer: what an unsure rotation moves them by
 _LOST_COST = 0.6  # of the points' cost between 0 and 1: well above any that lie where they should
 _SHARE_OF_SAME_MAP = 1e-3
+_FINER = 0.7  # voxel, where few points are measured
 _YOUNG_MAP = 5.0  # a map of one keyframe has ground only along that scan's rings, and guesses what lies between
 _FLOOR_COVARIANCE = np.diag(FLOOR_SIGMAS**2)
 
@@ -179,11 +180,20 @@ class ScanMatching:
     def _look(self, scan: Scan) -> SeenScan:
         """The scan's points within range, one a voxel, and a share of the same to register."""
         points = voxel_average(scan.points, None, self._settings.map_voxel_m)[0].astype(np.float64)
+        measured = len(scan.points) / max(len(points), 1)  # for each of these
         range2 = np.einsum("ij,ij->i", points, points)
         near, far = self._settings.min_range_m, self._settings.max_range_m
         points = np.asarray(points[(range2 > near**2) & (range2 < far**2)])
-        source = points.take(voxel_pick(points, self._settings.source_voxel_m), axis=0)
-        return SeenScan(points, source, self._settings.local_map)
+        return SeenScan(points, self._to_register(points, measured), self._settings.local_map)
+
+    def _to_register(self, points: Array, measured: float) -> Array:
+        """Some of the points, one a voxel; the less each is the mean of, the more of them it takes."""
+        side_m, finest_m = self._settings.source_voxel_m, self._settings.map_voxel_m / 2
+        picked = voxel_pick(points, side_m)
+        while measured * len(picked) < self._settings.least_measured and side_m > finest_m:
+            side_m *= _FINER
+            picked = voxel_pick(points, side_m)
+        return points.take(picked, axis=0)
 
     def _take_in_keyframe(self) -> None:
         """Put a keyframe that was not taken back into the map."""

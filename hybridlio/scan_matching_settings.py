@@ -19,6 +19,7 @@ class ScanMatchingSettings:
         min_range_m, max_range_m: points outside are not used.
         map_voxel_m: side of the voxels that thin a scan for the map.
         source_voxel_m: the same for the points that are registered.
+        least_measured: where these stand for fewer measured points, as with a sensor of few beams, voxels are smaller.
         min_points: with fewer points a scan is bridged by the initial pose.
         min_matched: with a smaller share of points matched, too.
         covariance_scale: how much larger the covariance is than independent residuals would make it; points on one
@@ -39,6 +40,7 @@ class ScanMatchingSettings:
     max_range_m: float = 100.0
     map_voxel_m: float = 0.6
     source_voxel_m: float = 1.0
+    least_measured: int = 20_000
     min_points: int = 200
     min_matched: float = 0.3
     covariance_scale: float = 5.0
@@ -51,7 +53,7 @@ class ScanMatchingSettings:
     def __post_init__(self) -> None:
         expect(self, "target", self.target in ("local-map", "last-scan"), "local-map or last-scan")
         above_0(self, "map_voxel_m", "source_voxel_m", "covariance_scale")
-        from_0(self, "min_range_m", "min_points")
+        from_0(self, "min_range_m", "min_points", "least_measured")
         shares(self, "min_matched", "drift_share")
         expect(self, "max_range_m", self.max_range_m > self.min_range_m, f"above min_range_m, {self.min_range_m}")
         for name in ("start_speeds_m_s", "start_rates_deg_s"):

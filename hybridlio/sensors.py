@@ -135,7 +135,8 @@ class ImuNoise:
     """Continuous-time noise densities of an IMU; the defaults fit an industrial MEMS unit.
 
     The accelerometer and gyroscope densities are white noise per root hertz, the bias walks random walks, and the two
-    ``*_bias_sigma`` say how far the biases may be from zero at power-up.
+    ``*_bias_sigma`` say how far the biases may be from zero at power-up. Those of a simulated IMU may be 0; to estimate
+    with, all must be above.
 
     Raises:
         SettingError: a value is negative or not finite.
@@ -164,12 +165,25 @@ class GpsFix:
         position_m: ``(3,)`` in a local east-north-up frame, the same for all fixes of a recording.
         covariance_m2: ``(3, 3)``.
         origin: where on Earth that frame has its origin; None where it is not known.
+
+    Raises:
+        DataError: the position is not finite, or the covariance not positive definite.
     """
 
     stamp_ns: int
     position_m: NDArray[np.float64]
     covariance_m2: NDArray[np.float64]
     origin: GeodeticPoint | None = None
+
+    def __post_init__(self) -> None:
+        position, covariance = (np.asarray(a, dtype=np.float64) for a in (self.position_m, self.covariance_m2))
+        if position.shape != (3,) or not np.isfinite(position).all():
+            raise DataError(f"GPS fix at {self.stamp_ns} ns: expected three finite metres, got {position.tolist()}")
+        known = covariance.shape == (3, 3) and np.isfinite(covariance).all()
+        if not known or np.linalg.eigvalsh(covariance)[0] <= 0:
+            raise DataError(f"GPS fix at {self.stamp_ns} ns: its covariance must be (3, 3) and positive definite")
+        object.__setattr__(self, "position_m", position)
+        object.__setattr__(self, "covariance_m2", covariance)
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,8 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridlio.config import Config
 from hybridlio.datasets.registry import check_options, open_sequence, sequence_names
@@ -42,6 +40,7 @@ from hybridlio.sensors import Scan
 Progress = Callable[[str, int, int], None]
 
 _VERSION = 2  # of what is put into shards; another one prepares recordings anew
+_SCANS_IN_DIGEST = 16  # with all, a long recording would be read twice
 _UNSURE_TRANSLATION_M = 0.5  # an initial pose as unsure as this is none
 _UNSURE_STEP_M = 0.05  # a step that scans tell no better gives no velocity
 
@@ -154,21 +153,24 @@ def needs_odometry(network: NetworkSettings) -> bool:
 
 
 def shard_name(sequence: Sequence, recipe: Recipe, initial_pose: str | None = None) -> str:
-    """The recording's name with a digest of what it holds and how it is prepared."""
-    first = next((scan for k in range(len(sequence)) if (scan := _readable(sequence, k)) is not None), None)
+    """The recording's name with a digest of what it holds, of its scans only some, and how it is prepared."""
     what = {
         "version": [_VERSION, FORMAT],
         "scans": len(sequence),
         "options": asdict(preparation_for(recipe)),
         "imu_samples": recipe.network.imu_samples,
         "initial_pose": _source(sequence, initial_pose) if needs_odometry(recipe.network) else None,
+        "imu_noise": None if sequence.imu_noise is None else asdict(sequence.imu_noise),
     }
     digest = hashlib.sha256(json.dumps(what, sort_keys=True).encode())
-    arrays: list[NDArray[Any]] = [sequence.stamps_ns, sequence.imu.gyro_rad_s, sequence.calibration.T_imu_lidar]
-    arrays += [] if first is None else [first.points]
-    arrays += [] if sequence.reference is None else [sequence.reference.poses]
+    imu = sequence.imu
+    arrays = [sequence.stamps_ns, imu.stamps_ns, imu.gyro_rad_s, imu.accel_m_s2, sequence.calibration.T_imu_lidar]
+    arrays += [] if sequence.reference is None else [sequence.reference.stamps_ns, sequence.reference.poses]
     for array in arrays:
         digest.update(np.ascontiguousarray(array).tobytes())
+    for k in np.unique(np.linspace(0, len(sequence) - 1, _SCANS_IN_DIGEST).astype(np.intp)):
+        scan = _readable(sequence, int(k))
+        digest.update(b"" if scan is None else np.ascontiguousarray(scan.points).tobytes())
     return f"{sequence.name.replace(os.sep, '-')}-{digest.hexdigest()[:10]}"
 
 

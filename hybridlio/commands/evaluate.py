@@ -52,6 +52,8 @@ def evaluate(
 
 def _load(estimate: Path, reference: Path | None) -> tuple[Trajectory, Trajectory, Steps | None]:
     """Reference, estimate, and the steps behind the estimate where it is a run folder."""
+    import numpy as np
+
     from hybridlio.run_folder import read_run
     from hybridlio.trajectory_files import read_pair, read_trajectory
 
@@ -69,7 +71,7 @@ def _load(estimate: Path, reference: Path | None) -> tuple[Trajectory, Trajector
         return run.reference, run.trajectory, run.steps  # type: ignore[return-value]
     if reference.is_dir():
         return _reference(reference), run.trajectory, run.steps
-    stamps = run.trajectory.stamps_ns
+    stamps = np.concatenate([run.stamps_before, run.trajectory.stamps_ns])
     return read_trajectory(reference, stamps, run.T_camera_lidar), run.trajectory, run.steps
 
 

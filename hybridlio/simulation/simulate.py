@@ -100,7 +100,10 @@ def _require_same(drive: Path, description: dict[str, Any]) -> None:
     except (OSError, ValueError):
         raise DataError(f"{drive} is there already and is no simulated drive; choose another folder") from None
     if _completed(found) != description:
-        raise DataError(f"{path} says that another drive of this seed is there; choose another folder or seed")
+        raise DataError(
+            f"{path} says that another drive is there, of this seed or of one with the same last four digits, which "
+            "number the folders; choose another folder or seed"
+        )
 
 
 def _completed(found: Any) -> Any:

@@ -13,7 +13,7 @@ from hybridlio.batch import Job, run_batch, run_job
 from hybridlio.batch_table import DONE, DONE_BEFORE, FAILED, NOT_RUN
 from hybridlio.cli import app
 from hybridlio.config import Config
-from hybridlio.errors import ConfigError, MissingDependencyError
+from hybridlio.errors import ConfigError, DataError, MissingDependencyError
 from hybridlio.recordings import Recording, find_recordings
 
 cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers cannot import tests
@@ -128,6 +128,19 @@ def test_the_same_batch_runs_on_a_dask_cluster(two, tmp_path):
     with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
         done = run_batch(two[:1], tmp_path, QUICK, engine="dask", scheduler=cluster.scheduler_address)
     assert statuses(done) == [DONE]
+
+
+def test_a_folder_that_cannot_be_made_is_named_whoever_runs_the_batch(two, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match=r"cannot make the folder .*file/runs"):
+        run_batch(two, tmp_path / "file/runs", QUICK)
+    with (
+        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.Client(cluster),
+        pytest.raises(DataError, match=r"cannot make the folder .*file/runs"),
+    ):
+        run_batch(two, tmp_path / "file/runs", QUICK, engine="dask")
 
 
 @pytest.mark.parametrize(("engine", "module"), [("dask", "distributed"), ("ray", "ray")])

@@ -108,6 +108,16 @@ def test_scans_that_cannot_be_read_are_bridged_told_and_have_rows(damaged, tmp_p
     assert len(read_tum(tmp_path / "run/poses_tum.txt")) == 25
 
 
+def test_a_run_that_starts_late_is_evaluated_against_a_file_of_all_scans(damaged, tmp_path, without_pages):
+    scans = damaged / next(path.name for path in damaged.glob("*_sync")) / "velodyne_points/data"
+    for k in (0, 1):
+        (scans / f"{k:010d}.bin").write_bytes(b"")
+    ok("odometry", damaged, "-o", tmp_path / "run")
+    assert json.loads((tmp_path / "run/metrics.json").read_text())["skipped"] == 2
+    itself = json.loads(ok("evaluate", tmp_path / "run", "--reference", tmp_path / "run/poses_kitti.txt", "--json"))
+    assert itself["ate_m"] < 1e-6
+
+
 def test_an_error_in_the_middle_keeps_what_was_estimated(tiny_drive, tmp_path, monkeypatch, without_pages):
     from hybridlio.errors import GraphError
     from hybridlio.graph.online import IncrementalBackend

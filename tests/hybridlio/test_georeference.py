@@ -70,6 +70,14 @@ def test_the_placed_path_lies_on_the_fixes_and_the_shift_is_found(record: Record
     assert fit.shift_s == pytest.approx(SHIFT_S, abs=0.005)
 
 
+@pytest.mark.parametrize(("most_s", "shift_s"), [(0.01, 0.004), (0.012, -0.008), (0.07, 0.06), (0.12, -0.11)])
+def test_a_shift_within_any_bound_is_found(record: Record, most_s: float, shift_s: float):
+    later = round((SHIFT_S - shift_s) * 1e9)
+    fixes = tuple(replace(fix, stamp_ns=fix.stamp_ns + later) for fix in record.gps)
+    fit = georeference(replace(record, gps=fixes), max_shift_s=most_s).alignment
+    assert fit.shift_s == pytest.approx(shift_s, abs=0.002)
+
+
 def test_what_is_written_is_read_again_and_lies_where_the_fixes_do(record: Record, tmp_path: Path):
     placed = georeference(record)
     assert [path.name for path in write_georeferenced(tmp_path, placed)] == [POSES_ENU, TABLE, MAP]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -108,4 +109,12 @@ def test_weights_that_cannot_be_read_end_a_run_at_once_and_not_at_every_scan(cho
     run = run_odometry(sequence, Odometry(config=parse_config({"lstm": lost, "network": lost}, "here"), **choice))
     assert isinstance(run.stopped, ConfigError)
     assert "nowhere.safetensors: weights cannot be read" in str(run.stopped)
-    assert (run.done, run.unreadable, caplog.messages) == (0, {}, [])
+    warned = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+    assert (run.done, run.unreadable, warned) == (0, {}, [])
+
+
+def test_an_imu_without_noise_is_refused_and_named(frames: list[Frame]):
+    for name in ("gyro_walk_rad_s2_sqrt_hz", "accel_bias_sigma_m_s2"):
+        silent = replace(ImuNoise(), **{name: 0.0})
+        with pytest.raises(ConfigError, match=f"ImuNoise.{name}: must be above 0, got 0"):
+            Odometry(config=Config(imu_noise=silent)).step(frames[0])

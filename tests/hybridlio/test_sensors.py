@@ -10,7 +10,7 @@ from scipy.integrate import trapezoid
 
 from hybridlio import se3
 from hybridlio.errors import DataError
-from hybridlio.sensors import LIDAR_MODELS, Calibration, ImuSamples, Scan
+from hybridlio.sensors import LIDAR_MODELS, Calibration, GpsFix, ImuSamples, Scan
 
 START_NS = 1_317_042_272_335_337_762  # nanoseconds since 1970 do not fit a float64
 MS = 1_000_000
@@ -134,6 +134,21 @@ def test_calibration_takes_rounded_extrinsics_and_refuses_what_is_not_rigid() ->
     for name in ("T_imu_lidar", "T_camera_lidar"):
         with pytest.raises(DataError, match=name):
             Calibration(**{name: np.diag([1.0, 1.0, -1.0, 1.0])})
+
+
+@pytest.mark.parametrize(
+    ("position", "covariance", "says"),
+    [
+        ([0.0, np.nan, 0.0], np.eye(3), "three finite metres"),
+        ([0.0, 0.0], np.eye(3), "three finite metres"),
+        ([0.0, 0.0, 0.0], np.eye(2), "positive definite"),
+        ([0.0, 0.0, 0.0], np.diag([1.0, 1.0, 0.0]), "positive definite"),
+        ([0.0, 0.0, 0.0], np.full((3, 3), np.inf), "positive definite"),
+    ],
+)
+def test_a_fix_that_says_nothing_of_a_place_is_refused_with_its_stamp(position, covariance, says) -> None:
+    with pytest.raises(DataError, match=f"GPS fix at 7 ns.*{says}"):
+        GpsFix(7, np.array(position), covariance)
 
 
 @pytest.mark.parametrize("name", list(LIDAR_MODELS))

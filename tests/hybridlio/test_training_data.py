@@ -14,6 +14,7 @@ from hybridlio.errors import ConfigError, DataError
 from hybridlio.learned.settings import NetworkSettings, Recipe
 from hybridlio.projection import MAP_GEOMETRIES
 from hybridlio.run import run_odometry
+from hybridlio.sensors import ImuNoise, Scan
 from hybridlio.training_data import DataOptions, shard_name, shards_of, training_pairs
 
 NETWORK = NetworkSettings(geometry=MAP_GEOMETRIES["16-beam"])
@@ -80,6 +81,10 @@ def test_a_step_that_scans_do_not_tell_gives_no_velocity(tiny_drive, tmp_path, m
     assert known[6:].all()
 
 
+def later_larger(scan: Scan, k: int) -> Scan:
+    return scan if k == 0 else replace(scan, points=1.1 * scan.points)
+
+
 def test_another_drive_other_cells_or_another_source_have_another_name(tiny_drive):
     sequence = open_sequence(tiny_drive)
     names = {
@@ -92,6 +97,17 @@ def test_another_drive_other_cells_or_another_source_have_another_name(tiny_driv
         shard_name(sequence, replace(RECIPE, loss=replace(RECIPE.loss, keep_ground=True))),
     }
     assert len(names) == 7
+    imu = sequence.imu
+    others = {
+        shard_name(other, RECIPE)
+        for other in (
+            replace(sequence, imu=replace(imu, accel_m_s2=9.81 * imu.accel_m_s2)),
+            replace(sequence, imu=replace(imu, stamps_ns=imu.stamps_ns + 50_000_000)),
+            replace(sequence, imu_noise=ImuNoise(gyro_rad_s_sqrt_hz=0.1)),
+            replace(sequence, load_scan=lambda k: later_larger(sequence.load_scan(k), k)),
+        )
+    }
+    assert len(others - names) == 4
     assert shard_name(sequence, GIVEN, "preintegration") == shard_name(sequence, MOVING) == shard_name(sequence, GIVEN)
     # a network that is told of neither needs no odometry, whatever its source is called
     assert shard_name(sequence, RECIPE, "kalman") == shard_name(sequence, RECIPE)

@@ -48,12 +48,12 @@ def test_another_place_is_refused_with_the_reason(round_trip: Any, verifier: Ver
         assert "match" in verdict.reason or "fit" in verdict.reason
 
 
-def test_a_wrong_start_far_away_gives_no_wrong_loop(round_trip: Any, verifier: Verifier):
+def test_a_start_far_away_gives_no_wrong_loop(round_trip: Any, verifier: Verifier):
     earlier, later = keyframe_at(round_trip, 24), keyframe_at(round_trip, 316)
     true = true_pose(round_trip, earlier, later)
     for metres in (15.0, -15.0, 25.0):
         verdict = verifier.verify(earlier, later, [true @ se3.exp(np.array([0, 0, 0, metres, 0, 0]))])
-        assert verdict.reason != "" or np.linalg.norm(se3.between(verdict.pose, true)[:3, 3]) < 0.2
+        assert "of the points match" in verdict.reason
 
 
 def test_bare_ground_holds_too_little(round_trip: Any, rng: np.random.Generator):
