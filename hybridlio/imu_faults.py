@@ -1,15 +1,35 @@
-"""Inertial samples that nobody measured: gaps that were filled with a straight line before anyone saw the recording."""
+"""Inertial samples that nobody measured: spikes, and gaps that were filled with a straight line."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from hybridlio.sensors import NS_PER_S, ImuSamples
 
+_AROUND = 5  # samples
+_SPIKE_RAD_S, _SPIKE_M_S2 = 5.0, 80.0  # off the median of those around: more than a car does, or a hand
+_MOST_SPIKES = 0.01  # of all samples; more of them are no spikes
 _LONGEST_LINE_S = 0.2  # a vehicle's vibration and the sensor's noise never lie on a line for so long
 _LEAST_SAMPLES = 8
 _OFF_THE_LINE = 0.05  # of the typical deviation from the neighbours' line
+
+
+def spikes(imu: ImuSamples) -> NDArray[np.intp]:
+    """Rows of samples far off the median of those around: bits that fell over, overflows, a knock on the sensor.
+
+    One alone turns or throws the predicted motion by metres. Where over one in a hundred is so far off it is something
+    else, such as another unit, and none is named.
+    """
+    if len(imu) < _AROUND:
+        return np.empty(0, np.intp)
+    off = [
+        np.abs(values - median_filter(values, size=(_AROUND, 1), mode="mirror")).max(axis=1)
+        for values in (imu.gyro_rad_s, imu.accel_m_s2)
+    ]
+    found = np.flatnonzero((off[0] > _SPIKE_RAD_S) | (off[1] > _SPIKE_M_S2))
+    return found if len(found) <= max(1, _MOST_SPIKES * len(imu)) else found[:0]
 
 
 def filled_gaps(imu: ImuSamples) -> list[tuple[int, int]]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridlio import se3
 from hybridlio.errors import DataError
@@ -18,7 +19,7 @@ from hybridlio.scan_matching_settings import ScanMatchingSettings
 from hybridlio.sensors import NS_PER_S, Frame, Scan
 from hybridlio.start_search import COARSE_KERNEL_M, best_start, lies_better, motions
 from hybridlio.surface import Surface
-from hybridlio.voxel import voxel_average, voxel_pick
+from hybridlio.voxel import Floats, voxel_average, voxel_pick
 
 _UNSURE_TRANSLATION_M = 0.5
 _UNSURE_ROTATION_RAD = 0.02
@@ -27,6 +28,7 @@ _LEVER_M = 10.0  # half of the points are nearer: what an unsure rotation moves 
 _LOST_COST = 0.6  # of the points' cost between 0 and 1: well above any that lie where they should
 _SHARE_OF_SAME_MAP = 1e-3
 _FINER = 0.7  # voxel, where few points are measured
+_NEVER_FEW = 4  # times what is needed: of a scan of so many points at least a quarter is always registered
 _YOUNG_MAP = 5.0  # a map of one keyframe has ground only along that scan's rings, and guesses what lies between
 _FLOOR_COVARIANCE = np.diag(FLOOR_SIGMAS**2)
 
@@ -81,6 +83,7 @@ class ScanMatching:
         self._map = LocalMap(self._settings.local_map)
         self._path = _Path(np.eye(4))
         self._before = self._path
+        self._doubted: _Path | None = None  # where the last scan was found, which the IMU contradicts
         self._waiting: Array | None = None  # points of a keyframe that goes into the map before the next scan
         self._adrift = False  # nobody knows how far the last scan is from the map: another map starts there
         self._stamp_ns = 0
@@ -119,8 +122,10 @@ class ScanMatching:
         before, self._before = self._path, self._path
         step = se3.between(before.T_map_lidar, found.pose)
         left_open = bool(len(observed.degenerate))
-        guessed = before.bridged or left_open
-        self._path = _Path(found.pose, None if guessed else se3.log(step) / dt_s)
+        seen_before = self._doubted or (None if before.bridged else before)
+        known = seen_before is not None and not left_open
+        moved = se3.log(se3.between(seen_before.T_map_lidar, found.pose)) / dt_s if known and seen_before else None
+        self._path, self._doubted = _Path(found.pose, moved), None
         self._adrift = left_open and _is_vague(initial)
         if self._settings.target == "last-scan" or self._adrift or self._map.wants(found.pose):
             self._waiting, self._path.map_changed = seen.points, True
@@ -128,7 +133,7 @@ class ScanMatching:
 
     def take_back(self, initial: RelativePose) -> None:
         """Leave the last scan out: the path goes on by ``initial``, and the map stays as it was."""
-        self._waiting = None
+        self._waiting, self._doubted = None, self._path
         self._path = self._before.carried_on(initial)
 
     def pair(self, earlier: SeenScan, current: SeenScan, initial: RelativePose) -> RelativePose:
@@ -180,20 +185,24 @@ class ScanMatching:
     def _look(self, scan: Scan) -> SeenScan:
         """The scan's points within range, one a voxel, and a share of the same to register."""
         points = voxel_average(scan.points, None, self._settings.map_voxel_m)[0].astype(np.float64)
-        measured = len(scan.points) / max(len(points), 1)  # for each of these
-        range2 = np.einsum("ij,ij->i", points, points)
-        near, far = self._settings.min_range_m, self._settings.max_range_m
-        points = np.asarray(points[(range2 > near**2) & (range2 < far**2)])
-        return SeenScan(points, self._to_register(points, measured), self._settings.local_map)
+        points = np.asarray(points[self._in_range(points)])
+        return SeenScan(points, self._to_register(points, scan), self._settings.local_map)
 
-    def _to_register(self, points: Array, measured: float) -> Array:
+    def _to_register(self, points: Array, scan: Scan) -> Array:
         """Some of the points, one a voxel; the less each is the mean of, the more of them it takes."""
         side_m, finest_m = self._settings.source_voxel_m, self._settings.map_voxel_m / 2
         picked = voxel_pick(points, side_m)
-        while measured * len(picked) < self._settings.least_measured and side_m > finest_m:
-            side_m *= _FINER
-            picked = voxel_pick(points, side_m)
+        if len(scan) < _NEVER_FEW * self._settings.least_measured:
+            measured = np.count_nonzero(self._in_range(scan.points)) / max(len(points), 1)  # for each of the points
+            while measured * len(picked) < self._settings.least_measured and side_m > finest_m:
+                side_m *= _FINER
+                picked = voxel_pick(points, side_m)
         return points.take(picked, axis=0)
+
+    def _in_range(self, points: Array | Floats) -> NDArray[np.bool_]:
+        range2 = np.einsum("ij,ij->i", points, points)
+        near, far = self._settings.min_range_m, self._settings.max_range_m
+        return np.asarray((range2 > near**2) & (range2 < far**2))
 
     def _take_in_keyframe(self) -> None:
         """Put a keyframe that was not taken back into the map."""
@@ -213,17 +222,28 @@ class ScanMatching:
         kernel_start_m = min(max(settings.kernel_m, sigma_m, sideways_m), 1.0)
         start = self._path.T_map_lidar @ initial.pose
         if sigma_m > _UNSURE_TRANSLATION_M:
-            if self._path.twist is not None:  # who guesses no motion leaves it to this source to know the last one
-                moving = self._path.T_map_lidar @ se3.exp(self._path.twist * dt_s)
-                alone, points = self._map.alone, seen.points
-                observed = observe(surface, seen.source, moving, settings, COARSE_KERNEL_M, True, alone, points)
-                if observed.found.matched >= self._settings.min_matched and observed.found.cost < _LOST_COST:
-                    return observed
+            # who guesses no motion leaves it to this source to know the last one
+            if (observed := self._going_on(self._path, seen, dt_s)) is not None:
+                return observed
             turns = initial.covariance[:3, :3].trace() > _UNSURE_ROTATION_RAD**2
             rates_deg_s = self._settings.start_rates_deg_s if turns else (0.0,)
             starts = [start @ step for step in motions(self._settings.start_speeds_m_s, rates_deg_s, dt_s)]
             start = best_start(surface, seen.source, seen.points, starts, settings)
-        return self._from_the_better(seen, start, initial, kernel_start_m)
+        observed = self._from_the_better(seen, start, initial, kernel_start_m)
+        if observed.found.matched < self._settings.min_matched:  # such as by an IMU that is wrong
+            return self._going_on(self._doubted or self._path, seen, dt_s) or observed
+        return observed
+
+    def _going_on(self, last: _Path, seen: SeenScan, dt_s: float) -> Observed | None:
+        """Registered from where the last motion leads; None where that is not known, or the scan lies badly there."""
+        surface, settings = self._map.surface, self._settings
+        if last.twist is None or surface is None:
+            return None
+        moving = last.T_map_lidar @ se3.exp(last.twist * dt_s)
+        alone, points = self._map.alone, seen.points
+        observed = observe(surface, seen.source, moving, settings.registration, COARSE_KERNEL_M, True, alone, points)
+        lies_well = observed.found.matched >= settings.min_matched and observed.found.cost < _LOST_COST
+        return observed if lies_well else None
 
     def _from_the_better(self, seen: SeenScan, start: Array, initial: RelativePose, kernel_start_m: float) -> Observed:
         """Register from ``start``, or from what was proposed, where the points lie better on the map there."""
@@ -239,7 +259,7 @@ class ScanMatching:
         return observe(surface, seen.source, start, settings, kernel_start_m, far, alone, seen.points)
 
     def _bridge(self, initial: RelativePose, points: int, observed: Observed | None) -> RelativePose:
-        self._before, self._path = self._path, self._path.carried_on(initial)
+        self._before, self._path, self._doubted = self._path, self._path.carried_on(initial), None
         return RelativePose(
             initial.pose,
             initial.covariance,

@@ -59,4 +59,4 @@ def lies_better(surface: Surface, source: Array, one: Array, other: Array, kerne
 def _best(fits: Sequence[Fit]) -> list[int]:
     """Their numbers, the best first; those of much fewer points are left out."""
     most = max(fit.matched for fit in fits)
-    return sorted((i for i, fit in enumerate(fits) if fit.matched > _OVERLAP * most), key=lambda i: fits[i].misfit)
+    return sorted((i for i, fit in enumerate(fits) if fit.matched >= _OVERLAP * most), key=lambda i: fits[i].misfit)

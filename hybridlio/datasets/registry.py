@@ -5,13 +5,18 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from hybridlio.datasets import folder, kitti_odometry, kitti_raw
-from hybridlio.datasets.sequence import Sequence
+from hybridlio.datasets.sequence import Notes, Sequence
 from hybridlio.datasets.vertical_angle import check_angle
 from hybridlio.errors import ConfigError, DataError
+from hybridlio.imu_faults import spikes
+from hybridlio.sensors import NS_PER_S, ImuSamples
+from hybridlio.tables import counted
 
 
 @dataclass(frozen=True)
@@ -64,7 +69,23 @@ def open_sequence(
     name, found = _find(root, reader)
     recording = found[_pick(root, found, sequence)]
     raw = Path(raw_root).expanduser() if raw_root is not None else None
-    return READERS[name].open(recording, raw, vertical_angle_deg)
+    return _without_spikes(READERS[name].open(recording, raw, vertical_angle_deg))
+
+
+def _without_spikes(sequence: Sequence) -> Sequence:
+    """The sequence without inertial samples that nobody measured, which is noted."""
+    imu, rows = sequence.imu, spikes(sequence.imu)
+    if not len(rows):
+        return sequence
+    notes = Notes(sequence.name, list(sequence.notes))
+    after_s = (imu.stamps_ns[rows[0]] - sequence.stamps_ns[0]) / NS_PER_S
+    notes.add(
+        f"left out {counted(len(rows), 'inertial sample')} far off those around, the first {after_s:.2f} s after the "
+        "first scan"
+    )
+    keep = np.delete(np.arange(len(imu)), rows)
+    imu = ImuSamples(imu.stamps_ns[keep], imu.gyro_rad_s[keep], imu.accel_m_s2[keep])
+    return replace(sequence, imu=imu, notes=tuple(notes.texts))
 
 
 def sequence_names(path: str | os.PathLike[str], *, reader: str | None = None) -> tuple[str, ...]:
