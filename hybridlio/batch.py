@@ -19,7 +19,7 @@ from hybridlio import engines, run_folder
 from hybridlio.batch_table import DONE, DONE_BEFORE, FAILED, NOT_RUN, Batch, BatchRow, figures_of, write_batch
 from hybridlio.config import Config
 from hybridlio.errors import ConfigError, DataError, HybridLioError
-from hybridlio.files import write_whole
+from hybridlio.files import make_folder, write_whole
 from hybridlio.recordings import Recording
 from hybridlio.sources import check_made, check_names
 
@@ -100,7 +100,7 @@ def run_batch(
     done = {job.recording for job in todo if _is_complete(job, overwrite)}
     missing = [job for job in todo if job.recording not in done]
     with engines.engine(engine, jobs, threads, scheduler):
-        _make(out)
+        make_folder(out)
         for job in missing:
             _clear(job)
         rows = {job.recording: _row(job, DONE_BEFORE if job.recording in done else NOT_RUN) for job in todo}
@@ -108,13 +108,6 @@ def run_batch(
     batch = Batch(out, tuple(rows.values()), stopped)
     write_batch(batch)
     return batch
-
-
-def _make(out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"cannot make the folder {out}: {error.strerror}; choose another with -o") from None
 
 
 def _run_missing(

@@ -88,6 +88,7 @@ class Comparison:
         reference_length_m: the reference's path length, or None.
         forward_speed_length_m: how far the vehicle went by its own forward speed, or None.
         rows: one run each.
+        stopped: the interrupt that ended the comparison, or None.
     """
 
     sequence: str
@@ -95,6 +96,7 @@ class Comparison:
     reference_length_m: float | None
     forward_speed_length_m: float | None
     rows: tuple[Compared, ...]
+    stopped: BaseException | None = None
 
 
 def combinations(
@@ -109,7 +111,8 @@ def combinations(
 def compare(sequence: Sequence, configs: Iterable[Config], progress: Progress | None = None) -> Comparison:
     """Run every configuration over the whole sequence, one after the other.
 
-    A run that fails has a row too, with what it had estimated until then; an interrupt ends the comparison.
+    A run that fails has a row too, with what it had estimated until then. An interrupt ends the comparison; it is kept
+    in :attr:`Comparison.stopped`, and what was compared by then stays.
 
     Args:
         sequence: the recording.
@@ -118,16 +121,15 @@ def compare(sequence: Sequence, configs: Iterable[Config], progress: Progress | 
 
     Raises:
         ConfigError: a source is unknown.
-        KeyboardInterrupt: while a run was going on.
     """
     odometries = [(config, Odometry(config=config)) for config in configs]  # wrong names fail before the work
     runs: list[tuple[Config, Run]] = []
     for config, odometry in odometries:
         show = None if progress is None else _shown(progress, config, len(runs), len(odometries))
         run = run_odometry(sequence, odometry, show)
-        if isinstance(run.stopped, KeyboardInterrupt):
-            raise run.stopped
         runs.append((config, run))
+        if isinstance(run.stopped, KeyboardInterrupt):
+            break
     lengths = [length for _, run in runs if (length := forward_speed_length_m(run)) is not None]
     return Comparison(
         sequence=sequence.name,
@@ -135,6 +137,7 @@ def compare(sequence: Sequence, configs: Iterable[Config], progress: Progress | 
         reference_length_m=None if sequence.reference is None else sequence.reference.length_m,
         forward_speed_length_m=max(lengths, default=None),
         rows=tuple(_compared(config, run) for config, run in runs),
+        stopped=next((run.stopped for _, run in runs if isinstance(run.stopped, KeyboardInterrupt)), None),
     )
 
 
@@ -164,7 +167,7 @@ def _compared(config: Config, run: Run) -> Compared:
         initial=initial,
         final=final,
         evaluation=evaluation,
-        error=None if run.stopped is None else str(run.stopped),
+        error=None if run.stopped is None else str(run.stopped) or "interrupted",
     )
 
 
@@ -238,5 +241,6 @@ def to_markdown(comparison: Comparison) -> str:
 def write_comparison(folder: Path, comparison: Comparison) -> None:
     """Write ``compare.json`` and ``compare.md``."""
     values = vars(comparison) | {"rows": [row.to_json_dict() for row in comparison.rows]}
+    values["stopped"] = comparison.stopped is not None
     write_whole(folder / "compare.json", json.dumps(values, indent=2, ensure_ascii=False) + "\n")
     write_whole(folder / "compare.md", to_markdown(comparison))

@@ -19,6 +19,18 @@ UNREADABLE_NPZ = (
 )  # fmt: skip
 
 
+def make_folder(path: Path) -> None:
+    """Make a folder, with those above it, unless it is there.
+
+    Raises:
+        DataError: it cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"cannot make the folder {path}: {error.strerror}; choose another with -o") from None
+
+
 @contextlib.contextmanager
 def writing_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary path in the same folder that takes ``path``'s place when the block ends well.

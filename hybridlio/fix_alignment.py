@@ -94,7 +94,9 @@ def align_fixes(
         EstimationError: too few fixes in the path's time.
     """
     if not fixes:
-        raise EstimationError("no GPS fixes to place the run on; the recording needs some, see gps.csv")
+        raise EstimationError(
+            "no GPS fixes in the run's time to place it on; the recording needs some, by its scans' clock, see gps.csv"
+        )
     up = up_world / np.linalg.norm(up_world)
     fit = _Fit(path, fixes, lever_m, up, up_sigma_rad)
     shift = fit.best_shift(max_shift_s) if max_shift_s > 0 else 0.0

@@ -50,7 +50,7 @@ def record_from_odometry(
         initial=relative,
         relative=relative,
         imu=inside,
-        gps=tuple(sorted(gps, key=lambda fix: fix.stamp_ns)),
+        gps=tuple(sorted(gps or (), key=lambda fix: fix.stamp_ns)),
         start=start_state(start_ns, beginning, imu_noise),
         calibration=calibration,
         imu_noise=imu_noise,

@@ -75,6 +75,11 @@ class GpsFit:
         kept = self.residuals_m[self.used & ~self.rejected]
         return float(np.sqrt((kept**2).sum(axis=1).mean())) if len(kept) else float("nan")
 
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether most of the fixes that the run reaches are rejected: then the others may be wrong as well."""
+        return bool(2 * self.rejected.sum() > self.used.sum())
+
     def to_json_dict(self) -> dict[str, Any]:
         """The figures as plain values; None for an RMSE of no fix."""
         return {
@@ -92,7 +97,8 @@ class GpsFit:
         """One line."""
         shift = f"clocks {1e3 * self.shift_s:.0f} ± {1e3 * self.shift_sigma_s:.0f} ms apart"
         scale = f", fixes taken {self.noise_scale:.1f} times less sure than they claim" if self.noise_scale > 1 else ""
+        count = int((self.used & ~self.rejected).sum())
         return (
-            f"{int(self.used.sum())} of {len(self.used)} fixes used, {int(self.rejected.sum())} rejected, "
+            f"{count} of {len(self.used)} fixes used, {int(self.rejected.sum())} rejected, "
             f"{self.rmse_m:.2f} m RMSE, {shift}{scale}"
         )

@@ -133,7 +133,7 @@ class Evaluation:
 
 
 def evaluate(
-    reference: Trajectory,
+    reference: Trajectory | None,
     estimate: Trajectory,
     lengths_m: Sequence[float] | None = None,
     steps: Steps | None = None,
@@ -142,7 +142,7 @@ def evaluate(
     """Compare an estimate with a reference.
 
     Args:
-        reference: the truth.
+        reference: the truth; None, as of a recording without, is an error.
         estimate: poses of the same sensor; the two may use different world frames. With covariances, of the poses
             relative to the first, their consistency is judged too.
         lengths_m: segment lengths for the drift beside KITTI's; by default :func:`lengths_for` a path under 100 m.
@@ -150,8 +150,10 @@ def evaluate(
         max_difference_ns: see :func:`associate`.
 
     Raises:
-        DataError: the two share less than two moments, or the steps do not fit the estimate.
+        DataError: there is no reference, the two share less than two moments, or the steps do not fit the estimate.
     """
+    if reference is None:
+        raise DataError("there is no reference to compare with: the recording came without")
     _check_steps(steps, estimate)
     both = associate(reference, estimate, max_difference_ns)
     drift = kitti_drift(both.reference, both.estimate)

@@ -82,6 +82,8 @@ class Odometry:
         config: Config | None = None,
     ) -> None:
         config = config or Config()
+        if not isinstance(config, Config):
+            raise ConfigError(f"config must be a Config, got {config!r}; hybridlio.load_config reads one from a file")
         self._config = config
         self._chosen = (initial_pose or config.initial_pose, residual or config.residual, backend or config.backend)
         check_names(*self._chosen)
@@ -110,7 +112,7 @@ class Odometry:
             state = self._take_up_imu(frame, state)
         seconds: dict[str, float] = {}
         with _timed(seconds, "initial pose"):
-            initial = self._initial_pose.predict(frame, state)
+            initial = _answer(self._initial_pose.predict(frame, state), self._initial_pose)
         relative = self._refine(frame, initial, state, seconds)
         if self._state is None and relative.ok:
             relative = self._restart(self._first, frame, relative, state)
@@ -189,7 +191,7 @@ class Odometry:
                 frame = replace(frame, scan=deskew(frame.scan, motion))
         self._compensated = frame.scan
         with _timed(seconds, "residual"):
-            relative = self._residual.refine(frame, initial)
+            relative = _answer(self._residual.refine(frame, initial), self._residual)
         return relative if turned is None or not relative.ok else relative.wider(added=turned)
 
     def _compare(
@@ -235,6 +237,15 @@ def _setup(config: Config, frame: Frame) -> Setup:
     noise = config.imu_noise or frame.imu_noise or ImuNoise()
     above_0(noise, *(field.name for field in fields(noise)))  # an IMU without noise is a simulator's only
     return Setup(config, frame.calibration or Calibration(), noise)
+
+
+def _answer(found: RelativePose, source: InitialPoseSource | ResidualSource) -> RelativePose:
+    """What a source of somebody's own answered, if it is what it should be."""
+    if not isinstance(found, RelativePose):
+        raise ConfigError(
+            f"the source {source.name!r} must answer with a RelativePose, not with {type(found).__name__}"
+        )
+    return found
 
 
 @contextmanager

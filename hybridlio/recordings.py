@@ -72,7 +72,7 @@ class Recording:
 
 
 def find_recordings(
-    data: Iterable[str | Path | Recording],
+    data: str | Path | Recording | Iterable[str | Path | Recording],
     sequence: str | None = None,
     reader: str | None = None,
     raw_root: str | Path | None = None,
@@ -85,18 +85,19 @@ def find_recordings(
     opened, and the others do not have to wait for that.
 
     Args:
-        data: paths, patterns (``drives/*``), or files that list them: ``.yaml`` with paths, or with mappings of
-            :class:`Recording`'s attributes but ``name``; or text with a path, and perhaps a sequence, a line. Paths in
-            a file start from its folder.
+        data: one or more of: paths, patterns (``drives/*``), or files that list them: ``.yaml`` with paths, or with
+            mappings of :class:`Recording`'s attributes but ``name``; or text with a path, and perhaps a sequence, a
+            line. Paths in a file start from its folder.
         sequence: which recordings, with commas between, where a path holds several.
         reader, raw_root, frames, vertical_angle_deg: for all that do not say their own.
 
     Raises:
-        ConfigError: there is not a single one, no such ``reader`` or ``raw_root``, ``frames`` is no range, or the angle
-            is over 5°.
+        ConfigError: there is not a single one, a pattern matches nothing, there is no such list file, ``reader`` or
+            ``raw_root``, ``frames`` is no range, or the angle is over 5°.
         DataError: a list file cannot be read, or is malformed.
     """
     check_options(raw_root=raw_root)
+    data = [data] if isinstance(data, str | Path | Recording) else data
     root = None if raw_root is None else str(raw_root)
     given = Recording("", sequence, reader, root, frames, vertical_angle_deg)
     wanted = [_with_defaults(item, given) for entry in data for item in _listed(entry)]
@@ -114,8 +115,13 @@ def _listed(entry: str | Path | Recording) -> Iterator[Recording]:
     path = Path(entry).expanduser()
     if path.is_file() and path.suffix in _YAML + _TEXT:
         yield from _read_list(path)
+    elif not path.exists() and path.suffix in _YAML + _TEXT:
+        raise ConfigError(f"{path}: no such list file")
     elif not path.exists() and glob.has_magic(str(path)):
-        yield from map(Recording, sorted(glob.glob(str(path))) or [str(path)])
+        matched = sorted(glob.glob(str(path)))
+        if not matched:
+            raise ConfigError(f"{path}: nothing matches this pattern")
+        yield from map(Recording, matched)
     else:
         yield Recording(str(path))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -27,6 +27,7 @@ _log = logging.getLogger(__name__)
 
 Progress = Callable[[int, int, float], None]
 
+_TOLD = 3  # scans that a run cannot start at, by warnings
 _FROM_IMU, _WITHOUT_IMU = "preintegration", "constant-velocity"
 
 
@@ -170,14 +171,23 @@ def _advance(run: Run, k: int) -> None:
             raise
         run.unreadable[k] = str(error)
         run.skipped += 1
-        _log.warning("frame %d: cannot start here, trying the next: %s", k, error)
+        level = logging.WARNING if run.skipped <= _TOLD else logging.INFO
+        more = "; -v tells of more scans like this" if run.skipped == _TOLD else ""
+        _log.log(level, "cannot start here, trying the next: %s%s", error, more)
         return
     run.reading_s.append(read)
     run.estimates.append(estimate)
     if estimate.agreement.verdict in ("down-weighted", "rejected", "relocated"):
         chi2, verdict = estimate.agreement.chi2, estimate.agreement.verdict
         _log.info("frame %d: %s: it and the IMU differ by χ² = %.0f (%.0f is the limit)", k, verdict, chi2, GATE)
+    elif estimate.relative is not None and not estimate.relative.ok and k not in run.unreadable:
+        _log.info("frame %d: bridged by the initial pose: %s", k, _why(estimate.relative.details))
     _log.debug("frame %d: %s", k, _described(estimate))
+
+
+def _why(details: Mapping[str, float]) -> str:
+    points = f"{details.get('points', 0.0):.0f} points"
+    return f"{details['matched']:.0%} of {points} match" if "matched" in details else f"{points} to match"
 
 
 def _described(estimate: Estimate) -> str:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 _ONLINE, _SMOOTHED = "odometry", "smoothed"
 _TOLD = 20
+_MANY = 0.1  # of all scans
 
 
 def write_run(folder: Path, run: Run, config: Config) -> Findings:
@@ -92,7 +93,7 @@ def notes(run: Run) -> list[str]:
 
 
 def disagreements(run: Run) -> list[str]:
-    """What was done with scans that contradict the IMU, in a line each; often none."""
+    """What was done with scans that contradict the IMU, in a line each, and what to check then; often none."""
     said = {
         "rejected": "left out, as they contradict the IMU",
         "relocated": "the map is followed from there, the jump left out, after contradicting the IMU once too often",
@@ -100,7 +101,13 @@ def disagreements(run: Run) -> list[str]:
         "trusted again": "taken as they are, as they contradict the IMU for longer than it is to be believed",
     }
     counts = {what: len(run.judged(cast("Verdict", verdict))) for verdict, what in said.items()}
-    return [f"{what}: {counted(count, 'scan')}" for what, count in counts.items() if count]
+    out = [f"{what}: {counted(count, 'scan')}" for what, count in counts.items() if count]
+    gross = len(run.judged("rejected")) + len(run.judged("trusted again"))
+    if gross > _MANY * len(run.estimates):
+        out.append(
+            "so many scans contradict the IMU that it may be its data that are wrong: check T_imu_lidar, units, clock"
+        )
+    return out
 
 
 def report_data(run: Run, config: Config, config_text: str) -> ReportData:
@@ -146,6 +153,7 @@ def metrics(run: Run, config: Config, evaluation: Evaluation | None) -> dict[str
         "notes": notes(run),
         "path_length_m": run.trajectory.length_m,
         "forward_speed_length_m": forward_speed_length_m(run),
+        "imu_path_length_m": imu_path_length_m(run),
         "seconds": run.seconds,
         "ms_per_scan": ms_per_scan(run),
         "pose_file_frame": run.sequence.pose_file_frame,
@@ -171,6 +179,12 @@ def forward_speed_length_m(run: Run) -> float | None:
         return None
     rows = slice(run.skipped, run.done)
     return float(np.trapezoid(speed[rows], run.sequence.stamps_ns[rows] / 1e9))
+
+
+def imu_path_length_m(run: Run) -> float:
+    """How far the IMU went; in bends that is another way than the lidar's, and the forward speed is of this one."""
+    poses = run.trajectory.poses @ se3.inverse(run.sequence.calibration.T_imu_lidar)
+    return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
 
 
 def write_smoothed(folder: Path, stored: run_folder.StoredRun, record: Record, smoothed: Smoothed) -> Findings:

@@ -38,6 +38,8 @@ class Scan:
     time_offsets_ns: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.stamp_ns, int | np.integer):
+            raise DataError(f"scan at {self.stamp_ns!r}: its stamp must be a whole number of nanoseconds")
         points = np.ascontiguousarray(self.points, dtype=np.float32)
         if points.ndim != 2 or points.shape[1] != 3:
             raise DataError(f"scan at {self.stamp_ns} ns: points must be (N, 3), got {points.shape}")
@@ -48,6 +50,8 @@ class Scan:
         for name, (values, dtype) in columns.items():
             if values is None:
                 continue
+            if dtype == np.int64 and np.asarray(values).dtype.kind not in "iu":
+                raise DataError(f"scan at {self.stamp_ns} ns: {name} must be whole nanoseconds, not of seconds")
             values = np.asarray(values, dtype=dtype)
             if values.shape != points.shape[:1]:
                 raise DataError(f"scan at {self.stamp_ns} ns: {name} must be ({len(points)},), got {values.shape}")

@@ -47,6 +47,7 @@ def compare(
     """Run every combination of sources over the same scans, and show them side by side."""
     from hybridlio.compare import combinations, table, write_comparison
     from hybridlio.compare import compare as run_all
+    from hybridlio.files import make_folder
 
     settings = common.settings(config)
     configs = combinations(
@@ -56,6 +57,8 @@ def compare(
         settings,
     )
     recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle)
+    if out is not None:
+        make_folder(out)  # before the work
     with progress("comparing") as tick:
         comparison = run_all(recording, configs, lambda name, done, total: tick(done, total, name))
     say_table(table(comparison))
@@ -67,6 +70,8 @@ def compare(
 
 def _finish(comparison: Comparison) -> None:
     """Say why runs ended early, a reason that they share once, and exit with the code that belongs to it."""
+    if comparison.stopped is not None:
+        common.fail(comparison.stopped)
     failed: dict[tuple[str, int], list[str]] = {}
     for row in comparison.rows:
         if row.error:

@@ -82,17 +82,21 @@ def _finish(folder: Path, run: Run, config: Config, is_latest: bool) -> None:
 def _say_result(folder: Path, run: Run, findings: Findings) -> None:
     from hybridlio.metrics_table import evaluation_table
     from hybridlio.run_folder import POSES, REPORT
-    from hybridlio.run_outputs import disagreements, forward_speed_length_m, ms_per_scan
+    from hybridlio.run_outputs import disagreements, forward_speed_length_m, imu_path_length_m, ms_per_scan
 
     metres, ms = run.trajectory.length_m, ms_per_scan(run).get("total")
-    speed = "" if ms is None else f", {ms:.0f} ms a scan"
+    speed = "" if ms is None else f", {ms:.0f} ms a scan without reading (median)"
     say(f"{run.sequence.name}: {counted(run.done, 'scan')}, {metres:.2f} m in {run.seconds:.1f} s{speed}")
     if (driven := forward_speed_length_m(run)) is not None:
-        say(f"by its own forward speed the vehicle drove {driven:.2f} m")
+        say(
+            f"by its own forward speed the vehicle drove {driven:.2f} m, by the estimate {imu_path_length_m(run):.2f} m"
+        )
     if run.bridged:
         say(f"bridged scans: {', '.join(map(str, run.bridged[:20]))}{' …' if len(run.bridged) > 20 else ''}")
     for line in disagreements(run):
         say(line)
+    for warning in (warning for e in findings.evaluations.values() for warning in e.warnings):
+        complain(f"warning: {warning}", "yellow")
     if findings.evaluations:
         say_table(evaluation_table(findings.evaluations))
     say(f"poses   {folder / POSES}")

@@ -49,7 +49,7 @@ def smooth(
     from hybridlio.keyframes import Keyframes
     from hybridlio.metrics_table import evaluation_table
     from hybridlio.record import Record
-    from hybridlio.run_folder import KEYFRAMES, POSES, RECORD, REPORT, SMOOTHED, is_run_folder, read_run
+    from hybridlio.run_folder import KEYFRAMES, POSES, RECORD, REPORT, SMOOTHED, new_run_folder, read_run
     from hybridlio.run_outputs import write_smoothed
 
     if not gps and not (antenna is None and outage is None and max_shift is None):
@@ -58,13 +58,14 @@ def smooth(
     folder = run / SMOOTHED if out is None else out
     if folder.resolve() == run.resolve():
         raise ConfigError(f"{folder} is the run itself; choose another folder with -o")
-    if out is not None and is_run_folder(out) and not overwrite:
-        raise ConfigError(f"{out} holds a run already; choose another folder, or --overwrite it")
     record = Record.load(run / RECORD)
     if loops:
         record = replace(record, keyframes=Keyframes.load(run / KEYFRAMES))
     start_ns = int(record.online.stamps_ns[0])
-    smoothed = _smooth(record, loops, gps and gps_options(antenna, max_shift, outage, start_ns), robust)
+    options = gps and gps_options(antenna, max_shift, outage, start_ns)
+    if out is not None:
+        new_run_folder(stored.metrics["sequence"], out, overwrite)
+    smoothed = _smooth(record, loops, options, robust)
     findings = write_smoothed(folder, stored, record, smoothed)
     error = (
         f"error {smoothed.error_before:.4g} before, {smoothed.error_after:.4g} after {smoothed.iterations} iterations"
@@ -74,6 +75,10 @@ def smooth(
         say(f"loops: {closed.summary()}")
     if (fit := smoothed.found.get("gps")) is not None:
         say(f"GPS: {fit.summary()}")
+        if fit.is_doubtful:
+            complain(
+                "warning: most fixes are rejected; check their sigma, the antenna and the clock (--max-shift)", "yellow"
+            )
     if not smoothed.converged:
         complain("warning: the optimiser stopped before the error had stopped falling", "yellow")
     if findings.evaluations:

@@ -160,8 +160,10 @@ def read_calibration_yaml(path: Path, needs_imu: bool = False) -> tuple[Calibrat
     """
     content = read_yaml(path) if path.is_file() else {}
     known = ("T_imu_lidar", "T_camera_lidar", "lidar", "antenna_imu_m")
-    if not isinstance(content, dict) or set(content) - set(known):
-        raise DataError(f"{path}: expected only the keys {', '.join(known)}; {_HOW_TO_CALIBRATE}")
+    if not isinstance(content, dict):
+        raise DataError(f"{path}: expected keys with values; {_HOW_TO_CALIBRATE}")
+    if unknown := [key for key in content if key not in known]:
+        raise DataError(f"{path}: unknown key {unknown[0]!r}; the keys are {', '.join(known)}")
     lidar = content.get("lidar")
     if lidar is not None and str(lidar) not in LIDAR_MODELS:
         raise DataError(f"{path}: unknown lidar {lidar!r}; known: {', '.join(LIDAR_MODELS)}")

@@ -76,6 +76,9 @@ class Sequence:
         if any(a.stamp_ns > b.stamp_ns for a, b in zip(self.gps, self.gps[1:], strict=False)):
             raise DataError(f"{self.name}: GPS fixes are not in time order; sort them by stamp")
 
+    def __repr__(self) -> str:
+        return f"Sequence({self.name!r}, {len(self)} scans, {len(self.imu)} inertial samples)"
+
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
@@ -103,7 +106,8 @@ class Sequence:
         """
         rows = slice(*slice(start, stop).indices(len(self))[:2])
         if rows.start >= rows.stop:
-            raise DataError(f"{self.name}: no scans from {start} to {stop}; there are {len(self)}")
+            ends = f"{'' if start is None else start}:{'' if stop is None else stop}"
+            raise DataError(f"{self.name}: no scans in {ends}; there are {len(self)}")
         before = int(self.stamps_ns[rows.start - 1]) if rows.start else self._first_stamp_ns() - 1
         reference = self.reference
         if reference is not None:

@@ -72,7 +72,10 @@ def read_stamps(path: Path) -> Stamps:
 
 
 def increasing(stamps: Stamps) -> NDArray[np.intp]:
-    """Indices of a longest strictly increasing part of ``stamps``: what is left when the fewest are dropped."""
+    """Indices of a longest strictly increasing part of ``stamps``: what is left when the fewest are dropped.
+
+    Of rows with the same stamp the first is kept: whoever writes one twice has missed the second's own.
+    """
     if (np.diff(stamps) > 0).all():
         return np.arange(len(stamps))
     tails: list[int] = []  # smallest last stamp of an increasing run, by its length
@@ -80,6 +83,9 @@ def increasing(stamps: Stamps) -> NDArray[np.intp]:
     before: list[int] = []
     for k, stamp in enumerate(stamps.tolist()):
         length = bisect_left(tails, stamp)
+        if tails[length : length + 1] == [stamp]:
+            before.append(-1)
+            continue
         before.append(tail_at[length - 1] if length else -1)
         tails[length : length + 1] = [stamp]
         tail_at[length : length + 1] = [k]

@@ -159,7 +159,7 @@ def test_too_few_fixes_are_a_clear_error(drive: Any):
     record = with_fixes(drive, 1)
     with pytest.raises(EstimationError, match=r"2 of 2 GPS fixes lie in the run's time; 3 are needed"):
         smooth(replace(record, gps=record.gps[5:7]), gps=True)
-    with pytest.raises(EstimationError, match="no GPS fixes to place the run on"):
+    with pytest.raises(EstimationError, match="no GPS fixes in the run's time"):
         smooth(replace(record, gps=()), gps=True)
 
 
@@ -190,3 +190,13 @@ def test_the_plumb_factors_jacobian_agrees_with_differences(drive: Any):
 def test_the_same_group_goes_with_others(drive: Any):
     record = with_fixes(drive, 1)
     assert set(smooth(record, groups=[GpsGroup(record)]).found) == {"gps"}
+
+
+def test_fixes_that_are_mostly_rejected_are_doubtful_and_count_as_used_only_where_they_are(drive: Any):
+    record = with_fixes(drive, 1, shift_s=0.0)
+    fit = smooth(record, gps=GpsOptions(max_shift_s=0.0)).found["gps"]
+    assert not fit.is_doubtful
+    wrong = fit.used & (np.arange(len(fit.used)) % 5 != 0)
+    doubted = replace(fit, weights=np.where(wrong, 0.0, fit.weights))
+    assert doubted.is_doubtful
+    assert f"{int((fit.used & ~wrong & (fit.weights >= 0.1)).sum())} of {len(fit.used)} fixes used" in doubted.summary()

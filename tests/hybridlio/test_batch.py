@@ -205,7 +205,7 @@ def test_what_one_recording_lacks_fails_for_it_alone(two, tmp_path):
     beyond = Recording(two[0].path, frames="900:", name="beyond")
     done = run_batch((beyond, two[0]), tmp_path, QUICK, engine="threading")
     assert statuses(done) == [FAILED, DONE]
-    assert "no scans from 900" in done.rows[0].reason
+    assert "no scans in 900:" in done.rows[0].reason
 
 
 def test_a_fault_is_one_recordings_reason_and_its_log_shows_where(two, tmp_path, monkeypatch):

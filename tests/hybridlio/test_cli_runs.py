@@ -2,6 +2,7 @@
 
 import errno
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -171,3 +172,23 @@ def test_a_reason_that_combinations_share_is_said_once(tiny_drive, monkeypatch):
                    "--backend", "incremental", "--frames", ":3")  # fmt: skip
     assert "kalman + none, identity + none ended after" in said
     assert said.count("error: ") == 1
+
+
+def test_scans_that_are_bridged_are_logged_with_the_reason(tiny_drive, tmp_path, without_pages):
+    few = tmp_path / "few.yaml"
+    few.write_text("{initial_pose: identity, scan_matching: {min_matched: 0.999}}")
+    said = run("odometry", tiny_drive, "--config", few, "--frames", ":6", "-v", "-o", tmp_path / "run").stderr
+    assert re.search(r"frame 3: bridged by the initial pose: \d+% of \d+ points match", said)
+
+
+def test_a_recording_that_cannot_be_started_at_is_told_of_a_few_times(tiny_drive, tmp_path):
+    many = tmp_path / "many.yaml"
+    many.write_text("scan_matching: {min_points: 10000000}")
+    said = run("odometry", tiny_drive, "--config", many, "-o", tmp_path / "run").stderr
+    assert said.count("cannot start here") == 3
+    assert "no scan to start at" in said
+
+
+def test_the_way_is_that_of_the_unit_that_the_forward_speed_is_of(finished_run):
+    figures = json.loads((finished_run / "metrics.json").read_text())
+    assert figures["imu_path_length_m"] == pytest.approx(figures["forward_speed_length_m"], rel=0.01)

@@ -111,10 +111,13 @@ def test_progress_counts_over_all_runs_and_an_interrupt_ends_the_comparison(sequ
         if done == 15:
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        compare(sequence, combinations(SOURCES, ["none"], ["incremental"], Config()), show)
+    found = compare(sequence, combinations([*SOURCES, "kalman"], ["none"], ["incremental"], Config()), show)
+    assert isinstance(found.stopped, KeyboardInterrupt)
+    assert [(row.initial_pose, row.scans, row.error) for row in found.rows] == [
+        (SOURCES[0], 12, None), (SOURCES[1], 3, "interrupted"),
+    ]  # fmt: skip
     assert [done for _, done, _ in told] == list(range(1, 16))
-    assert {total for _, _, total in told} == {24}
+    assert {total for _, _, total in told} == {36}
     assert told[-1][0] == "constant-velocity + none"
 
 

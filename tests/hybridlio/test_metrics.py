@@ -157,3 +157,9 @@ def test_the_table_has_a_line_for_each_figure_and_a_column_for_each_run(rng: np.
         assert value in line
         # the reference has no covariances to judge
         assert figures(bare).get(heading, "–") in line
+
+
+def test_without_a_reference_there_is_one_clear_error():
+    path = Trajectory(np.arange(3), np.tile(np.eye(4), (3, 1, 1)))
+    with pytest.raises(DataError, match="no reference to compare with"):
+        evaluate(None, path)

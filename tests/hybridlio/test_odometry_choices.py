@@ -118,3 +118,18 @@ def test_an_imu_without_noise_is_refused_and_named(frames: list[Frame]):
         silent = replace(ImuNoise(), **{name: 0.0})
         with pytest.raises(ConfigError, match=f"ImuNoise.{name}: must be above 0, got 0"):
             Odometry(config=Config(imu_noise=silent)).step(frames[0])
+
+
+def test_what_is_no_answer_and_no_configuration_is_named(frames: list[Frame]):
+    class Bare(Identity):
+        name = "bare"
+
+        def predict(self, frame: Frame, state: State) -> RelativePose:
+            return super().predict(frame, state).pose  # type: ignore[return-value]
+
+    odometry = Odometry(initial_pose=Bare())
+    odometry.step(frames[0])
+    with pytest.raises(ConfigError, match="source 'bare' must answer with a RelativePose, not with ndarray"):
+        odometry.step(frames[1])
+    with pytest.raises(ConfigError, match="load_config reads one"):
+        Odometry(config="my.yaml")  # type: ignore[arg-type]

@@ -129,3 +129,13 @@ def test_recordings_of_one_name_get_names_of_their_own_that_depend_on_nothing_el
 def test_names_are_good_for_folders():
     (odd,) = find_recordings([Recording("/nowhere/../a b:c")])
     assert odd.name == "a_b_c"
+
+
+def test_a_single_path_as_text_is_one_recording_and_not_its_letters(drives):
+    assert names(find_recordings(str(drives / "north"))) == ["north"]
+
+
+@pytest.mark.parametrize(("given", "words"), [("none.yaml", "no such list file"), ("nope/*", "nothing matches")])
+def test_a_list_or_pattern_that_stands_for_nothing_is_refused(tmp_path, given, words):
+    with pytest.raises(ConfigError, match=words):
+        find_recordings([tmp_path / given])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hybridlio import se3
+from hybridlio.agreement import Agreement
 from hybridlio.config import Config
 from hybridlio.datasets.sequence import Sequence, part_of
 from hybridlio.errors import ConfigError, DataError, GraphError
@@ -18,7 +19,7 @@ from hybridlio.packing import PackedCloud
 from hybridlio.record import Record
 from hybridlio.record_maker import RecordMaker
 from hybridlio.run import Run, run_odometry
-from hybridlio.run_outputs import write_run
+from hybridlio.run_outputs import notes, write_run
 from hybridlio.sensors import Scan
 
 
@@ -196,5 +197,14 @@ def test_without_a_range_the_recording_is_whole(sequence):
     ("text", "error"), [("5", ConfigError), ("1:2:3", ConfigError), ("a:b", ConfigError), ("9:9", DataError)]
 )
 def test_a_range_that_is_none_or_holds_no_scan_is_refused(text, error, sequence):
-    with pytest.raises(error, match=r"range such as|no scans from"):
+    with pytest.raises(error, match=r"range such as|no scans in"):
         part_of(sequence, text)
+
+
+def test_an_imu_that_many_scans_contradict_is_named_as_what_may_be_wrong(whole):
+    estimates = list(whole.estimates)
+    for count, told in ((1, False), (5, True)):
+        doubted = [replace(e, agreement=Agreement("trusted again", 1e3)) for e in estimates[-count:]]
+        said = notes(replace(whole, estimates=[*estimates[:-count], *doubted]))
+        assert f"{count} scan" in said[0]
+        assert ("check T_imu_lidar, units, clock" in said[-1]) == told

@@ -157,3 +157,12 @@ def test_beams_of_each_lidar_go_from_the_top_down(name: str) -> None:
     assert model.name == name
     assert model.beams == {"hdl-64e": 64, "32-beam": 32, "16-beam": 16}[name]
     assert (np.diff(model.elevations_deg) < 0).all()
+
+
+@pytest.mark.parametrize(
+    ("stamp", "offsets", "says"),
+    [(1.5, None, "whole number of nanoseconds"), ("1", None, "whole number"), (1, [0.0, 0.05], "whole nanoseconds")],
+)
+def test_times_in_seconds_are_refused_where_nanoseconds_are_meant(stamp, offsets, says) -> None:
+    with pytest.raises(DataError, match=says):
+        Scan(stamp, np.zeros((2, 3), np.float32), time_offsets_ns=None if offsets is None else np.array(offsets))

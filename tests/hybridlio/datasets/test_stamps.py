@@ -75,3 +75,8 @@ def test_scans_that_lie_many_seconds_apart_are_noted_as_perhaps_in_another_unit(
         notes = Notes("ride")
         note_gaps((np.arange(5) * step_s * 1e9).astype(np.int64), "scans", notes, factor=1.5)
         assert len([text for text in notes.texts if "are in seconds" in text]) == told
+
+
+def test_of_equal_stamps_the_first_is_kept() -> None:
+    assert increasing(np.array([0, 1, 2, 2, 4])).tolist() == [0, 1, 2, 4]
+    assert increasing(np.array([0, 0, 0, 3])).tolist() == [0, 3]
