@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from hybridlio.gps import GpsOptions
     from hybridlio.graph.offline import Smoothed
     from hybridlio.record import Record
+    from hybridlio.report_data import Findings
 
 
 @guarded
@@ -47,9 +48,8 @@ def smooth(
 ) -> None:
     """Optimise all poses of a finished run at once, and leave the better trajectory with a report of its own."""
     from hybridlio.keyframes import Keyframes
-    from hybridlio.metrics_table import evaluation_table
     from hybridlio.record import Record
-    from hybridlio.run_folder import KEYFRAMES, POSES, RECORD, REPORT, SMOOTHED, new_run_folder, read_run
+    from hybridlio.run_folder import KEYFRAMES, RECORD, SMOOTHED, new_run_folder, read_run
     from hybridlio.run_outputs import write_smoothed
 
     if not gps and not (antenna is None and outage is None and max_shift is None):
@@ -67,10 +67,17 @@ def smooth(
         new_run_folder(stored.metrics["sequence"], out, overwrite)
     smoothed = _smooth(record, loops, options, robust)
     findings = write_smoothed(folder, stored, record, smoothed)
+    _say_result(folder, stored.metrics["sequence"], smoothed, findings)
+
+
+def _say_result(folder: Path, sequence: str, smoothed: Smoothed, findings: Findings) -> None:
+    from hybridlio.metrics_table import evaluation_table
+    from hybridlio.run_folder import POSES, REPORT
+
     error = (
         f"error {smoothed.error_before:.4g} before, {smoothed.error_after:.4g} after {smoothed.iterations} iterations"
     )
-    say(f"{stored.metrics['sequence']}: {len(smoothed.trajectory)} poses, {error}")
+    say(f"{sequence}: {len(smoothed.trajectory)} poses, {error}")
     if (closed := smoothed.found.get("loops")) is not None:
         say(f"loops: {closed.summary()}")
     if (fit := smoothed.found.get("gps")) is not None:
