@@ -112,11 +112,15 @@ class _Fit:
     def _at(self, shift_s: float) -> NDArray[np.int64]:
         return self._stamps + round(shift_s * NS_PER_S)
 
+    def _too_few(self, count: int) -> EstimationError:
+        return EstimationError(
+            f"{count} of {len(self._stamps)} GPS fixes lie in the run's time; {_LEAST_FIXES} are needed; where their "
+            "clock is another, allow a larger shift (--max-shift)"
+        )
+
     def best_shift(self, most_s: float) -> float:
         grid = np.linspace(-most_s, most_s, 2 * math.ceil(most_s / _GRID_S) + 1)
-        # the same fixes for every shift, or leaving out some would look like fitting better
-        kept = self._path.covers(self._at(-most_s)) & self._path.covers(self._at(most_s))
-        kept = kept if kept.sum() >= _LEAST_FIXES else self._path.covers(self._stamps)
+        grid, kept = self._comparable(grid)
         rows = np.flatnonzero(kept)
         pieces = np.array_split(rows, max(len(rows) // _WINDOW, 1))
 
@@ -128,13 +132,27 @@ class _Fit:
             return len(rows) * float(np.log(bounded * scale)) + (shift_s / most_s) ** 2
 
         if len(rows) < _LEAST_FIXES:
-            raise EstimationError(
-                f"{len(rows)} of {len(self._stamps)} GPS fixes lie in the run's time; {_LEAST_FIXES} are needed"
-            )
+            raise self._too_few(len(rows))
         costs = [cost(float(shift)) for shift in grid]
         k = int(np.argmin(costs))
         ends = float(grid[max(k - 1, 0)]), float(grid[min(k + 1, len(grid) - 1)])
         return float(minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": 1e-4}).x)
+
+    def _comparable(self, grid: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Shifts, and the fixes to compare them by: the same for all, or leaving out some would look like a better fit.
+
+        Where hardly any fix stays in the run's time whatever the shift, they are those of the time at no shift; or, if
+        more are in it at another, as by a clock that is far off, those, at the shifts that keep them there.
+        """
+        always = self._path.covers(self._at(grid[0])) & self._path.covers(self._at(grid[-1]))
+        if always.sum() >= _LEAST_FIXES:
+            return grid, always
+        covered = np.array([self._path.covers(self._at(float(shift))) for shift in grid])
+        nearest = np.argsort(np.abs(grid), kind="stable")
+        most = nearest[covered[nearest].sum(axis=1).argmax()]
+        if most == nearest[0]:
+            return grid, covered[most]
+        return grid[covered[:, covered[most]].all(axis=1)], covered[most]
 
     def _robust(self, points: Array, fixes: Array) -> tuple[Array, Array, Array]:
         """Rigid motion, weights and squared distances, by Geman-McClure weights whose width shrinks to the spread."""
@@ -164,9 +182,7 @@ class _Fit:
         stamps = self._at(shift_s)
         used = self._path.covers(stamps)
         if used.sum() < _LEAST_FIXES:
-            raise EstimationError(
-                f"{used.sum()} of {len(stamps)} GPS fixes lie in the run's time; {_LEAST_FIXES} are needed"
-            )
+            raise self._too_few(int(used.sum()))
         points, velocities = self._path.points(stamps[used], self._lever)
         T, _, squares = self._robust(points, self._fixes[used])
         spread2 = max(float(np.median(squares)) / _MEDIAN_NORM**2, 1e-8)

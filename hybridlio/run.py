@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 
 import numpy as np
@@ -20,13 +20,14 @@ from hybridlio.metrics import Steps
 from hybridlio.odometry import Estimate, Odometry
 from hybridlio.packing import PackedList
 from hybridlio.record import Record
-from hybridlio.sensors import Frame
+from hybridlio.sensors import NS_PER_S, Frame
 from hybridlio.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
 
 Progress = Callable[[int, int, float], None]
 
+_CLOCKS_APART_NS = 30 * NS_PER_S  # GPS time and UTC are 18 s apart
 _TOLD = 3  # scans that a run cannot start at, by warnings
 _FROM_IMU, _WITHOUT_IMU = "preintegration", "constant-velocity"
 
@@ -119,9 +120,13 @@ class Run:
 
     @property
     def record(self) -> Record | None:
-        """What smoothing needs; None for less than two estimates."""
-        # an interrupt between the two may leave the odometry one scan ahead
-        return self.odometry.record(len(self.estimates)) if len(self.estimates) > 1 else None
+        """What smoothing needs, with fixes that another clock may have stamped; None for less than two estimates."""
+        if len(self.estimates) < 2:
+            return None
+        record = self.odometry.record(len(self.estimates))  # an interrupt may have left it one scan ahead
+        begin, end = (int(stamp) for stamp in record.online.stamps_ns[[0, -1]])
+        near = (fix for fix in self.sequence.gps if begin - _CLOCKS_APART_NS <= fix.stamp_ns <= end + _CLOCKS_APART_NS)
+        return replace(record, gps=tuple(near))
 
 
 def run_odometry(sequence: Sequence, odometry: Odometry, progress: Progress | None = None) -> Run:

@@ -78,6 +78,14 @@ def test_a_shift_within_any_bound_is_found(record: Record, most_s: float, shift_
     assert fit.shift_s == pytest.approx(shift_s, abs=0.002)
 
 
+@pytest.mark.parametrize("apart_s", [18.0, -18.0])
+def test_the_clock_of_gps_which_is_18_s_before_utc_is_found_where_so_much_is_allowed(record: Record, apart_s: float):
+    fixes = tuple(replace(fix, stamp_ns=fix.stamp_ns + round(apart_s * 1e9)) for fix in record.gps)
+    fit = georeference(replace(record, gps=fixes), max_shift_s=20.0).alignment
+    assert fit.shift_s == pytest.approx(SHIFT_S - apart_s, abs=0.005)
+    assert fit.inliers.sum() == len(fixes) - 1
+
+
 def test_what_is_written_is_read_again_and_lies_where_the_fixes_do(record: Record, tmp_path: Path):
     placed = georeference(record)
     assert [path.name for path in write_georeferenced(tmp_path, placed)] == [POSES_ENU, TABLE, MAP]

@@ -20,7 +20,7 @@ from hybridlio.record import Record
 from hybridlio.record_maker import RecordMaker
 from hybridlio.run import Run, run_odometry
 from hybridlio.run_outputs import notes, write_run
-from hybridlio.sensors import Scan
+from hybridlio.sensors import GpsFix, Scan
 
 
 @pytest.fixture(scope="module")
@@ -208,3 +208,10 @@ def test_an_imu_that_many_scans_contradict_is_named_as_what_may_be_wrong(whole):
         said = notes(replace(whole, estimates=[*estimates[:-count], *doubted]))
         assert f"{count} scan" in said[0]
         assert ("check T_imu_lidar, units, clock" in said[-1]) == told
+
+
+def test_fixes_by_another_clock_stay_with_the_run_for_smoothing_to_place(sequence):
+    stamps = [sequence.stamps_ns[0] + round(seconds * 1e9) for seconds in (-40, -18, 1, 18, 40)]
+    fixes = tuple(GpsFix(int(stamp), np.zeros(3), np.eye(3)) for stamp in stamps)
+    run = run_odometry(replace(sequence, gps=fixes), Odometry(residual="none"))
+    assert run.record.gps == fixes[1:4]
