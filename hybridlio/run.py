@@ -46,6 +46,7 @@ class Run:
         reading_s: seconds spent reading, one for each estimate.
         seconds: wall time of the whole loop.
         stopped: what stopped the run before its end, such as a KeyboardInterrupt; None for a whole one.
+        points_before: of the last scan that was read.
     """
 
     sequence: Sequence
@@ -56,6 +57,7 @@ class Run:
     reading_s: list[float] = field(default_factory=list)
     seconds: float = 0.0
     stopped: BaseException | None = None
+    points_before: NDArray[np.float32] | None = field(default=None, repr=False)
 
     @property
     def done(self) -> int:
@@ -207,7 +209,11 @@ def _described(estimate: Estimate) -> str:
 
 def _frame(run: Run, k: int) -> Frame:
     try:
-        return run.sequence[k]
+        frame = run.sequence[k]
+        before, run.points_before = run.points_before, frame.scan.points
+        if len(frame.scan) and before is not None and np.array_equal(frame.scan.points, before):
+            raise DataError("its points are those of the scan before, to the last bit")  # delivered twice
+        return frame
     except DataError as error:
         run.unreadable[k] = str(error)
         if run.estimates:

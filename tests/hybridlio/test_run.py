@@ -215,3 +215,11 @@ def test_fixes_by_another_clock_stay_with_the_run_for_smoothing_to_place(sequenc
     fixes = tuple(GpsFix(int(stamp), np.zeros(3), np.eye(3)) for stamp in stamps)
     run = run_odometry(replace(sequence, gps=fixes), Odometry(residual="none"))
     assert run.record.gps == fixes[1:4]
+
+
+def test_a_scan_that_is_delivered_twice_is_bridged_and_told(sequence, caplog):
+    again = with_scans(sequence, {6: replace(sequence.load_scan(5), stamp_ns=int(sequence.stamps_ns[6]))})
+    run = run_odometry(again, Odometry())
+    assert run.bridged == [6]
+    assert "frame 6: bridged by the initial pose: its points are those of the scan before" in caplog.text
+    assert end_error_m(run) < 0.3
