@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.errors import DataError
-from hybridlio.files import write_whole
+from hybridlio.files import alone_in, write_whole
 from hybridlio.geodesy import origin_of
 from hybridlio.sensors import NS_PER_S, Scan
 from hybridlio.simulation.config import SimulationConfig
@@ -57,7 +57,8 @@ def simulate(out: Path, config: SimulationConfig, progress: Progress | None = No
         rows (``…_extract``).
 
     Raises:
-        DataError: ``out`` holds a drive of this seed with other settings, or the pose file is malformed.
+        DataError: ``out`` holds a drive of this seed with other settings or cannot be written to, or the pose file is
+            malformed.
         ConfigError: there is no such pose file.
     """
     description = describe(config)
@@ -67,15 +68,26 @@ def simulate(out: Path, config: SimulationConfig, progress: Progress | None = No
         return done.sync
     partial = DriveFolders(Path(out) / f".partial-{_fingerprint(description)}", done.number)
     drive = plan(config)
+    with alone_in(partial.root):
+        if not done.sync.exists():  # another process may have made it meanwhile
+            _write(partial, drive, config, progress)
+            _move(partial, done)
+        shutil.rmtree(partial.root, ignore_errors=True)
+    return done.sync
+
+
+def _write(partial: DriveFolders, drive: Drive, config: SimulationConfig, progress: Progress | None) -> None:
     _write_measurements(partial, drive, config)
     _write_scans(partial, drive, config, progress)
-    write_whole(partial.sync / "simulation.json", json.dumps(description, indent=2) + "\n")
+    write_whole(partial.sync / "simulation.json", json.dumps(describe(config), indent=2) + "\n")
+
+
+def _move(partial: DriveFolders, done: DriveFolders) -> None:
+    """Move a drive into its place, what says that it is there last."""
     write_calibration(done.date)
     for source, target in ((partial.extract, done.extract), (partial.sync, done.sync)):
         shutil.rmtree(target, ignore_errors=True)
         source.rename(target)
-    shutil.rmtree(partial.root)
-    return done.sync
 
 
 def describe(config: SimulationConfig) -> dict[str, Any]:

@@ -1,6 +1,8 @@
 import json
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Barrier
 
 import numpy as np
 import pytest
@@ -77,6 +79,19 @@ def test_an_interrupted_drive_shows_nothing_and_goes_on_to_the_same_bytes(tmp_pa
     drive = simulate(tmp_path / "a", SMALL, lambda *a: calls.append(a))
     assert (drive / "velodyne_points/data" / scan.name).stat().st_mtime_ns == written
     assert calls == [(k, 6) for k in range(1, 7)]
+    assert contents(drive.parent) == contents(simulate(tmp_path / "b", SMALL).parent)
+    assert [p.name for p in (tmp_path / "a").iterdir()] == [DATE]
+
+
+def test_processes_that_simulate_one_drive_at_once_make_it_once(tmp_path: Path):
+    ready = Barrier(3)
+
+    def begin(_: int) -> Path:
+        ready.wait()
+        return simulate(tmp_path / "a", SMALL)
+
+    with ThreadPoolExecutor(3) as runs:
+        (drive,) = set(runs.map(begin, range(3)))
     assert contents(drive.parent) == contents(simulate(tmp_path / "b", SMALL).parent)
     assert [p.name for p in (tmp_path / "a").iterdir()] == [DATE]
 
