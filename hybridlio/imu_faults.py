@@ -32,6 +32,12 @@ def spikes(imu: ImuSamples) -> NDArray[np.intp]:
     return found if len(found) <= max(1, _MOST_SPIKES * len(imu)) else found[:0]
 
 
+def without_spikes(imu: ImuSamples) -> tuple[ImuSamples, NDArray[np.int64]]:
+    """The samples without :func:`spikes`, and the stamps of these."""
+    rows = spikes(imu)
+    return _those(imu, np.delete(np.arange(len(imu)), rows)) if len(rows) else imu, imu.stamps_ns[rows]
+
+
 def filled_gaps(imu: ImuSamples) -> list[tuple[int, int]]:
     """First and last row of every stretch in which all six channels run along straight lines.
 
@@ -64,5 +70,8 @@ def without_filled_gaps(imu: ImuSamples) -> tuple[ImuSamples, list[tuple[int, in
     gaps = filled_gaps(imu)
     for first, last in gaps:
         keep[first + 1 : last] = False
-    rest = ImuSamples(imu.stamps_ns[keep], imu.gyro_rad_s[keep], imu.accel_m_s2[keep])
-    return rest, [(int(imu.stamps_ns[a]), int(imu.stamps_ns[b])) for a, b in gaps]
+    return _those(imu, keep), [(int(imu.stamps_ns[a]), int(imu.stamps_ns[b])) for a, b in gaps]
+
+
+def _those(imu: ImuSamples, rows: NDArray[np.bool_] | NDArray[np.intp]) -> ImuSamples:
+    return ImuSamples(imu.stamps_ns[rows], imu.gyro_rad_s[rows], imu.accel_m_s2[rows])

@@ -152,10 +152,8 @@ def evaluate(
     Raises:
         DataError: there is no reference, the two share less than two moments, or the steps do not fit the estimate.
     """
-    if reference is None:
-        raise DataError("there is no reference to compare with: the recording came without")
     _check_steps(steps, estimate)
-    both = associate(reference, estimate, max_difference_ns)
+    both = associate(_known(reference), estimate, max_difference_ns)
     drift = kitti_drift(both.reference, both.estimate)
     chosen = _chosen_drift(both, lengths_m, bool(len(drift)))
     shown = drift if len(drift) or chosen is None else chosen
@@ -193,6 +191,12 @@ def evaluate(
         pose_consistency=poses,
         step_consistency=step,
     )
+
+
+def _known(reference: Trajectory | None) -> Trajectory:
+    if reference is None:
+        raise DataError("there is no reference to compare with: the recording came without")
+    return reference
 
 
 def _check_steps(steps: Steps | None, estimate: Trajectory) -> None:

@@ -8,14 +8,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from hybridlio.datasets import folder, kitti_odometry, kitti_raw
 from hybridlio.datasets.sequence import Notes, Sequence
 from hybridlio.datasets.vertical_angle import check_angle
 from hybridlio.errors import ConfigError, DataError
-from hybridlio.imu_faults import spikes
-from hybridlio.sensors import NS_PER_S, ImuSamples
+from hybridlio.imu_faults import without_spikes
+from hybridlio.sensors import NS_PER_S
 from hybridlio.tables import counted
 
 
@@ -74,17 +72,15 @@ def open_sequence(
 
 def _without_spikes(sequence: Sequence) -> Sequence:
     """The sequence without inertial samples that nobody measured, which is noted."""
-    imu, rows = sequence.imu, spikes(sequence.imu)
-    if not len(rows):
+    imu, left_out_ns = without_spikes(sequence.imu)
+    if not len(left_out_ns):
         return sequence
     notes = Notes(sequence.name, list(sequence.notes))
-    after_s = (imu.stamps_ns[rows[0]] - sequence.stamps_ns[0]) / NS_PER_S
+    after_s = (left_out_ns[0] - sequence.stamps_ns[0]) / NS_PER_S
     notes.add(
-        f"left out {counted(len(rows), 'inertial sample')} far off those around, the first {after_s:.2f} s after the "
-        "first scan"
+        f"left out {counted(len(left_out_ns), 'inertial sample')} far off those around, the first {after_s:.2f} s after "
+        "the first scan"
     )
-    keep = np.delete(np.arange(len(imu)), rows)
-    imu = ImuSamples(imu.stamps_ns[keep], imu.gyro_rad_s[keep], imu.accel_m_s2[keep])
     return replace(sequence, imu=imu, notes=tuple(notes.texts))
 
 

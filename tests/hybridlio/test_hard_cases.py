@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from hybridlio.estimates import RelativePose
 from hybridlio.odometry import Odometry
 from hybridlio.run import Run, run_odometry
 from hybridlio.scan_matching import ScanMatching, SeenScan
-from hybridlio.sensors import Frame
+from hybridlio.sensors import Frame, Scan
 from hybridlio.simulation.faults import block_sector, drop_scans, imu_bias, imu_gap
 from hybridlio.simulation.scenarios import open_scenario
 from hybridlio.start_search import best_start
@@ -114,3 +115,32 @@ def test_after_a_scan_that_failed_the_motion_is_searched_anew(sequence: Sequence
     matching.take_back(unsure)
     matching.refine(sequence[3], unsure)
     assert len(searches) == 2
+
+
+def guess(pose: np.ndarray, sigma_rad: float = 0.01, sigma_m: float = 0.1) -> RelativePose:
+    return RelativePose(pose, np.diag(np.r_[np.full(3, sigma_rad), np.full(3, sigma_m)] ** 2), "guess")
+
+
+def test_scans_are_found_on_from_where_they_were_though_the_imu_leads_elsewhere(sequence: Sequence):
+    """Their steps contradict a wrong IMU, and are left out; the map is not lost for that."""
+    assert sequence.reference is not None
+    true, matching, whole = sequence.reference.poses, ScanMatching(), np.eye(4)
+    matching.start(sequence[0])
+    for k in range(1, 6):
+        whole = whole @ matching.refine(sequence[k], guess(se3.between(true[k - 1], true[k]))).pose
+    wrong = se3.exp(np.array([0.1, 0.2, 0.6, 1.0, 0.5, 0.0]))
+    for k in range(6, 12):
+        found = matching.refine(sequence[k], guess(wrong))
+        assert found.ok
+        off = se3.log(se3.between(whole @ found.pose, true[k]))
+        assert np.linalg.norm(off[:3]) < np.deg2rad(0.3)
+        assert np.linalg.norm(off[3:]) < 0.1
+        matching.take_back(guess(wrong))
+        whole = whole @ wrong
+
+
+def test_a_search_among_motions_under_which_nothing_matches_ends_without_one(sequence: Sequence):
+    matching, frame = ScanMatching(), sequence[1]
+    matching.start(sequence[0])
+    far = Scan(frame.scan.stamp_ns, frame.scan.points / 30 + np.array([0.0, 0.0, 60.0], np.float32))
+    assert not matching.refine(replace(frame, scan=far), guess(np.eye(4), 3.0, 30.0)).ok

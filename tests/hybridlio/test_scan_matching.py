@@ -291,30 +291,3 @@ def test_a_first_scan_of_one_beam_is_no_map_and_the_next_one_is(sequence: Sequen
     matching.start(with_points(frames[0], ring))
     known = [matching.refine(frames[k], guess(true_pose(sequence, k - 1, k))).ok for k in (1, 2, 3)]
     assert known == [False, True, True]
-
-
-def test_scans_are_found_on_from_where_they_were_though_the_imu_leads_elsewhere(
-    sequence: Sequence, frames: list[Frame]
-):
-    """Their steps contradict a wrong IMU, and are left out; the map is not lost for that."""
-    matching, whole = ScanMatching(), np.eye(4)
-    matching.start(frames[0])
-    for k in range(1, 6):
-        whole = whole @ matching.refine(frames[k], guess(true_pose(sequence, k - 1, k))).pose
-    wrong = se3.exp(np.array([0.1, 0.2, 0.6, 1.0, 0.5, 0.0]))
-    for k in range(6, 12):
-        found = matching.refine(frames[k], guess(wrong))
-        assert found.ok
-        degrees, metres = error(whole @ found.pose, true_pose(sequence, 0, k))
-        assert degrees < 0.3
-        assert metres < 0.1
-        matching.take_back(guess(wrong))
-        whole = whole @ wrong
-
-
-def test_a_search_among_motions_under_which_nothing_matches_ends_with_one_of_them(frames: list[Frame]):
-    matching = ScanMatching()
-    matching.start(frames[0])
-    unknown = guess(np.eye(4), unknown_motion_covariance(0.1))
-    far = with_points(frames[1], frames[1].scan.points / 30 + np.array([0.0, 0.0, 60.0]))
-    assert not matching.refine(far, unknown).ok
