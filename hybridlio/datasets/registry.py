@@ -78,8 +78,8 @@ def _without_spikes(sequence: Sequence) -> Sequence:
     notes = Notes(sequence.name, list(sequence.notes))
     after_s = (left_out_ns[0] - sequence.stamps_ns[0]) / NS_PER_S
     notes.add(
-        f"left out {counted(len(left_out_ns), 'inertial sample')} far off those around, the first {after_s:.2f} s after "
-        "the first scan"
+        f"left out {counted(len(left_out_ns), 'inertial sample')} far off those around, the first {after_s:.2f} s "
+        "after the first scan"
     )
     return replace(sequence, imu=imu, notes=tuple(notes.texts))
 
