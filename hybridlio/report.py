@@ -22,7 +22,7 @@ from hybridlio.report_data import DrawnPath, Findings, ReportData, find
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Findings", "ReportData", "find", "pictures", "write_report"]
+__all__ = ["Findings", "ReportData", "draw", "find", "pictures", "write_report"]
 
 _PACKAGES = ("numpy", "scipy", "gtsam", "small_gicp", "open3d", "torch", "filterpy")
 _FRAMES_LISTED = 200
@@ -40,22 +40,27 @@ def write_report(
         path: the HTML file.
         data: the run.
         findings: of the same data, where they are computed already.
-        drawn: its :func:`pictures` as PNG, where they are drawn already.
+        drawn: its pictures, as :func:`draw` makes them, where they are drawn already.
 
     Raises:
         DataError: the place cannot be written to.
     """
     import jinja2
 
-    from hybridlio.plots import to_png
-
     findings = find(data) if findings is None else findings
-    drawn = {name: to_png(figure) for name, figure in pictures(data, findings).items()} if drawn is None else drawn
+    drawn = draw(data, findings) if drawn is None else drawn
     text = resources.files("hybridlio").joinpath("report.html.jinja").read_text(encoding="utf-8")
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     write_whole(path, environment.from_string(text).render(_page(data, findings, drawn)))
+
+
+def draw(data: ReportData, findings: Findings) -> dict[str, bytes]:
+    """The :func:`pictures` as PNG, by name."""
+    from hybridlio.plots import to_png
+
+    return {name: to_png(figure) for name, figure in pictures(data, findings).items()}
 
 
 def pictures(data: ReportData, findings: Findings) -> dict[str, Figure]:

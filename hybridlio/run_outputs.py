@@ -13,7 +13,7 @@ from hybridlio.errors import EstimationError
 from hybridlio.files import write_whole
 from hybridlio.metrics import Evaluation, Steps
 from hybridlio.record import Record
-from hybridlio.report import pictures, write_report
+from hybridlio.report import draw, write_report
 from hybridlio.report_data import Findings, ReportData, find
 from hybridlio.run import Run
 from hybridlio.tables import counted
@@ -64,9 +64,7 @@ def write_run(folder: Path, run: Run, config: Config) -> Findings:
 
 def write_pages(folder: Path, data: ReportData, findings: Findings) -> None:
     """Write ``report.html``, and the picture of the path alone."""
-    from hybridlio.plots import to_png
-
-    drawn = {name: to_png(figure) for name, figure in pictures(data, findings).items()}
+    drawn = draw(data, findings)
     write_report(folder / run_folder.REPORT, data, findings, drawn)
     write_whole(folder / run_folder.PICTURE, drawn["trajectory"])
 

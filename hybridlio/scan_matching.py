@@ -103,6 +103,7 @@ class ScanMatching:
             )
         self._map = LocalMap(self._settings.local_map)
         self._path = self._before = _Path(np.eye(4), map_changed=True)
+        self._doubted = None
         self._waiting, self.seen = seen.points, seen
         self._stamp_ns = frame.scan.stamp_ns
 
@@ -122,10 +123,9 @@ class ScanMatching:
         before, self._before = self._path, self._path
         step = se3.between(before.T_map_lidar, found.pose)
         left_open = bool(len(observed.degenerate))
-        seen_before = self._doubted or (None if before.bridged else before)
-        known = seen_before is not None and not left_open
-        moved = se3.log(se3.between(seen_before.T_map_lidar, found.pose)) / dt_s if known and seen_before else None
-        self._path, self._doubted = _Path(found.pose, moved), None
+        last = self._doubted or (None if before.bridged else before)
+        twist = None if last is None or left_open else se3.log(se3.between(last.T_map_lidar, found.pose)) / dt_s
+        self._path, self._doubted = _Path(found.pose, twist), None
         self._adrift = left_open and _is_vague(initial)
         if self._settings.target == "last-scan" or self._adrift or self._map.wants(found.pose):
             self._waiting, self._path.map_changed = seen.points, True

@@ -70,16 +70,12 @@ def simulate(out: Path, config: SimulationConfig, progress: Progress | None = No
     drive = plan(config)
     with alone_in(partial.root):
         if not done.sync.exists():  # another process may have made it meanwhile
-            _write(partial, drive, config, progress)
+            _write_measurements(partial, drive, config)
+            _write_scans(partial, drive, config, progress)
+            write_whole(partial.sync / "simulation.json", json.dumps(description, indent=2) + "\n")
             _move(partial, done)
         shutil.rmtree(partial.root, ignore_errors=True)
     return done.sync
-
-
-def _write(partial: DriveFolders, drive: Drive, config: SimulationConfig, progress: Progress | None) -> None:
-    _write_measurements(partial, drive, config)
-    _write_scans(partial, drive, config, progress)
-    write_whole(partial.sync / "simulation.json", json.dumps(describe(config), indent=2) + "\n")
 
 
 def _move(partial: DriveFolders, done: DriveFolders) -> None:

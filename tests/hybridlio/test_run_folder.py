@@ -8,6 +8,7 @@ from threading import Barrier
 
 import numpy as np
 import pytest
+from scipy.integrate import trapezoid
 from scipy.spatial.transform import Rotation
 
 from hybridlio import run_folder, se3
@@ -84,6 +85,8 @@ def test_the_metrics_say_what_was_done_and_how_good_it_is(folder, run):
     )  # fmt: skip
     path, true = run.trajectory.poses[:, :3, 3], run.sequence.reference.poses[:, :3, 3]
     assert said["path_length_m"] == pytest.approx(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    driven = trapezoid(run.sequence.forward_speed_m_s, run.sequence.stamps_ns / 1e9)
+    assert said["forward_speed_length_m"] == pytest.approx(driven)
     assert said["forward_speed_length_m"] == pytest.approx(run.sequence.reference.length_m, rel=0.02)
     _, left = Rotation.align_vectors(true - true.mean(0), path - path.mean(0))
     assert said["ate_m"] == pytest.approx(left / np.sqrt(len(path)), rel=1e-6)

@@ -61,7 +61,7 @@ def test_the_lidar_sits_where_kittis_does():
 
 
 class InterruptError(Exception):
-    pass
+    """What stops a simulation in these tests."""
 
 
 def test_an_interrupted_drive_shows_nothing_and_goes_on_to_the_same_bytes(tmp_path: Path):
