@@ -15,18 +15,18 @@ from pathlib import Path
 import torch
 from front_end import SIZES, Row, shaken, steps_left
 
-from hybridlio import tables
-from hybridlio.files import write_whole
-from hybridlio.learned.driving import drive
-from hybridlio.learned.odometry_network import OdometryNetwork, parameter_count
-from hybridlio.learned.pairs import Pairs
+from hybridlio.core import tables
+from hybridlio.core.files import write_whole
+from hybridlio.learned.data.pairs import Pairs
+from hybridlio.learned.data.shards import Shard
+from hybridlio.learned.networks.odometry_network import OdometryNetwork, parameter_count
 from hybridlio.learned.presets import DEFAULT, DEPARTURES
 from hybridlio.learned.settings import Recipe
-from hybridlio.learned.shards import Shard
-from hybridlio.learned.training import RunOptions, train
-from hybridlio.learned.validation import step_errors
-from hybridlio.recipes import lasting
-from hybridlio.training_data import DataOptions, shards_of
+from hybridlio.learned.training.driving import drive
+from hybridlio.learned.training.train import RunOptions, train
+from hybridlio.learned.training.validation import step_errors
+from hybridlio.runs.recipes import lasting
+from hybridlio.runs.training_data import DataOptions, shards_of
 
 
 def measured(name: str, network: OdometryNetwork, tests: list[Shard]) -> Iterator[Row]:

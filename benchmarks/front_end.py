@@ -24,21 +24,21 @@ import small_gicp
 import torch
 from numpy.typing import NDArray
 
-from hybridlio import se3, tables
+from hybridlio.cloud.preparation import prepare
+from hybridlio.cloud.projection import vertex_map
+from hybridlio.core import se3, tables
+from hybridlio.core.files import write_whole
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.files import write_whole
-from hybridlio.learned.driving import drive
-from hybridlio.learned.odometry_network import OdometryNetwork
-from hybridlio.learned.pairs import Pairs
-from hybridlio.learned.shards import Shard
-from hybridlio.learned.training import RunOptions, train
-from hybridlio.learned.validation import step_errors
-from hybridlio.learned.weights import Weights, load_weights, weights_path
-from hybridlio.preparation import prepare
-from hybridlio.projection import vertex_map
-from hybridlio.recipes import adaptation
-from hybridlio.training_data import DataOptions, shards_of
+from hybridlio.learned.data.pairs import Pairs
+from hybridlio.learned.data.shards import Shard
+from hybridlio.learned.networks.odometry_network import OdometryNetwork
+from hybridlio.learned.networks.weights import Weights, load_weights, weights_path
+from hybridlio.learned.training.driving import drive
+from hybridlio.learned.training.train import RunOptions, train
+from hybridlio.learned.training.validation import step_errors
+from hybridlio.runs.recipes import adaptation
+from hybridlio.runs.training_data import DataOptions, shards_of
 
 Array = NDArray[np.float64]
 Row = dict[str, str]

@@ -18,15 +18,15 @@ from pathlib import Path
 import numpy as np
 
 import hybridlio as hl
-from hybridlio import se3
-from hybridlio.fix_alignment import fix_stamps
-from hybridlio.gps import GpsOptions
-from hybridlio.imu_faults import without_filled_gaps
-from hybridlio.metrics import align, associate
-from hybridlio.odometry_noise import odometry_noise
-from hybridlio.record import Record
-from hybridlio.sensors import NS_PER_S
-from hybridlio.trajectory_files import read_kitti
+from hybridlio.core import se3
+from hybridlio.core.sensors import NS_PER_S
+from hybridlio.core.trajectory_files import read_kitti
+from hybridlio.datasets.imu_faults import without_filled_gaps
+from hybridlio.evaluation.evaluate import align, associate
+from hybridlio.record.odometry_noise import odometry_noise
+from hybridlio.record.record import Record
+from hybridlio.smoothing.gps_alignment import fix_stamps
+from hybridlio.smoothing.gps_options import GpsOptions
 
 # calib_imu_to_velo.txt of 2011_10_03, as KITTI publishes it
 T_LIDAR_IMU = se3.make(

@@ -31,17 +31,17 @@ from typing import Any
 
 import numpy as np
 
-from hybridlio import se3
+from hybridlio.commands.terminal import progress
+from hybridlio.core import se3
+from hybridlio.core.estimates import RelativePose
+from hybridlio.core.files import write_whole
+from hybridlio.core.packed_arrays import PackedList
+from hybridlio.core.sensors import Calibration, Frame, ImuSamples, Scan
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.estimates import RelativePose
-from hybridlio.files import write_whole
-from hybridlio.odometry import Estimate, Odometry
-from hybridlio.packing import PackedList
-from hybridlio.sensors import Calibration, Frame, ImuSamples, Scan
+from hybridlio.odometry.odometry import Estimate, Odometry
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.simulate import simulate
-from hybridlio.terminal import progress
 
 PART = 500
 WARM_UP = 20

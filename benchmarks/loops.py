@@ -19,18 +19,18 @@ from pathlib import Path
 import numpy as np
 
 import hybridlio as hl
-from hybridlio import se3
-from hybridlio.consistency import pose_consistency
+from hybridlio.core import se3
+from hybridlio.core.estimates import RelativePose
+from hybridlio.core.sensors import Calibration, ImuNoise, ImuSamples
+from hybridlio.core.start_state import start_state
+from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.registry import open_sequence
-from hybridlio.estimates import RelativePose
-from hybridlio.keyframes import KeyframeMaker, Keyframes, KeyframeSettings
-from hybridlio.record import Record
-from hybridlio.run import run_odometry
-from hybridlio.run_folder import KEYFRAMES, RECORD, is_run_folder, read_run
-from hybridlio.sensors import Calibration, ImuNoise, ImuSamples
-from hybridlio.startup import start_state
-from hybridlio.trajectory import Trajectory
-from hybridlio.trajectory_errors import associate
+from hybridlio.evaluation.ate_rpe import associate
+from hybridlio.evaluation.consistency import pose_consistency
+from hybridlio.record.keyframes import KeyframeMaker, Keyframes, KeyframeSettings
+from hybridlio.record.record import Record
+from hybridlio.runs.folder import KEYFRAMES, RECORD, is_run_folder, read_run
+from hybridlio.runs.run import run_odometry
 
 _FALSE_M, _FALSE_DEG = 0.5, 1.0
 _REVISIT_M, _APART_M = 10.0, 40.0
@@ -63,9 +63,9 @@ def of_recording(path: Path) -> Case:
 
 def of_seed(config: hl.SimulationConfig) -> Case:
     """Keyframes of a simulated drive, and exact odometry; noise is added by :func:`drifted`."""
-    from hybridlio.simulation.lidar import ray_pattern
     from hybridlio.simulation.plan import plan
     from hybridlio.simulation.rig import T_IMU_LIDAR
+    from hybridlio.simulation.sensors.lidar import ray_pattern
     from hybridlio.simulation.simulate import scan_at
 
     drive, pattern, settings = plan(config), ray_pattern(config.lidar_model), KeyframeSettings()

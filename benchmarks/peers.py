@@ -24,14 +24,14 @@ import numpy as np
 from lockstep import Pass, resident_growth_mb, run_in_lockstep
 from systems import PEERS, Array, Make, our_systems, peer_systems
 
-from hybridlio import se3, tables
+from hybridlio.commands.terminal import progress
+from hybridlio.core import se3, tables
+from hybridlio.core.errors import HybridLioError
+from hybridlio.core.files import write_whole
+from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence, part_of
-from hybridlio.errors import HybridLioError
-from hybridlio.files import write_whole
-from hybridlio.metrics import Evaluation, evaluate
-from hybridlio.terminal import progress
-from hybridlio.trajectory import Trajectory
+from hybridlio.evaluation.evaluate import Evaluation, evaluate
 
 Figures = dict[str, Any]
 

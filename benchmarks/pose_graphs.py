@@ -18,10 +18,10 @@ import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridlio import se3
+from hybridlio.core import se3
 from hybridlio.graph import PoseGraph
-from hybridlio.graph.coordinates import to_matrices
-from hybridlio.graph.edges import loops_of
+from hybridlio.graph.model.coordinates import to_matrices
+from hybridlio.graph.model.edge_arrays import loops_of
 
 _EQUAL = 1e-5  # relative; errors closer than this are the same answer
 

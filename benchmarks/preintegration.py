@@ -23,10 +23,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import hybridlio as hl
-from hybridlio import se3
-from hybridlio.graph.preintegration import covers, predict_step, preintegrate
-from hybridlio.record import Record
-from hybridlio.sensors import NS_PER_S
+from hybridlio.core import se3
+from hybridlio.core.sensors import NS_PER_S
+from hybridlio.graph.base.preintegration import covers, predict_step, preintegrate
+from hybridlio.record.record import Record
 from hybridlio.simulation.chain import make_chain
 
 WINDOWS_S = (0.1, 1.0, 5.0)

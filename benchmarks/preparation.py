@@ -13,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridlio import se3
-from hybridlio.deskew import constant_twist, deskew
-from hybridlio.ground import find_ground
-from hybridlio.normals import estimate_normals
-from hybridlio.preparation import prepare
-from hybridlio.projection import MAP_GEOMETRIES, normal_map, remap, vertex_map
-from hybridlio.sensors import Scan
-from hybridlio.voxel import voxel_average, voxel_to_count
+from hybridlio.cloud.deskew import constant_twist, deskew
+from hybridlio.cloud.ground import find_ground
+from hybridlio.cloud.normals import estimate_normals
+from hybridlio.cloud.preparation import prepare
+from hybridlio.cloud.projection import MAP_GEOMETRIES, normal_map, remap, vertex_map
+from hybridlio.cloud.voxel import voxel_average, voxel_to_count
+from hybridlio.core import se3
+from hybridlio.core.sensors import Scan
 
 
 def steps(points: np.ndarray, threads: int) -> dict[str, Callable[[], object]]:

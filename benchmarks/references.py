@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from peers import ahead_of_speed, drift_of, opened, trajectory_of
 from systems import our_systems, peer_systems
 
-from hybridlio import se3, tables
+from hybridlio.commands.terminal import progress
+from hybridlio.core import se3, tables
+from hybridlio.core.estimates import Array
+from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.estimates import Array
-from hybridlio.metrics import evaluate
-from hybridlio.terminal import progress
-from hybridlio.trajectory import Trajectory
+from hybridlio.evaluation.evaluate import evaluate
 
 _DRAWS = 200
 

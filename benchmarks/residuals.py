@@ -22,14 +22,14 @@ import numpy as np
 import small_gicp
 from numpy.typing import NDArray
 
-from hybridlio import se3
-from hybridlio.config import Config
+from hybridlio.core import se3
+from hybridlio.core.estimates import RelativePose, ResidualSource
+from hybridlio.core.files import write_whole
+from hybridlio.core.sensors import ImuNoise
 from hybridlio.datasets.registry import open_sequence, sequence_names
 from hybridlio.datasets.sequence import Sequence, part_of
-from hybridlio.estimates import RelativePose, ResidualSource
-from hybridlio.files import write_whole
-from hybridlio.sensors import ImuNoise
-from hybridlio.sources import RESIDUAL_SOURCES, Setup
+from hybridlio.odometry.config import Config
+from hybridlio.odometry.registry import RESIDUAL_SOURCES, Setup
 
 Array = NDArray[np.float64]
 

@@ -21,11 +21,11 @@ from lockstep import Pass, run_in_lockstep
 from peers import circumstances, drift_of, judged, trajectory_of, words
 from systems import PEERS, our_systems, peer_systems
 
-from hybridlio import tables
+from hybridlio.commands.terminal import progress
+from hybridlio.core import tables
+from hybridlio.core.files import write_whole
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.files import write_whole
 from hybridlio.simulation.scenarios import SCENARIOS, open_scenario
-from hybridlio.terminal import progress
 
 Figures = dict[str, Any]
 

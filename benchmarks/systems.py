@@ -10,11 +10,11 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlio import se3
-from hybridlio.config import Config
+from hybridlio.core import se3
+from hybridlio.core.sensors import Frame
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.sensors import Frame
-from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
+from hybridlio.odometry.config import Config
+from hybridlio.odometry.registry import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
 
 Array = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ Make = Callable[[Sequence, int], Step]  # with the number of threads
 
 
 def ours(config: Config, _: Sequence, threads: int) -> Step:
-    from hybridlio.odometry import Odometry
+    from hybridlio.odometry.odometry import Odometry
 
     odometry = Odometry(config=Config.model_validate(_with_threads(config.model_dump(), threads)))
 

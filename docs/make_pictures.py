@@ -19,9 +19,9 @@ from matplotlib.colors import LinearSegmentedColormap
 from scipy.spatial import cKDTree
 
 import hybridlio as hl
-from hybridlio import se3
-from hybridlio.projection import map_geometry, vertex_map
-from hybridlio.voxel import voxel_average
+from hybridlio.cloud.projection import map_geometry, vertex_map
+from hybridlio.cloud.voxel import voxel_average
+from hybridlio.core import se3
 
 IMAGES = Path(__file__).resolve().parent / "images"
 CONFIG = hl.SimulationConfig(seconds=60, seed=5, speed_m_s=9.0)

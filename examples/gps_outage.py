@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 
 import hybridlio as hl
-from hybridlio.geodesy import GeodeticPoint
-from hybridlio.georeference import georeference, write_georeferenced
-from hybridlio.gps import GpsOptions
-from hybridlio.metrics import ate
-from hybridlio.record import Record
+from hybridlio.core.geodesy import GeodeticPoint
+from hybridlio.evaluation.evaluate import ate
+from hybridlio.record.record import Record
 from hybridlio.simulation.chain import make_chain
+from hybridlio.smoothing.georeference import georeference, write_georeferenced
+from hybridlio.smoothing.gps_options import GpsOptions
 
 LATE_S, SIGMA_M = 0.3, 0.2
 ORIGIN = GeodeticPoint(49.0, 8.4, 110.0)

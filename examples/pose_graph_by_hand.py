@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridlio import se3
+from hybridlio.core import se3
 from hybridlio.graph import PoseGraph
 
 SIDES, STEPS = 4, 10

@@ -10,8 +10,8 @@ import tempfile
 from pathlib import Path
 
 import hybridlio as hl
-from hybridlio.record import Record
-from hybridlio.run import run_odometry
+from hybridlio.record.record import Record
+from hybridlio.runs.run import run_odometry
 
 
 def main(folder: str | None = None, seconds: str = "6", *_: str) -> None:

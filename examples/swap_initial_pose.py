@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import hybridlio as hl
-from hybridlio import se3
+from hybridlio.core import se3
 
 
 def main(folder: str | None = None, seconds: str = "5") -> None:

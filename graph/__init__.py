@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hybridlio.graph.pose_graph import PoseGraph as PoseGraph
-    from hybridlio.graph.solution import Solution as Solution
+    from hybridlio.graph.solve.solution import Solution as Solution
 
 __all__ = ["PoseGraph", "Solution"]
 
-_MODULES = {"PoseGraph": "hybridlio.graph.pose_graph", "Solution": "hybridlio.graph.solution"}
+_MODULES = {"PoseGraph": "hybridlio.graph.pose_graph", "Solution": "hybridlio.graph.solve.solution"}
 
 
 def __getattr__(name: str) -> Any:

@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hybridlio.errors import DataError, GraphError
-from hybridlio.geodesy import check_geodetic, enu_from_geodetic
-from hybridlio.graph.graph_data import GraphData
-from hybridlio.graph.keys import Key, check_key
-from hybridlio.graph.measurements import Factor, RobustLike, label, make_noise, make_robust
-from hybridlio.sensors import ImuNoise, ImuSamples
+from hybridlio.core.errors import DataError, GraphError
+from hybridlio.core.geodesy import check_geodetic, enu_from_geodetic
+from hybridlio.core.sensors import ImuNoise, ImuSamples
+from hybridlio.graph.model.graph_data import GraphData
+from hybridlio.graph.model.keys import Key, check_key
+from hybridlio.graph.model.measurements import Factor, RobustLike, label, make_noise, make_robust
 
 if TYPE_CHECKING:
-    from hybridlio.graph.initial import Method
-    from hybridlio.graph.levenberg import Progress
-    from hybridlio.graph.online_solver import OnlineSolver
-    from hybridlio.graph.optimise import Backend, Initial
-    from hybridlio.graph.solution import Solution
+    from hybridlio.graph.solve.levenberg import Progress
+    from hybridlio.graph.solve.online_solver import OnlineSolver
+    from hybridlio.graph.solve.optimise import Backend, Initial
+    from hybridlio.graph.solve.solution import Solution
+    from hybridlio.graph.solve.starts import Method
 
 _UP = np.array([0.0, 0.0, 1.0])
 _STANDS_STILL_M_S = 0.01
@@ -179,7 +179,7 @@ class PoseGraph(GraphData):
 
     def components(self) -> list[list[Key]]:
         """The parts that no between- or IMU factor joins, largest first."""
-        from hybridlio.graph.checks import components
+        from hybridlio.graph.model.checks import components
 
         return components(self)
 
@@ -193,7 +193,7 @@ class PoseGraph(GraphData):
         Raises:
             GraphError: some poses cannot be reached; names them.
         """
-        from hybridlio.graph.initial import find
+        from hybridlio.graph.solve.starts import find
 
         self._initial.array[:] = find(self, method)
 
@@ -219,7 +219,7 @@ class PoseGraph(GraphData):
         Raises:
             GraphError: the factors do not determine every pose; names the keys.
         """
-        from hybridlio.graph.optimise import Settings, optimise
+        from hybridlio.graph.solve.optimise import Settings, optimise
 
         return optimise(self, Settings(backend, initial, max_iterations, tolerance, lag), progress)
 
@@ -237,7 +237,7 @@ class PoseGraph(GraphData):
         Raises:
             ConfigError: no such backend, or a lag that is not positive.
         """
-        from hybridlio.graph.online_solver import OnlineSolver
+        from hybridlio.graph.solve.online_solver import OnlineSolver
 
         return OnlineSolver(self, backend, lag, forget)
 
@@ -252,7 +252,7 @@ class PoseGraph(GraphData):
         Raises:
             DataError: the file is missing, truncated or garbled; names the row.
         """
-        from hybridlio.graph.files import load
+        from hybridlio.graph.formats.files import load
 
         return load(path)
 
@@ -267,6 +267,6 @@ class PoseGraph(GraphData):
             GraphError: the format cannot hold what is in the graph.
             DataError: unknown ending, or the place cannot be written to.
         """
-        from hybridlio.graph.files import save
+        from hybridlio.graph.formats.files import save
 
         save(self, path, solution)

@@ -3,24 +3,24 @@
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from hybridlio.core.version import __version__
+
 if TYPE_CHECKING:  # what type checkers and editors see; at run time each name loads when first used
-    from hybridlio.batch import run_batch
-    from hybridlio.batch_table import Batch
-    from hybridlio.config import Config
+    from hybridlio.core.errors import HybridLioError
+    from hybridlio.core.estimates import RelativePose, State
+    from hybridlio.core.sensors import Calibration, Frame, GpsFix, ImuNoise, ImuSamples, Scan
+    from hybridlio.core.trajectory import Trajectory
     from hybridlio.datasets.registry import open_sequence
     from hybridlio.datasets.sequence import Sequence
-    from hybridlio.errors import HybridLioError
-    from hybridlio.estimates import RelativePose, State
-    from hybridlio.graph.offline import smooth
-    from hybridlio.metrics import evaluate
-    from hybridlio.odometry import Estimate, Odometry
-    from hybridlio.recordings import Recording, find_recordings
-    from hybridlio.sensors import Calibration, Frame, GpsFix, ImuNoise, ImuSamples, Scan
+    from hybridlio.evaluation.evaluate import evaluate
+    from hybridlio.graph.run.smooth import smooth
+    from hybridlio.odometry.config import Config
+    from hybridlio.odometry.odometry import Estimate, Odometry
+    from hybridlio.runs.batch import run_batch
+    from hybridlio.runs.batch_table import Batch
+    from hybridlio.runs.recordings import Recording, find_recordings
     from hybridlio.simulation.config import SimulationConfig
     from hybridlio.simulation.simulate import simulate
-    from hybridlio.trajectory import Trajectory
-
-__version__ = "0.1.0"
 
 __all__ = [
     "Batch",
@@ -50,21 +50,21 @@ __all__ = [
 ]
 
 _HOMES = {
-    "batch": ("run_batch",),
-    "batch_table": ("Batch",),
-    "config": ("Config",),
+    "core.errors": ("HybridLioError",),
+    "core.estimates": ("RelativePose", "State"),
+    "core.sensors": ("Calibration", "Frame", "GpsFix", "ImuNoise", "ImuSamples", "Scan"),
+    "core.trajectory": ("Trajectory",),
     "datasets.registry": ("open_sequence",),
     "datasets.sequence": ("Sequence",),
-    "errors": ("HybridLioError",),
-    "estimates": ("RelativePose", "State"),
-    "graph.offline": ("smooth",),
-    "metrics": ("evaluate",),
-    "odometry": ("Estimate", "Odometry"),
-    "recordings": ("Recording", "find_recordings"),
-    "sensors": ("Calibration", "Frame", "GpsFix", "ImuNoise", "ImuSamples", "Scan"),
+    "evaluation.evaluate": ("evaluate",),
+    "graph.run.smooth": ("smooth",),
+    "odometry.config": ("Config",),
+    "odometry.odometry": ("Estimate", "Odometry"),
+    "runs.batch": ("run_batch",),
+    "runs.batch_table": ("Batch",),
+    "runs.recordings": ("Recording", "find_recordings"),
     "simulation.config": ("SimulationConfig",),
     "simulation.simulate": ("simulate",),
-    "trajectory": ("Trajectory",),
 }
 _HOME_OF = {name: f"hybridlio.{module}" for module, names in _HOMES.items() for name in names}
 

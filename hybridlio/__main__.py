@@ -1,5 +1,5 @@
 """``python -m hybridlio``: the command line."""
 
-from hybridlio.cli import app
+from hybridlio.commands.app import app
 
 app()

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
-from hybridlio.errors import ConfigError
+from hybridlio.core.errors import ConfigError
 from hybridlio.learned.settings import LossSettings, NetworkSettings, OptimiserSettings, Recipe
 
 PAPER = Recipe("paper", NetworkSettings(), LossSettings(), OptimiserSettings())

@@ -13,8 +13,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
-from hybridlio.errors import ConfigError
-from hybridlio.projection import MAP_GEOMETRIES, MapGeometry
+from hybridlio.cloud.projection import MAP_GEOMETRIES, MapGeometry
+from hybridlio.core.errors import ConfigError
 
 _S = TypeVar("_S")
 
@@ -49,7 +49,8 @@ class NetworkSettings:
             point to it, or with it the ``gradient`` of d²/2 by translation and rotation, d·n and d·(p × n). Not in the
             paper, and needs ``twins``.
         projective_steps: each iteration starts with so many weighted steps of point-to-plane registration between the
-            maps (:mod:`hybridlio.learned.projective`), which the residual network corrects; not in the paper.
+            maps (:mod:`hybridlio.learned.networks.projective_steps`), which the residual network corrects; not in the
+            paper.
         weight_channels: of the network that gives their weights; 0 takes the robust kernel's weights alone.
         vertex_scale_m: vertices are divided by it.
         residual_scale: the last layers' weights start smaller by it, so that training starts near δT = 1.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hybridlio.ranges import above_0, expect, from_0, shares
+from hybridlio.core.setting_checks import above_0, expect, from_0, shares
 
 SHIPPED = "shipped"
 """In place of a path: the weights that come with the package."""

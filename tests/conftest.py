@@ -90,10 +90,10 @@ def untrained_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
     import torch
 
-    from hybridlio.learned.odometry_network import OdometryNetwork
+    from hybridlio.cloud.projection import MAP_GEOMETRIES
+    from hybridlio.learned.networks.odometry_network import OdometryNetwork
+    from hybridlio.learned.networks.weights import save_weights
     from hybridlio.learned.settings import NetworkSettings, Recipe
-    from hybridlio.learned.weights import save_weights
-    from hybridlio.projection import MAP_GEOMETRIES
 
     small: dict[str, Any] = {
         "imu_hidden": 8,

@@ -83,7 +83,7 @@ GRAPH, LEARNED = inside("hybridlio.graph"), inside("hybridlio.learned")
 
 
 def test_the_three_packages_are_found():
-    assert {"hybridlio", "hybridlio.se3"} <= set(MODULES)
+    assert {"hybridlio", "hybridlio.core.se3"} <= set(MODULES)
     assert "hybridlio.graph" in GRAPH
     assert "hybridlio.learned" in LEARNED
     assert len(set(MODULES.values())) == len(MODULES)
@@ -177,7 +177,7 @@ def test_importing_hybridlio_is_quick_and_loads_no_heavy_library():
 
 
 def test_the_configuration_loads_no_pytorch():
-    code = "import sys; from hybridlio.config import Config; Config(); print('torch' in sys.modules)"
+    code = "import sys; from hybridlio.odometry.config import Config; Config(); print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False"]
 
@@ -186,9 +186,9 @@ def test_odometry_without_imu_and_graph_does_without_gtsam():
     code = """
 import sys
 import numpy as np
-from hybridlio.config import Config
-from hybridlio.odometry import Odometry
-from hybridlio.sensors import Frame, ImuSamples, Scan
+from hybridlio.odometry.config import Config
+from hybridlio.odometry.odometry import Odometry
+from hybridlio.core.sensors import Frame, ImuSamples, Scan
 
 points = np.random.default_rng(0).uniform(-9, 9, (3000, 3)).astype(np.float32)
 points[np.arange(3000), np.arange(3000) % 3] = 9

@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from hybridlio.config import Config
+from hybridlio.odometry.config import Config
 
 ROOT = Path(__file__).resolve().parents[1]
 OURS = f"{Config().initial_pose} + none + {Config().backend}"
@@ -93,7 +93,7 @@ def test_a_system_that_diverges_is_named_and_not_judged(tiny_drive, tmp_path):
 def test_laps_follow_each_other_without_a_gap():
     program = (
         "import sys; sys.path.insert(0, sys.argv[1]); import numpy as np; "
-        "from hybridlio.sensors import Frame, ImuSamples, Scan; import long_run;"
+        "from hybridlio.core.sensors import Frame, ImuSamples, Scan; import long_run;"
         "stamps = 10**12 + np.arange(long_run.LAP + 1) * 10**8;"
         "samples = lambda k: ImuSamples(np.arange(stamps[k] - 10**8, stamps[k] + 1, 10**7), *np.zeros((2, 11, 3)));"
         "points = lambda k: np.full((1, 3), k, np.float32);"

@@ -13,7 +13,7 @@ import pytest
 import typer
 
 import hybridlio as hl
-from hybridlio.cli import app
+from hybridlio.commands.app import app
 from hybridlio.graph import PoseGraph
 
 ROOT = Path(__file__).resolve().parents[1]

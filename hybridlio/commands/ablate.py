@@ -12,18 +12,18 @@ import typer
 
 from hybridlio.commands import common
 from hybridlio.commands.common import INTERRUPTED, guarded
+from hybridlio.commands.terminal import complain, say, say_table
 from hybridlio.commands.train import Device, Recordings, leads, names, shown
-from hybridlio.errors import ConfigError, HybridLioError
-from hybridlio.terminal import complain, say, say_table
+from hybridlio.core.errors import ConfigError, HybridLioError
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from hybridlio.learned.ablation import RowData, RowResult
-    from hybridlio.learned.comparison import Line
     from hybridlio.learned.presets import TableRow
     from hybridlio.learned.settings import Recipe
-    from hybridlio.training_data import DataOptions
+    from hybridlio.learned.training.ablation import RowData, RowResult
+    from hybridlio.learned.training.comparison import Line
+    from hybridlio.runs.training_data import DataOptions
 
 Rows = Callable[["TableRow"], "RowResult"]
 
@@ -64,8 +64,8 @@ def ablate(
     Published figures stand beside, marked as such. Given again, the same command does not repeat finished rows. A row
     that fails does not stop the others.
     """
-    from hybridlio.learned.devices import pick_device
-    from hybridlio.training_data import DataOptions
+    from hybridlio.learned.networks.devices import pick_device
+    from hybridlio.runs.training_data import DataOptions
 
     pick_device(device)
     if (test is None) == (split is None):
@@ -103,11 +103,11 @@ def _trainer(
     device: str,
 ) -> Rows:
     """Trains and evaluates a row."""
-    from hybridlio.learned.ablation import RowData, run_rows
-    from hybridlio.learned.ablation import reduced as smaller
     from hybridlio.learned.presets import preset
-    from hybridlio.learned.training import RunOptions
-    from hybridlio.training_data import shards_of, split_options
+    from hybridlio.learned.training.ablation import RowData, run_rows
+    from hybridlio.learned.training.ablation import reduced as smaller
+    from hybridlio.learned.training.train import RunOptions
+    from hybridlio.runs.training_data import shards_of, split_options
 
     run_options = RunOptions(device=None if device == "auto" else device)
 
@@ -139,8 +139,8 @@ def _trainer(
 
 def _measured(number: int, chosen: list[TableRow], run: Rows) -> list[Line]:
     """Every line of the table, those of chosen rows with what was measured."""
-    from hybridlio.learned.comparison import Line
-    from hybridlio.learned.published import published
+    from hybridlio.learned.training.comparison import Line
+    from hybridlio.learned.training.published import published
 
     wanted, lines = {row.published: row for row in chosen}, []
     for figures in published(number):
@@ -160,8 +160,8 @@ def _measured(number: int, chosen: list[TableRow], run: Rows) -> list[Line]:
 
 
 def _finish(folder: Path, number: int, lines: list[Line], budget: str) -> None:
-    from hybridlio.files import write_whole
-    from hybridlio.learned.comparison import LEGEND, tables, to_json_dict, to_markdown
+    from hybridlio.core.files import write_whole
+    from hybridlio.learned.training.comparison import LEGEND, tables, to_json_dict, to_markdown
 
     if not leads():
         return

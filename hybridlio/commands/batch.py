@@ -9,11 +9,11 @@ import typer
 
 from hybridlio.commands import common
 from hybridlio.commands.common import guarded
-from hybridlio.engines import LOCAL
-from hybridlio.terminal import complain, progress, say, say_table
+from hybridlio.commands.terminal import complain, progress, say, say_table
+from hybridlio.runs.engines import LOCAL
 
 if TYPE_CHECKING:
-    from hybridlio.batch_table import Batch
+    from hybridlio.runs.batch_table import Batch
 
 
 @guarded
@@ -59,8 +59,8 @@ def batch(
 
     One that fails stops no other. The same command again runs only what is missing. DIR/batch.md sums up.
     """
-    from hybridlio.batch import run_batch
-    from hybridlio.recordings import find_recordings
+    from hybridlio.runs.batch import run_batch
+    from hybridlio.runs.recordings import find_recordings
 
     settings = common.settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
     found = find_recordings(data, sequence, reader, raw_root, frames, vertical_angle)
@@ -74,7 +74,7 @@ def batch(
 
 def _finish(done: Batch) -> None:
     """Say what came of it, and end with the exit code that belongs to it."""
-    from hybridlio.batch_table import table
+    from hybridlio.runs.batch_table import table
 
     say_table(table(done))
     say(f"written to {done.out / 'batch.md'} and {done.out / 'batch.json'}")

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Annotated, NoReturn, ParamSpec
 
 import typer
 
-from hybridlio.errors import ConfigError, DataError, HybridLioError
-from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
-from hybridlio.terminal import complain, set_up_logging
+from hybridlio.commands.terminal import complain, set_up_logging
+from hybridlio.core.errors import ConfigError, DataError, HybridLioError
+from hybridlio.odometry.registry import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
 
 if TYPE_CHECKING:
-    from hybridlio.config import Config
     from hybridlio.datasets.sequence import Sequence
+    from hybridlio.odometry.config import Config
 
 _P = ParamSpec("_P")
 
@@ -154,7 +154,7 @@ def open_data(
 
 def settings(config: Path | None, **names: str | None) -> Config:
     """The configuration in a file, or the default one, with the names given on the command line."""
-    from hybridlio.config import Config, load_config
+    from hybridlio.odometry.config import Config, load_config
 
     settings = load_config(config) if config is not None else Config()
     return settings.model_copy(update={name: value for name, value in names.items() if value is not None})

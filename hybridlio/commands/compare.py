@@ -9,12 +9,12 @@ import typer
 
 from hybridlio.commands import common
 from hybridlio.commands.common import guarded
-from hybridlio.errors import ConfigError
-from hybridlio.sources import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
-from hybridlio.terminal import complain, progress, say, say_table
+from hybridlio.commands.terminal import complain, progress, say, say_table
+from hybridlio.core.errors import ConfigError
+from hybridlio.odometry.registry import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
 
 if TYPE_CHECKING:
-    from hybridlio.compare import Comparison
+    from hybridlio.runs.compare import Comparison
 
 
 def _several(names: tuple[str, ...]) -> str:
@@ -45,9 +45,9 @@ def compare(
     _verbose: common.Verbose = 0,
 ) -> None:
     """Run every combination of sources over the same scans, and show them side by side."""
-    from hybridlio.compare import combinations, table, write_comparison
-    from hybridlio.compare import compare as run_all
-    from hybridlio.files import make_folder
+    from hybridlio.core.files import make_folder
+    from hybridlio.runs.compare import combinations, table, write_comparison
+    from hybridlio.runs.compare import compare as run_all
 
     settings = common.settings(config)
     configs = combinations(

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hybridlio.commands.common import Verbose, guarded
-from hybridlio.errors import ConfigError, DataError
-from hybridlio.terminal import complain, say, say_table
+from hybridlio.commands.terminal import complain, say, say_table
+from hybridlio.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
-    from hybridlio.metrics import Steps
-    from hybridlio.trajectory import Trajectory
+    from hybridlio.core.trajectory import Trajectory
+    from hybridlio.evaluation.evaluate import Steps
 
 
 @guarded
@@ -37,8 +37,8 @@ def evaluate(
     _verbose: Verbose = 0,
 ) -> None:
     """Judge a trajectory: KITTI's drift, ATE, RPE and, for a run folder, whether its covariances are true."""
-    from hybridlio.metrics import evaluate as judge
-    from hybridlio.metrics_table import evaluation_table
+    from hybridlio.evaluation.evaluate import evaluate as judge
+    from hybridlio.evaluation.figures import evaluation_table
 
     true, estimated, steps = _load(estimate, reference)
     result = judge(true, estimated, lengths_m=_numbers(lengths), steps=steps)
@@ -54,8 +54,8 @@ def _load(estimate: Path, reference: Path | None) -> tuple[Trajectory, Trajector
     """Reference, estimate, and the steps behind the estimate where it is a run folder."""
     import numpy as np
 
-    from hybridlio.run_folder import read_run
-    from hybridlio.trajectory_files import read_pair, read_trajectory
+    from hybridlio.core.trajectory_files import read_pair, read_trajectory
+    from hybridlio.runs.folder import read_run
 
     if not estimate.is_dir():
         if reference is None:
@@ -78,7 +78,7 @@ def _load(estimate: Path, reference: Path | None) -> tuple[Trajectory, Trajector
 def _reference(folder: Path) -> Trajectory:
     """The poses of a run, or the reference of a recording."""
     from hybridlio.datasets.registry import open_sequence
-    from hybridlio.run_folder import is_run_folder, read_run
+    from hybridlio.runs.folder import is_run_folder, read_run
 
     if is_run_folder(folder):
         return read_run(folder).trajectory

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hybridlio.commands.common import Verbose, guarded
-from hybridlio.commands.fixes import Antenna, MaxShift, gps_options
-from hybridlio.errors import ConfigError, DataError
-from hybridlio.terminal import complain, say
+from hybridlio.commands.gps_options import Antenna, MaxShift, gps_options
+from hybridlio.commands.terminal import complain, say
+from hybridlio.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
-    from hybridlio.geodesy import GeodeticPoint
+    from hybridlio.core.geodesy import GeodeticPoint
 
 
 @guarded
@@ -39,10 +39,10 @@ def georeference(
     _verbose: Verbose = 0,
 ) -> None:
     """Place a run on its GPS fixes as a whole, without bending it, and write it as CSV, GeoJSON and TUM."""
-    from hybridlio.georeference import georeference as place
-    from hybridlio.georeference import write_georeferenced
-    from hybridlio.record import Record
-    from hybridlio.run_folder import RECORD, read_run
+    from hybridlio.record.record import Record
+    from hybridlio.runs.folder import RECORD, read_run
+    from hybridlio.smoothing.georeference import georeference as place
+    from hybridlio.smoothing.georeference import write_georeferenced
 
     stored = read_run(run)
     path = next((p for p in (run / RECORD, run.parent / RECORD) if p.is_file()), None)
@@ -64,7 +64,7 @@ def georeference(
 
 
 def _origin(text: str | None) -> GeodeticPoint | None:
-    from hybridlio.geodesy import check_geodetic
+    from hybridlio.core.geodesy import check_geodetic
 
     if text is None:
         return None

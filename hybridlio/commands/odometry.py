@@ -9,13 +9,13 @@ import typer
 
 from hybridlio.commands import common
 from hybridlio.commands.common import FAILED, guarded
-from hybridlio.tables import counted
-from hybridlio.terminal import complain, progress, say, say_table
+from hybridlio.commands.terminal import complain, progress, say, say_table
+from hybridlio.core.tables import counted
 
 if TYPE_CHECKING:
-    from hybridlio.config import Config
-    from hybridlio.report_data import Findings
-    from hybridlio.run import Run
+    from hybridlio.evaluation.report_data import Findings
+    from hybridlio.odometry.config import Config
+    from hybridlio.runs.run import Run
 
 
 @guarded
@@ -41,9 +41,9 @@ def odometry(
 
     Without -o, runs/latest is a link to the newest. Ctrl-C keeps what was estimated so far.
     """
-    from hybridlio.odometry import Odometry
-    from hybridlio.run import run_odometry, suited_to
-    from hybridlio.run_folder import new_run_folder
+    from hybridlio.odometry.odometry import Odometry
+    from hybridlio.runs.folder import new_run_folder
+    from hybridlio.runs.run import run_odometry, suited_to
 
     chosen = common.settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
     estimator = Odometry(config=chosen)  # wrong names fail before the recording is opened
@@ -59,8 +59,8 @@ def odometry(
 
 def _finish(folder: Path, run: Run, config: Config, is_latest: bool) -> None:
     """Write the run and say what came of it; an interrupted or failed one ends with its exit code."""
-    from hybridlio.run_folder import point_latest_at
-    from hybridlio.run_outputs import write_run
+    from hybridlio.runs.folder import point_latest_at
+    from hybridlio.runs.write import write_run
 
     if run.stopped is not None and len(run.estimates) < 2:  # the first pose is the origin: nothing is known yet
         _remove_if_empty(folder)
@@ -80,9 +80,9 @@ def _finish(folder: Path, run: Run, config: Config, is_latest: bool) -> None:
 
 
 def _say_result(folder: Path, run: Run, findings: Findings) -> None:
-    from hybridlio.metrics_table import evaluation_table
-    from hybridlio.run_folder import POSES, REPORT
-    from hybridlio.run_outputs import disagreements, forward_speed_length_m, imu_path_length_m, ms_per_scan
+    from hybridlio.evaluation.figures import evaluation_table
+    from hybridlio.runs.folder import POSES, REPORT
+    from hybridlio.runs.write import disagreements, forward_speed_length_m, imu_path_length_m, ms_per_scan
 
     metres, ms = run.trajectory.length_m, ms_per_scan(run).get("total")
     speed = "" if ms is None else f", {ms:.0f} ms a scan without reading (median)"

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from hybridlio.commands.common import INTERRUPTED, Verbose, guarded
-from hybridlio.errors import ConfigError
-from hybridlio.terminal import complain, progress, say
+from hybridlio.commands.terminal import complain, progress, say
+from hybridlio.core.errors import ConfigError
 
 
 @guarded

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hybridlio.commands.common import Verbose, guarded
-from hybridlio.commands.fixes import Antenna, MaxShift, Outages, gps_options
-from hybridlio.errors import ConfigError
-from hybridlio.terminal import complain, progress, say, say_table
+from hybridlio.commands.gps_options import Antenna, MaxShift, Outages, gps_options
+from hybridlio.commands.terminal import complain, progress, say, say_table
+from hybridlio.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from hybridlio.gps import GpsOptions
-    from hybridlio.graph.offline import Smoothed
-    from hybridlio.record import Record
-    from hybridlio.report_data import Findings
+    from hybridlio.evaluation.report_data import Findings
+    from hybridlio.graph.run.smooth import Smoothed
+    from hybridlio.record.record import Record
+    from hybridlio.smoothing.gps_options import GpsOptions
 
 
 @guarded
@@ -47,10 +47,10 @@ def smooth(
     _verbose: Verbose = 0,
 ) -> None:
     """Optimise all poses of a finished run at once, and leave the better trajectory with a report of its own."""
-    from hybridlio.keyframes import Keyframes
-    from hybridlio.record import Record
-    from hybridlio.run_folder import KEYFRAMES, RECORD, SMOOTHED, new_run_folder, read_run
-    from hybridlio.run_outputs import write_smoothed
+    from hybridlio.record.keyframes import Keyframes
+    from hybridlio.record.record import Record
+    from hybridlio.runs.folder import KEYFRAMES, RECORD, SMOOTHED, new_run_folder, read_run
+    from hybridlio.runs.write import write_smoothed
 
     if not gps and not (antenna is None and outage is None and max_shift is None):
         raise ConfigError("--antenna, --outage and --max-shift are about GPS fixes; give --gps too")
@@ -71,8 +71,8 @@ def smooth(
 
 
 def _say_result(folder: Path, sequence: str, smoothed: Smoothed, findings: Findings) -> None:
-    from hybridlio.metrics_table import evaluation_table
-    from hybridlio.run_folder import POSES, REPORT
+    from hybridlio.evaluation.figures import evaluation_table
+    from hybridlio.runs.folder import POSES, REPORT
 
     error = (
         f"error {smoothed.error_before:.4g} before, {smoothed.error_after:.4g} after {smoothed.iterations} iterations"
@@ -95,7 +95,7 @@ def _say_result(folder: Path, sequence: str, smoothed: Smoothed, findings: Findi
 
 
 def _smooth(record: Record, loops: bool, gps: bool | GpsOptions, robust: str | None) -> Smoothed:
-    from hybridlio.graph.offline import smooth as optimise
+    from hybridlio.graph.run.smooth import smooth as optimise
 
     with progress("smoothing", "poses") as tick:
 

@@ -13,16 +13,16 @@ import typer
 
 from hybridlio.commands import common
 from hybridlio.commands.common import INTERRUPTED, guarded
-from hybridlio.errors import ConfigError
-from hybridlio.sources import INITIAL_POSE_SOURCES
-from hybridlio.terminal import Tick, complain, progress, say
+from hybridlio.commands.terminal import Tick, complain, progress, say
+from hybridlio.core.errors import ConfigError
+from hybridlio.odometry.registry import INITIAL_POSE_SOURCES
 
 if TYPE_CHECKING:
-    from hybridlio.learned.pairs import Pairs
+    from hybridlio.learned.data.pairs import Pairs
+    from hybridlio.learned.networks.weights import Weights
     from hybridlio.learned.settings import Recipe
-    from hybridlio.learned.training import TrainingProgress
-    from hybridlio.learned.validation import Validation
-    from hybridlio.learned.weights import Weights
+    from hybridlio.learned.training.train import TrainingProgress
+    from hybridlio.learned.training.validation import Validation
 
 Recordings = Annotated[
     list[Path], typer.Argument(metavar="DATA…", help="Recordings, folders of them, or shards.", show_default=False)
@@ -90,10 +90,10 @@ def train(
 
     An interrupted run goes on where its last checkpoint was when the same command is given again.
     """
-    from hybridlio.learned.devices import pick_device
-    from hybridlio.learned.weights import load_weights, weights_path
-    from hybridlio.recipes import origin, recipe_for
-    from hybridlio.training_data import DataOptions, training_pairs
+    from hybridlio.learned.networks.devices import pick_device
+    from hybridlio.learned.networks.weights import load_weights, weights_path
+    from hybridlio.runs.recipes import origin, recipe_for
+    from hybridlio.runs.training_data import DataOptions, training_pairs
 
     pick_device(device)
     if steps is not None and epochs is not None:
@@ -122,9 +122,9 @@ def _run(
     device: str,
     steps: int | None,
 ) -> None:
-    from hybridlio.learned.training import WEIGHTS, RunOptions
-    from hybridlio.learned.training import train as run
-    from hybridlio.recipes import lasting
+    from hybridlio.learned.training.train import WEIGHTS, RunOptions
+    from hybridlio.learned.training.train import train as run
+    from hybridlio.runs.recipes import lasting
 
     if steps is not None:
         recipe = lasting(recipe, steps, len(pairs))
@@ -167,7 +167,7 @@ def shown(what: str, unit: str) -> Iterator[Tick]:
 
 def clear(folder: Path) -> None:
     """Delete what a training run leaves, and nothing else."""
-    from hybridlio.learned.training import CHECKPOINT, WEIGHTS
+    from hybridlio.learned.training.train import CHECKPOINT, WEIGHTS
 
     for name in (CHECKPOINT, WEIGHTS, "recipe.json", "log.jsonl"):
         (folder / name).unlink(missing_ok=True)

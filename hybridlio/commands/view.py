@@ -10,8 +10,8 @@ from typing import Annotated
 import typer
 
 from hybridlio.commands.common import Verbose, guarded
-from hybridlio.errors import DataError
-from hybridlio.terminal import say
+from hybridlio.commands.terminal import say
+from hybridlio.core.errors import DataError
 
 
 @guarded
@@ -21,7 +21,7 @@ def view(
     """Open a run's report in the browser; without a display, print where it is."""
     import webbrowser
 
-    from hybridlio.run_folder import REPORT
+    from hybridlio.runs.folder import REPORT
 
     report = (run / REPORT).absolute()
     if not report.is_file():

@@ -9,7 +9,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from hybridlio.errors import DataError
+from hybridlio.core.errors import DataError
 
 _PLY_BYTES = {"char": 1, "short": 2, "int": 4, "float": 4, "double": 8} | {
     **{"uchar": 1, "ushort": 2, "uint": 4, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2},

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from hybridlio.errors import DataError
+from hybridlio.core.errors import DataError
 
 
 def read_csv(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:

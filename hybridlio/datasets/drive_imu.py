@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from hybridlio.core.sensors import ImuSamples
 from hybridlio.datasets.oxts import OxtsRows, read_oxts
 from hybridlio.datasets.sequence import Notes
 from hybridlio.datasets.stamps import note_coverage
-from hybridlio.sensors import ImuSamples
 
 _FILL_NS = 30_000_000  # a slow row is used where no fast one is this near: only in holes and beyond the ends
 

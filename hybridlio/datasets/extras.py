@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridlio.core.errors import DataError
+from hybridlio.core.geodesy import GeodeticPoint, check_geodetic, enu_from_geodetic, origin_of
+from hybridlio.core.sensors import LIDAR_MODELS, NS_PER_S, GpsFix, ImuNoise, LidarModel
 from hybridlio.datasets.csv_rows import read_csv
 from hybridlio.datasets.sequence import Notes
-from hybridlio.errors import DataError
-from hybridlio.geodesy import GeodeticPoint, check_geodetic, enu_from_geodetic, origin_of
-from hybridlio.sensors import LIDAR_MODELS, NS_PER_S, GpsFix, ImuNoise, LidarModel
 
 _LOCAL, _GEODETIC = ("east", "north", "up"), ("latitude", "longitude", "height")
 _LEAST_SIGMA_M = 1e-3  # an exact fix still needs a covariance that can be inverted

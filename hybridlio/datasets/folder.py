@@ -20,7 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlio import se3
+from hybridlio.core import se3
+from hybridlio.core.errors import DataError
+from hybridlio.core.files import read_yaml
+from hybridlio.core.sensors import LIDAR_MODELS, Calibration, ImuSamples, LidarModel, Scan
+from hybridlio.core.trajectory_files import read_tum
 from hybridlio.datasets.extras import note_fixes, read_gps_csv
 from hybridlio.datasets.imu_csv import read_imu_csv
 from hybridlio.datasets.point_files import SUFFIXES, read_scan
@@ -28,10 +32,6 @@ from hybridlio.datasets.reference import poses_at
 from hybridlio.datasets.sequence import Notes, Sequence
 from hybridlio.datasets.stamps import MISSING_STAMP, note_coverage, note_gaps, read_stamps, usable_scans
 from hybridlio.datasets.vertical_angle import raised
-from hybridlio.errors import DataError
-from hybridlio.files import read_yaml
-from hybridlio.sensors import LIDAR_MODELS, Calibration, ImuSamples, LidarModel, Scan
-from hybridlio.trajectory_files import read_tum
 
 LAYOUT = "a folder with .bin, .npy, .pcd or .ply scans (there or in scans/) and timestamps.txt"
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridlio.core.errors import DataError
+from hybridlio.core.sensors import NS_PER_S, ImuSamples
 from hybridlio.datasets.csv_rows import read_csv
 from hybridlio.datasets.sequence import Notes
 from hybridlio.datasets.stamps import note_gaps, sorted_unique
-from hybridlio.errors import DataError
-from hybridlio.sensors import NS_PER_S, ImuSamples
 
 _STANDARD_GRAVITY_M_S2 = 9.80665
 _FASTEST_RAD_S = 6.0  # a turn a second: of a vehicle, or of a hand for long, only degrees taken for radians

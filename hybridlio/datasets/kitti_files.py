@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlio import se3
-from hybridlio.errors import DataError
-from hybridlio.sensors import Scan
+from hybridlio.core import se3
+from hybridlio.core.errors import DataError
+from hybridlio.core.sensors import Scan
 
 Array = NDArray[np.float64]
 

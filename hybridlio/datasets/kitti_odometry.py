@@ -8,7 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlio import se3
+from hybridlio.core import se3
+from hybridlio.core.errors import DataError
+from hybridlio.core.sensors import LIDAR_MODELS, Calibration, ImuSamples
+from hybridlio.core.trajectory import Trajectory
+from hybridlio.core.trajectory_files import read_kitti
 from hybridlio.datasets.drive_imu import drive_imu
 from hybridlio.datasets.kitti_files import BinScans, numbered, read_calibration, rows_of
 from hybridlio.datasets.kitti_raw import read_drive_calibration
@@ -16,10 +20,6 @@ from hybridlio.datasets.oxts import read_oxts
 from hybridlio.datasets.sequence import Notes, Sequence
 from hybridlio.datasets.stamps import note_coverage, note_gaps, read_stamps, usable_scans
 from hybridlio.datasets.vertical_angle import kitti_raised
-from hybridlio.errors import DataError
-from hybridlio.sensors import LIDAR_MODELS, Calibration, ImuSamples
-from hybridlio.trajectory import Trajectory
-from hybridlio.trajectory_files import read_kitti
 
 LAYOUT = (
     "a sequence folder with velodyne/NNNNNN.bin and times.txt, or the folder above it, or its sequences/ beside poses/"

@@ -12,7 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlio import se3
+from hybridlio.core import se3
+from hybridlio.core.errors import DataError
+from hybridlio.core.sensors import LIDAR_MODELS, Calibration
+from hybridlio.core.trajectory import Trajectory
+from hybridlio.core.trajectory_files import read_kitti
 from hybridlio.datasets.drive_imu import drive_imu, fast_rows
 from hybridlio.datasets.extras import note_fixes, read_gps_csv, read_simulation
 from hybridlio.datasets.kitti_files import BinScans, numbered, read_calibration, read_rigid, rows_of
@@ -20,10 +24,6 @@ from hybridlio.datasets.oxts import OxtsRows, read_oxts
 from hybridlio.datasets.sequence import Notes, Sequence
 from hybridlio.datasets.stamps import MISSING_STAMP, note_coverage, note_gaps, read_stamps, usable_scans
 from hybridlio.datasets.vertical_angle import kitti_raised
-from hybridlio.errors import DataError
-from hybridlio.sensors import LIDAR_MODELS, Calibration
-from hybridlio.trajectory import Trajectory
-from hybridlio.trajectory_files import read_kitti
 
 LAYOUT = "a drive folder with velodyne_points/data/NNNNNNNNNN.bin, or the date or root folder above it"
 

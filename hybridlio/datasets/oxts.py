@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hybridlio import se3
+from hybridlio.core import se3
+from hybridlio.core.errors import DataError
+from hybridlio.core.sensors import ImuSamples
+from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.gyro_lag import gyro_lag_ns
 from hybridlio.datasets.kitti_files import numbered
 from hybridlio.datasets.reference import poses_at
 from hybridlio.datasets.sequence import Notes
 from hybridlio.datasets.stamps import MISSING_STAMP, note_gaps, read_stamps, sorted_unique
-from hybridlio.errors import DataError
-from hybridlio.sensors import ImuSamples
-from hybridlio.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridlio.core.errors import DataError
+from hybridlio.core.sensors import NS_PER_S, Scan
 from hybridlio.datasets.cloud_headers import check_whole
 from hybridlio.datasets.kitti_files import read_bin
-from hybridlio.errors import DataError
-from hybridlio.sensors import NS_PER_S, Scan
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlio import se3
+from hybridlio.core import se3
+from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.sequence import Notes
-from hybridlio.trajectory import Trajectory
 
 _MAX_AWAY_NS = 250_000_000
 

@@ -8,13 +8,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from hybridlio.core.errors import ConfigError, DataError
+from hybridlio.core.sensors import NS_PER_S
+from hybridlio.core.tables import counted
 from hybridlio.datasets import folder, kitti_odometry, kitti_raw
+from hybridlio.datasets.imu_faults import without_spikes
 from hybridlio.datasets.sequence import Notes, Sequence
 from hybridlio.datasets.vertical_angle import check_angle
-from hybridlio.errors import ConfigError, DataError
-from hybridlio.imu_faults import without_spikes
-from hybridlio.sensors import NS_PER_S
-from hybridlio.tables import counted
 
 
 @dataclass(frozen=True)

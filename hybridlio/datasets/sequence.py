@@ -10,9 +10,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlio.errors import ConfigError, DataError
-from hybridlio.sensors import NS_PER_S, Calibration, Frame, GpsFix, ImuNoise, ImuSamples, LidarModel, Scan
-from hybridlio.trajectory import Trajectory
+from hybridlio.core.errors import ConfigError, DataError
+from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, GpsFix, ImuNoise, ImuSamples, LidarModel, Scan
+from hybridlio.core.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
 

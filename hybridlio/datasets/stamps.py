@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridlio.core.errors import DataError
+from hybridlio.core.sensors import NS_PER_S
 from hybridlio.datasets.sequence import Notes
-from hybridlio.errors import DataError
-from hybridlio.sensors import NS_PER_S
 
 Stamps = NDArray[np.int64]
 

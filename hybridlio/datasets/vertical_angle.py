@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridlio.core.errors import ConfigError, DataError
+from hybridlio.core.sensors import Scan
 from hybridlio.datasets.sequence import Notes
-from hybridlio.errors import ConfigError, DataError
-from hybridlio.sensors import Scan
 
 KITTI_VERTICAL_ANGLE_DEG = 0.205
 

@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hybridlio import se3
-from hybridlio.estimates import KeyframePose, RelativePose, State
-from hybridlio.record import Record
-from hybridlio.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples, Scan
-from hybridlio.simulation.imu import ideal_imu
-from hybridlio.simulation.path import SmoothPath
+from hybridlio.core import se3
+from hybridlio.core.estimates import KeyframePose, RelativePose, State
+from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples, Scan
+from hybridlio.core.start_state import GRAVITY_MAGNITUDE_SIGMA_M_S2, start_state
+from hybridlio.core.trajectory import Trajectory
+from hybridlio.record.record import Record
+from hybridlio.simulation.drive.path import SmoothPath
 from hybridlio.simulation.rig import GRAVITY_M_S2
-from hybridlio.startup import GRAVITY_MAGNITUDE_SIGMA_M_S2, start_state
-from hybridlio.trajectory import Trajectory
+from hybridlio.simulation.sensors.imu import ideal_imu
 
 Array = NDArray[np.float64]
 

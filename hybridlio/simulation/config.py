@@ -7,8 +7,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from hybridlio.errors import ConfigError
-from hybridlio.sensors import LIDAR_MODELS, ImuNoise, LidarModel
+from hybridlio.core.errors import ConfigError
+from hybridlio.core.sensors import LIDAR_MODELS, ImuNoise, LidarModel
 
 Scene = Literal["town", "corridor", "field"]
 Driving = Literal["calm", "hard"]
@@ -25,7 +25,7 @@ class SimulationConfig(BaseModel):
         driving: ``calm``, or ``hard``: bends at 6 m/s² sideways, brakes at 7 m/s². Not used along a pose file.
         scene: ``town`` (houses, gardens, open stretches), ``corridor`` (smooth parallel walls: hardly anything says
             how far one went) or ``field`` (open ground and a few distant trees: hardly anything at all).
-        lidar: a name of :data:`hybridlio.sensors.LIDAR_MODELS`.
+        lidar: a name of :data:`hybridlio.core.sensors.LIDAR_MODELS`.
         motion_distortion: the car moves during a sweep, and points carry times; else a scan is one instant.
         start_moving: begin at cruising speed instead of from two seconds of standstill.
         loops: the route comes back to streets it has been in.

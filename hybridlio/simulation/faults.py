@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridlio.core.errors import ConfigError
+from hybridlio.core.sensors import NS_PER_S, ImuNoise, ImuSamples, Scan
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.errors import ConfigError
-from hybridlio.sensors import NS_PER_S, ImuNoise, ImuSamples, Scan
-from hybridlio.trajectory_errors import select
+from hybridlio.evaluation.ate_rpe import select
 
 
 def drop_scans(sequence: Sequence, share: float, seed: int = 0) -> Sequence:
@@ -82,7 +82,7 @@ def imu_gap(sequence: Sequence, start_s: float, end_s: float) -> Sequence:
 def imu_bias(sequence: Sequence, sigmas: float, seed: int = 0) -> Sequence:
     """Add to every axis of gyroscope and accelerometer a constant bias ``sigmas`` times what is assumed of it.
 
-    What is assumed is the recording's :class:`~hybridlio.sensors.ImuNoise`, else the default; signs are random.
+    What is assumed is the recording's :class:`~hybridlio.core.sensors.ImuNoise`, else the default; signs are random.
     """
     noise = sequence.imu_noise or ImuNoise()
     signs = np.random.default_rng([seed, 12]).choice([-1.0, 1.0], (2, 3))

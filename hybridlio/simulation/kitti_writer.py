@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hybridlio import se3
-from hybridlio.files import write_whole
-from hybridlio.geodesy import GeodeticPoint
-from hybridlio.sensors import Scan
-from hybridlio.simulation.path import Motion
+from hybridlio.core import se3
+from hybridlio.core.files import write_whole
+from hybridlio.core.geodesy import GeodeticPoint
+from hybridlio.core.sensors import Scan
+from hybridlio.simulation.drive.path import Motion
 from hybridlio.simulation.rig import T_CAMERA_LIDAR, T_LIDAR_IMU
 
 Array = NDArray[np.float64]

@@ -10,17 +10,17 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from hybridlio.simulation.config import SimulationConfig
-from hybridlio.simulation.ground import CAMBER, Ground, Height, land_along, waves
-from hybridlio.simulation.layout import lay_out
-from hybridlio.simulation.path import SmoothPath
-from hybridlio.simulation.pose_files import path_along, read_lidar_poses
-from hybridlio.simulation.revisits import level_revisits
+from hybridlio.simulation.drive.path import SmoothPath
+from hybridlio.simulation.drive.pose_files import path_along, read_lidar_poses
+from hybridlio.simulation.drive.revisits import level_revisits
+from hybridlio.simulation.drive.rises import without_false_rises
+from hybridlio.simulation.drive.traffic import MovingCar, traffic
+from hybridlio.simulation.drive.vehicle import FINE_S, drive_path, lane_of
 from hybridlio.simulation.rig import LIDAR_HEIGHT_M, SCAN_RATE_HZ, T_IMU_LIDAR
-from hybridlio.simulation.rises import without_false_rises
-from hybridlio.simulation.roads import LANE_OFFSET_M, MANNERS, STEP_M, Road, drive, generate_centreline
-from hybridlio.simulation.traffic import MovingCar, traffic
-from hybridlio.simulation.vehicle import FINE_S, drive_path, lane_of
-from hybridlio.simulation.world import World
+from hybridlio.simulation.world.ground import CAMBER, Ground, Height, land_along, waves
+from hybridlio.simulation.world.layout import lay_out
+from hybridlio.simulation.world.roads import LANE_OFFSET_M, MANNERS, STEP_M, Road, drive, generate_centreline
+from hybridlio.simulation.world.world import World
 
 Array = NDArray[np.float64]
 

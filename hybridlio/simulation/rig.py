@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hybridlio import se3
+from hybridlio.core import se3
 
 Array = NDArray[np.float64]
 

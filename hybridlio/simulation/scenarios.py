@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from hybridlio.core.errors import ConfigError
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.errors import ConfigError
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.faults import block_sector, drop_scans, imu_bias, imu_gap
 from hybridlio.simulation.simulate import Progress, simulate

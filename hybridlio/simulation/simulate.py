@@ -12,13 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlio.errors import DataError
-from hybridlio.files import alone_in, write_whole
-from hybridlio.geodesy import origin_of
-from hybridlio.sensors import NS_PER_S, Scan
+from hybridlio.core.errors import DataError
+from hybridlio.core.files import alone_in, write_whole
+from hybridlio.core.geodesy import origin_of
+from hybridlio.core.sensors import NS_PER_S, Scan
 from hybridlio.simulation.config import SimulationConfig
-from hybridlio.simulation.gps import gps_csv, gps_fixes
-from hybridlio.simulation.imu import add_noise, ideal_imu
 from hybridlio.simulation.kitti_writer import (
     FIRST_PLACE,
     START_NS,
@@ -30,9 +28,11 @@ from hybridlio.simulation.kitti_writer import (
     write_oxts,
     write_scan,
 )
-from hybridlio.simulation.lidar import RayPattern, first_hits, measure, ray_pattern
 from hybridlio.simulation.plan import Drive, plan
 from hybridlio.simulation.rig import IMU_RATE_HZ, SCAN_RATE_HZ, T_IMU_LIDAR
+from hybridlio.simulation.sensors.gps import gps_csv, gps_fixes
+from hybridlio.simulation.sensors.imu import add_noise, ideal_imu
+from hybridlio.simulation.sensors.lidar import RayPattern, first_hits, measure, ray_pattern
 
 Progress = Callable[[int, int], None]
 

@@ -6,10 +6,10 @@ import gtsam
 import numpy as np
 import pytest
 
-from hybridlio import se3
-from hybridlio.errors import GraphError
+from hybridlio.core import se3
+from hybridlio.core.errors import GraphError
 from hybridlio.graph import PoseGraph
-from hybridlio.graph.measurements import Robust
+from hybridlio.graph.model.measurements import Robust
 
 SIGMAS = np.array([0.01, 0.02, 0.03, 0.1, 0.2, 0.3])
 

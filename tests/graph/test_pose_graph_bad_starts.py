@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hybridlio import se3
+from hybridlio.core import se3
 from hybridlio.graph import PoseGraph
 
 SPREAD_M = 50.0  # the sphere's radius

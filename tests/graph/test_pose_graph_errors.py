@@ -7,9 +7,9 @@ import re
 import numpy as np
 import pytest
 
-from hybridlio.errors import ConfigError, DataError, GraphError
+from hybridlio.core.errors import ConfigError, DataError, GraphError
+from hybridlio.core.sensors import ImuNoise, ImuSamples
 from hybridlio.graph import PoseGraph
-from hybridlio.sensors import ImuNoise, ImuSamples
 
 NAN = np.full((4, 4), np.nan)
 SKEWED = np.eye(6) + np.triu(np.ones((6, 6)), 1)

@@ -9,10 +9,10 @@ import gtsam
 import numpy as np
 import pytest
 
-from hybridlio import se3
-from hybridlio.errors import DataError, GraphError
+from hybridlio.core import se3
+from hybridlio.core.errors import DataError, GraphError
+from hybridlio.core.sensors import ImuNoise, ImuSamples
 from hybridlio.graph import PoseGraph
-from hybridlio.sensors import ImuNoise, ImuSamples
 
 SPACE = """VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1
 VERTEX_SE3:QUAT 1 1.5 0.25 -0.125 0 0 0.6 0.8

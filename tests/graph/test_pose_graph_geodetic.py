@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybridlio import se3
-from hybridlio.errors import DataError, GraphError
-from hybridlio.geodesy import GeodeticPoint, geodetic_from_enu
+from hybridlio.core import se3
+from hybridlio.core.errors import DataError, GraphError
+from hybridlio.core.geodesy import GeodeticPoint, geodetic_from_enu
 from hybridlio.graph import PoseGraph
 
 ORIGIN = GeodeticPoint(49.011, 8.416, 112.0)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybridlio import se3
+from hybridlio.core import se3
+from hybridlio.core.sensors import ImuNoise, ImuSamples
 from hybridlio.graph import PoseGraph
-from hybridlio.sensors import ImuNoise, ImuSamples
 
 STEP_SIGMAS = np.r_[np.full(3, 1e-3), np.full(3, 0.02)]  # as the simulated drive's
 
@@ -59,7 +59,7 @@ def test_inertial_factors_find_velocity_and_biases_and_better_poses(chain):
 
 
 def _matrix(coordinates: np.ndarray) -> np.ndarray:
-    from hybridlio.graph.coordinates import to_matrices
+    from hybridlio.graph.model.coordinates import to_matrices
 
     return to_matrices(coordinates[None])[0]
 

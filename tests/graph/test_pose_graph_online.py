@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybridlio import se3
-from hybridlio.errors import ConfigError, GraphError
+from hybridlio.core import se3
+from hybridlio.core.errors import ConfigError, GraphError
+from hybridlio.core.sensors import ImuSamples
 from hybridlio.graph import PoseGraph
-from hybridlio.sensors import ImuSamples
 
 SIGMAS = np.array([0.01, 0.01, 0.01, 0.05, 0.05, 0.05])
 STEP = np.array([0, 0, 0.1, 1, 0, 0])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typer.testing import CliRunner, Result
 
-from hybridlio.cli import app
+from hybridlio.commands.app import app
 
 
 def run(*words: object) -> Result:

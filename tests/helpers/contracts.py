@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from hybridlio import se3
+from hybridlio.core import se3
+from hybridlio.core.estimates import RelativePose, State
+from hybridlio.core.sensors import NS_PER_S, Frame, ImuNoise
+from hybridlio.core.start_state import start_state
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.estimates import RelativePose, State
-from hybridlio.sensors import NS_PER_S, Frame, ImuNoise
-from hybridlio.startup import start_state
 
 
 def true_step(sequence: Sequence, i: int, j: int) -> RelativePose:

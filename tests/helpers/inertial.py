@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from hybridlio.estimates import State
-from hybridlio.sensors import NS_PER_S, ImuNoise, ImuSamples
+from hybridlio.core.estimates import State
+from hybridlio.core.sensors import NS_PER_S, ImuNoise, ImuSamples
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 CERTAIN = 1e-18 * np.eye(15)

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from hybridlio import se3
-from hybridlio.estimates import RelativePose, State
-from hybridlio.graph.inertial_steps import InertialSteps
-from hybridlio.graph.online import IncrementalBackend
+from hybridlio.core import se3
+from hybridlio.core.estimates import RelativePose, State
+from hybridlio.graph.run.inertial_steps import InertialSteps
+from hybridlio.graph.run.isam_backend import IncrementalBackend
 
 
 def run(chain: Any) -> tuple[IncrementalBackend, list[State], list[RelativePose]]:

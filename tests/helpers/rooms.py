@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hybridlio import se3
+from hybridlio.core import se3
 
 
 def wall(

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hybridlio.sensors import Frame, Scan
+from hybridlio.core.sensors import Frame, Scan
 
 
 def blind(frame: Frame) -> Frame:

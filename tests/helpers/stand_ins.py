@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from hybridlio import se3
+from hybridlio.core import se3
+from hybridlio.core.sensors import Frame, ImuSamples, Scan
 from hybridlio.learned.source_settings import NetworkResidualSettings
-from hybridlio.sensors import Frame, ImuSamples, Scan
 
 STEP = se3.exp([0.0, 0.0, 0.03, 0.3, 0.05, 0.0])
 WIDE = np.diag(np.r_[np.full(3, 1e-4), np.full(3, 1e-2)])

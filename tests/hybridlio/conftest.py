@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from command_line import ok
 
-from hybridlio.config import Config
+from hybridlio.core.sensors import Frame, ImuNoise
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.learned.source_settings import LstmSettings, NetworkResidualSettings
-from hybridlio.sensors import Frame, ImuNoise
-from hybridlio.sources import Setup
+from hybridlio.odometry.config import Config
+from hybridlio.odometry.registry import Setup
 
 
 @pytest.fixture(scope="session")
@@ -49,7 +49,7 @@ def setup(sequence: Sequence, learned_config: Config) -> Setup:
 @pytest.fixture
 def without_pages(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spare the test the report and its pictures, which take a second."""
-    monkeypatch.setattr("hybridlio.run_outputs.write_pages", lambda *_: None)
+    monkeypatch.setattr("hybridlio.runs.write.write_pages", lambda *_: None)
 
 
 @pytest.fixture(scope="session")
@@ -57,7 +57,7 @@ def finished_run(tiny_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     """The folder of a run over the whole drive, without its pages; read it, do not change it."""
     folder = tmp_path_factory.mktemp("cli") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hybridlio.run_outputs.write_pages", lambda *_: None)
+        patch.setattr("hybridlio.runs.write.write_pages", lambda *_: None)
         ok("odometry", tiny_drive, "-o", folder)
     return folder
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import torch
 
-from hybridlio import se3
-from hybridlio.learned.odometry_network import OdometryNetwork
+from hybridlio.cloud.projection import MapGeometry, vertex_map
+from hybridlio.core import se3
+from hybridlio.learned.data.shards import ScanRecord, Shard, write_shard
+from hybridlio.learned.networks.odometry_network import OdometryNetwork
+from hybridlio.learned.networks.weights import save_weights
 from hybridlio.learned.settings import LossSettings, NetworkSettings, OptimiserSettings, Recipe
-from hybridlio.learned.shards import ScanRecord, Shard, write_shard
-from hybridlio.learned.weights import save_weights
-from hybridlio.projection import MapGeometry, vertex_map
 
 GEOMETRY = MapGeometry(20.0, -20.0, 12, 60)
 SEEN_GEOMETRY = MapGeometry(40.0, -40.0, 40, 180)

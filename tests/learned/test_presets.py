@@ -4,11 +4,11 @@ from dataclasses import FrozenInstanceError, replace
 import pytest
 import torch
 
-from hybridlio.errors import ConfigError
-from hybridlio.learned.odometry_network import OdometryNetwork, parameter_count
+from hybridlio.core.errors import ConfigError
+from hybridlio.learned.networks.odometry_network import OdometryNetwork, parameter_count
 from hybridlio.learned.presets import PAPER, PRESETS, TABLES, preset, split, table
-from hybridlio.learned.published import published
 from hybridlio.learned.settings import LossSettings, NetworkSettings, OptimiserSettings, Recipe, from_dict, to_dict
+from hybridlio.learned.training.published import published
 
 
 def test_the_papers_preset_has_the_published_numbers():

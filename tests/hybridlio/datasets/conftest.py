@@ -12,10 +12,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hybridlio import se3
-from hybridlio.sensors import ImuSamples
-from hybridlio.trajectory import Trajectory
-from hybridlio.trajectory_files import write_kitti, write_tum
+from hybridlio.core import se3
+from hybridlio.core.sensors import ImuSamples
+from hybridlio.core.trajectory import Trajectory
+from hybridlio.core.trajectory_files import write_kitti, write_tum
 
 Array = NDArray[np.float64]
 EARTH_RADIUS_M, LATITUDE_DEG, LONGITUDE_DEG = 6378137.0, 49.0, 8.4

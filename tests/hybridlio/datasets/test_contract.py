@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hybridlio.core.errors import DataError
+from hybridlio.core.sensors import Scan
 from hybridlio.datasets import READERS, Sequence, open_sequence, sequence_names
-from hybridlio.errors import DataError
-from hybridlio.sensors import Scan
 
 # a new reader is tested by adding how its layout is written: (fixture, folder) -> arguments of open_sequence
 WRITERS: dict[str, Callable[[Any, Path], dict[str, Any]]] = {

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hybridlio import se3
+from hybridlio.core import se3
+from hybridlio.core.errors import DataError
+from hybridlio.core.sensors import LIDAR_MODELS
+from hybridlio.core.trajectory import Trajectory
+from hybridlio.core.trajectory_files import write_tum
 from hybridlio.datasets import open_sequence
-from hybridlio.errors import DataError
-from hybridlio.sensors import LIDAR_MODELS
-from hybridlio.trajectory import Trajectory
-from hybridlio.trajectory_files import write_tum
 
 
 @pytest.fixture

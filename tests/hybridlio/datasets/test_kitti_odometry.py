@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hybridlio import se3
+from hybridlio.core import se3
+from hybridlio.core.errors import DataError
+from hybridlio.core.trajectory_files import read_kitti, write_kitti
 from hybridlio.datasets import open_sequence
 from hybridlio.datasets.kitti_odometry import RAW_DRIVES
-from hybridlio.errors import DataError
-from hybridlio.trajectory_files import read_kitti, write_kitti
 
 MS = 1_000_000
 

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
+from hybridlio.core.errors import DataError
+from hybridlio.core.sensors import ImuSamples
 from hybridlio.datasets import open_sequence
 from hybridlio.datasets.kitti_raw import find
 from hybridlio.datasets.oxts import read_oxts
 from hybridlio.datasets.sequence import Notes
-from hybridlio.errors import DataError
-from hybridlio.sensors import ImuSamples
 
 MS = 1_000_000
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hybridlio.core.errors import DataError
 from hybridlio.datasets import open_sequence
 from hybridlio.datasets.oxts import read_oxts
 from hybridlio.datasets.sequence import Notes
-from hybridlio.errors import DataError
 
 MS = 1_000_000
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hybridlio.core.errors import DataError
+from hybridlio.core.sensors import LIDAR_MODELS, ImuNoise
+from hybridlio.core.trajectory import Trajectory
+from hybridlio.core.trajectory_files import write_kitti
 from hybridlio.datasets import open_sequence
-from hybridlio.errors import DataError
-from hybridlio.sensors import LIDAR_MODELS, ImuNoise
-from hybridlio.trajectory import Trajectory
-from hybridlio.trajectory_files import write_kitti
 
 MS = 1_000_000
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hybridlio import se3
+from hybridlio.core import se3
+from hybridlio.core.sensors import ImuSamples
 from hybridlio.datasets.oxts import OxtsRows, read_oxts
 from hybridlio.datasets.sequence import Notes
-from hybridlio.sensors import ImuSamples
 
 START_NS = 1_317_042_272_000_000_000
 MS = 1_000_000

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from hybridlio.core.errors import DataError
 from hybridlio.datasets.point_files import read_scan
-from hybridlio.errors import DataError
 
 STAMP_NS = 1_600_000_000_000_000_000
 COUNT = 40

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.datasets import READERS, open_sequence, sequence_names
-from hybridlio.errors import ConfigError, DataError
 
 
 def test_where_no_reader_fits_every_layout_tried_is_listed(tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hybridlio.core.errors import DataError
 from hybridlio.datasets.sequence import Notes
 from hybridlio.datasets.stamps import MISSING_STAMP, increasing, note_gaps, read_stamps, sorted_unique
-from hybridlio.errors import DataError
 
 
 @pytest.mark.parametrize(

@@ -3,11 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hybridlio.core.errors import ConfigError
+from hybridlio.core.sensors import ImuNoise, ImuSamples, Scan
+from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.errors import ConfigError
-from hybridlio.sensors import ImuNoise, ImuSamples, Scan
 from hybridlio.simulation.faults import block_sector, drop_scans, imu_bias, imu_gap
-from hybridlio.trajectory import Trajectory
 
 STAMPS = 1_700_000_000_000_000_000 + np.arange(101) * 100_000_000
 

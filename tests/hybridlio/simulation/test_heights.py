@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hybridlio import se3
+from hybridlio.core import se3
 from hybridlio.simulation.config import SimulationConfig
+from hybridlio.simulation.drive.pose_files import read_lidar_poses
+from hybridlio.simulation.drive.revisits import level_revisits
+from hybridlio.simulation.drive.rises import without_false_rises
 from hybridlio.simulation.plan import plan
-from hybridlio.simulation.pose_files import read_lidar_poses
-from hybridlio.simulation.revisits import level_revisits
 from hybridlio.simulation.rig import LIDAR_HEIGHT_M, T_IMU_LIDAR
-from hybridlio.simulation.rises import without_false_rises
 
 
 def along(xy: np.ndarray, height: np.ndarray, speed_m_s: float = 8.0) -> np.ndarray:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybridlio.errors import ConfigError
+from hybridlio.core.errors import ConfigError
 from hybridlio.simulation.plan import plan
 from hybridlio.simulation.scenarios import SCENARIOS, open_scenario, scenario_config
 

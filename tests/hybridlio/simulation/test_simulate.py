@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from hybridlio import se3
-from hybridlio.errors import ConfigError, DataError
+from hybridlio.core import se3
+from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.simulation import SimulationConfig, simulate
 from hybridlio.simulation.kitti_writer import DATE
 from hybridlio.simulation.plan import plan

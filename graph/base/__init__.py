@@ -1,0 +1,1 @@
+"""Thin layers over GTSAM: noise models, iSAM2, preintegration, marginals."""

@@ -1,0 +1,95 @@
+"""IMU preintegration (Forster et al., "On-Manifold Preintegration", TRO 2017) by GTSAM."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from hybridlio.core import se3
+from hybridlio.core.errors import DataError
+from hybridlio.core.estimates import Array, State
+from hybridlio.core.sensors import NS_PER_S, ImuNoise, ImuSamples
+
+# What a vehicle can do between two samples that linear interpolation does not see. At 100 Hz it is below the sensor's
+# own noise; at 10 Hz, or across a gap, it is what the uncertainty consists of.
+_JERK_M_S3 = 5.0
+_ANGULAR_ACCELERATION_RAD_S2 = 0.5
+LARGEST_ACCELERATION_M_S2 = 4.0
+LARGEST_RATE_RAD_S = 0.6
+
+
+def sampling_noise(noise: ImuNoise, gap_s: float) -> tuple[float, float]:
+    """White-noise densities ``(accel, gyro)`` of an IMU whose longest time without a sample is ``gap_s``.
+
+    Adds to the sensor's own noise the motion that samples so far apart cannot show, growing with the gap up to the
+    accelerations and rates a vehicle reaches; constant over the gap, so its density is the deviation times √gap.
+    """
+    accel = min(_JERK_M_S3 * gap_s / 4, LARGEST_ACCELERATION_M_S2) * np.sqrt(gap_s)
+    gyro = min(_ANGULAR_ACCELERATION_RAD_S2 * gap_s / 4, LARGEST_RATE_RAD_S) * np.sqrt(gap_s)
+    return float(np.hypot(noise.accel_m_s2_sqrt_hz, accel)), float(np.hypot(noise.gyro_rad_s_sqrt_hz, gyro))
+
+
+def _params(noise: ImuNoise, gap_s: float, gravity: Array) -> gtsam.PreintegrationCombinedParams:
+    accel, gyro = sampling_noise(noise, gap_s)
+    params = gtsam.PreintegrationCombinedParams(gravity)
+    params.setAccelerometerCovariance(np.eye(3) * accel**2)
+    params.setGyroscopeCovariance(np.eye(3) * gyro**2)
+    params.setIntegrationCovariance(np.eye(3) * 1e-8)  # GTSAM needs it positive; 0.1 mm per root second
+    params.setBiasAccCovariance(np.eye(3) * noise.accel_walk_m_s3_sqrt_hz**2)
+    params.setBiasOmegaCovariance(np.eye(3) * noise.gyro_walk_rad_s2_sqrt_hz**2)
+    return params
+
+
+def bias_of(state: State) -> gtsam.imuBias.ConstantBias:
+    """The state's biases as GTSAM has them."""
+    return gtsam.imuBias.ConstantBias(state.accel_bias_m_s2, state.gyro_bias_rad_s)
+
+
+def preintegrate(imu: ImuSamples, state: State, noise: ImuNoise) -> gtsam.PreintegratedCombinedMeasurements:
+    """Sum up the samples from the state's stamp to the last, with the state's biases and gravity.
+
+    Each step between two samples takes their mean (trapezoidal rule). The noise grows with the longest step
+    (:func:`sampling_noise`).
+
+    Raises:
+        DataError: there are fewer than two samples.
+    """
+    if len(imu) < 2:
+        raise DataError(f"preintegration: {len(imu)} IMU samples after {state.stamp_ns} ns, at least 2 are needed")
+    steps_s = np.diff(imu.stamps_ns) / NS_PER_S
+    params = _params(noise, float(steps_s.max()), state.gravity_m_s2)
+    pim = gtsam.PreintegratedCombinedMeasurements(params, bias_of(state))
+    gyro = (imu.gyro_rad_s[1:] + imu.gyro_rad_s[:-1]) / 2
+    # GTSAM takes the force in the frame at the step's start, from where the second sample's frame has turned
+    turned = se3.so3_exp((gyro - state.gyro_bias_rad_s) * steps_s[:, None])
+    accel = (imu.accel_m_s2[:-1] + (turned @ imu.accel_m_s2[1:, :, None])[..., 0]) / 2
+    for step_s, a, w in zip(steps_s, accel, gyro, strict=True):
+        pim.integrateMeasurement(a, w, step_s)
+    return pim
+
+
+def covers(imu: ImuSamples, start_ns: int, end_ns: int) -> bool:
+    """Whether the samples reach from ``start_ns`` to ``end_ns`` (within a millisecond), so that they say it all."""
+    slack = NS_PER_S // 1000
+    return len(imu) >= 2 and imu.stamps_ns[0] <= start_ns + slack and imu.stamps_ns[-1] >= end_ns - slack
+
+
+def predict_step(pim: gtsam.PreintegratedCombinedMeasurements, state: State) -> tuple[Array, Array]:
+    """The IMU's pose after the samples, in its pose before them, with covariance ``(6, 6)``.
+
+    Carries the state's uncertainty (velocity, tilt, biases, gravity) and the samples' noise.
+    """
+    now = gtsam.NavState(gtsam.Pose3(state.T_world_imu), state.velocity_m_s)
+    by_state, by_bias = np.zeros((9, 9), order="F"), np.zeros((9, 6), order="F")
+    then = pim.predict(now, bias_of(state), by_state, by_bias)
+    step = se3.between(state.T_world_imu, then.pose().matrix())
+    R_world_imu, R_step = state.T_world_imu[:3, :3], step[:3, :3]
+    # GTSAM perturbs a NavState's velocity in the body's frame; the state's covariance is of the velocity in world
+    by_state[:, 6:] = by_state[:, 6:] @ R_world_imu.T
+    by_pose = by_state[:6, :6] - se3.adjoint(se3.inverse(step))
+    J = np.hstack([by_pose, by_state[:6, 6:], by_bias[:6]])
+    half_dt2 = pim.deltaTij() ** 2 / 2
+    by_gravity = np.vstack([np.zeros((3, 3)), half_dt2 * (R_world_imu @ R_step).T])
+    noise = pim.preintMeasCov()[:6, :6]
+    covariance = J @ state.covariance @ J.T + by_gravity @ state.gravity_covariance @ by_gravity.T + noise
+    return step, (covariance + covariance.T) / 2

@@ -1,0 +1,176 @@
+"""Pose graphs as NumPy archives: everything a graph holds, to the last bit, without pickles."""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from hybridlio.core.errors import DataError
+from hybridlio.core.estimates import Array
+from hybridlio.core.files import UNREADABLE_NPZ, write_whole
+from hybridlio.core.sensors import ImuSamples
+from hybridlio.graph.model import coordinates as co
+from hybridlio.graph.model.edge_table import FORMS
+from hybridlio.graph.model.graph_data import GraphData
+from hybridlio.graph.model.keys import Key, check_key
+from hybridlio.graph.model.measurements import Factor, Kind, Noise, Robust, check_vector, make_noise, make_robust
+from hybridlio.graph.pose_graph import PoseGraph
+
+_FORMAT = "hybridlio pose graph 1"
+_NO_ROBOT = -1
+
+
+def write_npz(data: GraphData, path: str | os.PathLike[str]) -> None:
+    """Write all of a graph.
+
+    Raises:
+        DataError: the place cannot be written to.
+    """
+    keys = data.keys
+    key_table = _key_table([(key,) for key in keys], 1)
+    arrays: dict[str, Any] = {
+        "format": np.array(_FORMAT),
+        "dimension": np.array(data.dimension),
+        "next_id": np.array(data.next_id),
+        "keys": key_table,
+        "initial": data.coordinates_or_nan,
+        "fixed": np.array([key in data.fixed for key in keys], dtype=bool),
+    }
+    if data.origin is not None:
+        arrays["origin"] = np.array(data.origin)
+    if len(data.edges):
+        arrays |= {f"between_{name}": column for name, column in _edge_columns(data, key_table[:, 0]).items()}
+    for kind in get_args(Kind):
+        numbered = {number: factor for number, factor in data.others.items() if factor.kind == kind}
+        if numbered:
+            arrays |= {f"{kind}_{name}": column for name, column in _columns(numbered).items()}
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    write_whole(path, buffer.getvalue())
+
+
+def _edge_columns(data: GraphData, keys: Any) -> dict[str, Any]:
+    table = data.edges
+    kernels = [table.robust.get(number) for number in table.ids.tolist()]
+    return {
+        "id": table.ids,
+        "keys": keys[table.ends],
+        "measured": table.measured,
+        "kernel": np.array([kernel.kernel if kernel else "" for kernel in kernels]),
+        "width": np.array([kernel.width if kernel else np.nan for kernel in kernels]),
+        "noise_form": np.array(FORMS)[table.form],
+        "noise": table.noise,
+    }
+
+
+def _key_table(keys: list[tuple[Key, ...]], width: int) -> Any:
+    rows = [[(_NO_ROBOT, key) if isinstance(key, int) else key for key in row] for row in keys]
+    return np.array(rows, dtype=np.int64).reshape(-1, width, 2)
+
+
+def _columns(numbered: dict[int, Factor]) -> dict[str, Any]:
+    factors = list(numbered.values())
+    columns: dict[str, Any] = {
+        "id": np.array(list(numbered), dtype=np.int64),
+        "keys": _key_table([factor.keys for factor in factors], len(factors[0].keys)),
+        "measured": np.array([factor.measured for factor in factors]),
+        "kernel": np.array([factor.robust.kernel if factor.robust else "" for factor in factors]),
+        "width": np.array([factor.robust.width if factor.robust else np.nan for factor in factors]),
+    }
+    noises = [factor.noise for factor in factors if factor.noise is not None]
+    if noises:
+        columns["noise_form"] = np.array([noise.form for noise in noises])
+        columns["noise"] = np.array([np.diag(n.values) if n.form == "sigmas" else n.values for n in noises])
+    samples = [factor.samples for factor in factors if factor.samples is not None]
+    if samples:
+        columns["sample_count"] = np.array([len(part) for part in samples], dtype=np.int64)
+        columns["stamps_ns"] = np.concatenate([part.stamps_ns for part in samples])
+        columns["gyro_rad_s"] = np.concatenate([part.gyro_rad_s for part in samples])
+        columns["accel_m_s2"] = np.concatenate([part.accel_m_s2 for part in samples])
+    return columns
+
+
+def read_npz(path: str | os.PathLike[str]) -> PoseGraph:
+    """Read what :func:`write_npz` wrote.
+
+    Raises:
+        DataError: the file cannot be read, is damaged, or is something else.
+    """
+    path = Path(path)
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        if str(arrays["format"]) != _FORMAT:
+            raise DataError(f"{path}: written as {arrays['format']!s}; this release reads {_FORMAT}")
+        return _assemble(arrays)
+    except OSError as error:
+        raise DataError(f"cannot read {path}: {error}") from error
+    except UNREADABLE_NPZ as error:
+        raise DataError(f"{path}: no pose graph, or a damaged one: {error}") from error
+
+
+def _assemble(arrays: dict[str, Any]) -> PoseGraph:
+    graph = PoseGraph(int(arrays["dimension"]))  # type: ignore[arg-type]
+    if "origin" in arrays:
+        graph.set_origin(*arrays["origin"].tolist())
+    size = len(co.IDENTITY[graph.dimension])
+    for (key,), initial, fixed in zip(
+        _key_rows(arrays["keys"]), arrays["initial"].reshape(-1, size), arrays["fixed"], strict=True
+    ):
+        if key in graph:
+            raise DataError(f"pose {key} is there twice")
+        graph.put_pose(key, None if np.isnan(initial).all() else check_vector(initial, size, f"pose {key}"))
+        if fixed:
+            graph.fix(key)
+    numbered: dict[int, Factor] = {}
+    for kind in get_args(Kind):
+        prefix = f"{kind}_"
+        columns = {name[len(prefix) :]: value for name, value in arrays.items() if name.startswith(prefix)}
+        if columns:
+            numbered |= _factors(kind, columns)
+    for number in sorted(numbered):
+        if missing := [key for key in numbered[number].keys if key not in graph]:
+            raise DataError(f"{numbered[number].label}: there is no pose {missing[0]}")
+        graph.put_factor(numbered[number], number)
+    graph.next_id = max(graph.next_id, int(arrays["next_id"]))
+    return graph
+
+
+def _key_rows(table: Any) -> list[tuple[Key, ...]]:
+    return [
+        tuple(check_key(index if robot == _NO_ROBOT else (robot, index)) for robot, index in row)
+        for row in table.tolist()
+    ]
+
+
+def _factors(kind: Kind, columns: dict[str, Any]) -> dict[int, Factor]:
+    found = {}
+    samples = _samples(columns)
+    for row, (number, keys) in enumerate(zip(columns["id"].tolist(), _key_rows(columns["keys"]), strict=True)):
+        measured = columns["measured"][row]
+        name = f"{kind} {keys}"
+        noise = _noise(columns, row, name) if "noise" in columns else None
+        kernel = str(columns["kernel"][row])
+        robust: Robust | None = make_robust((kernel, float(columns["width"][row])), 1, name) if kernel else None
+        measured = check_vector(measured, len(measured), name)
+        found[number] = Factor(kind, keys, measured, noise, robust, samples[row] if samples else None)
+    return found
+
+
+def _noise(columns: dict[str, Any], row: int, name: str) -> Noise:
+    form, values = str(columns["noise_form"][row]), np.array(columns["noise"][row])
+    given: dict[str, Array | None] = {"covariance": None, "information": None, "sigmas": None}
+    given[form] = np.diagonal(values).copy() if form == "sigmas" else values
+    return make_noise(name, len(values), **given)
+
+
+def _samples(columns: dict[str, Any]) -> list[ImuSamples]:
+    if "sample_count" not in columns:
+        return []
+    ends = np.cumsum(columns["sample_count"])[:-1]
+    parts = (np.split(columns[name], ends) for name in ("stamps_ns", "gyro_rad_s", "accel_m_s2"))
+    return [ImuSamples(*part) for part in zip(*parts, strict=True)]

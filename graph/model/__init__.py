@@ -1,0 +1,1 @@
+"""A pose graph as plain data: keys, coordinates, measurements, edges, checks."""

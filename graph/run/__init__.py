@@ -1,0 +1,1 @@
+"""The odometry run's own graph: factors, backends, smoothing."""

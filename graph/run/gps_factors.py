@@ -1,0 +1,219 @@
+"""GPS fixes in offline smoothing: where they say the antenna was, in a frame and at times that have to be found too.
+
+Fixes are in a local east-north-up frame, the run's poses in its own world; between the two lies an unknown pose, and
+between their clocks an unknown constant. Both are variables of the graph. A fix falls between scans: the motion from
+the nearest scan to its time is taken from the path as it is known (:class:`hybridlio.core.pose_interpolation.PosePath`), as a lever
+that the time shift draws along the velocity. In 50 ms the path is known to millimetres where a fix is known to
+decimetres, so no variable and no noise is added for it; each round takes the levers anew.
+
+Keys: ``e`` pose of the run's world in the fixes' frame, ``t`` time shift in seconds, and for each fix the antenna as a
+point, three times over, so that GTSAM's own factors reach from scan to fix: a factor in Python gets a copy of all
+values whenever it is evaluated, which takes longer than all the rest on a long run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import A, E, G, P, T, W, X
+from numpy.typing import NDArray
+
+from hybridlio.core import se3
+from hybridlio.core.estimates import Array, State
+from hybridlio.core.pose_interpolation import PosePath
+from hybridlio.core.sensors import NS_PER_S, GpsFix
+from hybridlio.graph.base import noise
+from hybridlio.graph.run.factor_groups import Doubtful, GroupAnswer, GroupFactors
+from hybridlio.record.record import Record
+from hybridlio.smoothing.gps_alignment import FixAlignment, align_fixes, fix_stamps
+from hybridlio.smoothing.gps_options import GpsFit, GpsOptions
+
+_UP = np.array([0.0, 0.0, 1.0])
+_PLUMB_SIGMA_RAD = 5e-4  # of the vertical against the ellipsoid's, and over a few kilometres
+_LEVEL_SIGMA_RAD = 0.1  # without IMU: how level the lidar started
+_NOWHERE_RAD, _NOWHERE_M = 10.0, 1e5
+_LINK_M = 1e-3
+_MEDIAN_CHI2 = 2.366  # of three degrees of freedom
+_SECOND_DIFFERENCE = 6.0  # 1 + 4 + 1: variance of x[-1] - 2 x[0] + x[1]
+_LEAST_FOR_SPREAD = 10
+_LONGEST_PAUSE = 1.5  # times the usual time between fixes
+
+
+class GpsGroup:
+    """A record's fixes as a group of factors.
+
+    Raises:
+        EstimationError: too few fixes in the run's time.
+    """
+
+    name = "gps"
+
+    def __init__(self, record: Record, options: GpsOptions | None = None) -> None:
+        self._options = options or GpsOptions()
+        self.robust = self._options.robust
+        self._fixes = record.gps
+        self._T_imu_lidar = record.calibration.T_imu_lidar
+        antenna = self._options.antenna_m if self._options.antenna_m is not None else record.calibration.antenna_imu_m
+        self._antenna = np.zeros(3) if antenna is None else np.asarray(antenna, dtype=np.float64)
+        self._scale: float | None = None
+        self._rows: NDArray[np.int64] = np.empty(0, np.int64)
+
+    def build(self, states: Sequence[State], before: gtsam.Values | None) -> GroupFactors:
+        """One factor a fix, and what is known of frame and clock beforehand."""
+        path = _path_of(states)
+        if before is None:
+            aligned = self._align(path, states[0])
+            T_enu_world, shift = aligned.T_enu_world, aligned.shift_s
+            self._scale = _noise_scale([self._fixes[k] for k in self._rows], aligned.residuals_m, aligned.inliers)
+        else:
+            T_enu_world, shift = before.atPose3(E(0)).matrix(), float(before.atVector(T(0))[0])
+        values = gtsam.Values()
+        values.insert(E(0), gtsam.Pose3(T_enu_world))
+        values.insert(T(0), np.array([shift]))
+        group = GroupFactors([*self._priors(T_enu_world), _plumb_factor(states[0])], values=values)
+        self._add_fixes(group, path, shift, T_enu_world)
+        return group
+
+    def _align(self, path: PosePath, start: State) -> FixAlignment:
+        stamps = fix_stamps(self._fixes)
+        out = np.zeros(len(stamps), dtype=bool)
+        for first, last in self._options.outages:
+            out |= (stamps >= first) & (stamps <= last)
+        self._rows = np.flatnonzero(~out)
+        up, sigma = _up_of(start)
+        aligned = align_fixes(
+            path, [self._fixes[k] for k in self._rows], self._antenna, up, sigma, self._options.max_shift_s
+        )
+        self._rows = self._rows[aligned.used]
+        kept = aligned.used
+        return FixAlignment(
+            aligned.T_enu_world, aligned.shift_s, aligned.covariance, aligned.residuals_m[kept], kept[kept],
+            aligned.inliers[kept],
+        )  # fmt: skip
+
+    def _priors(self, T_enu_world: Array) -> list[gtsam.NonlinearFactor]:
+        """The frame may be anywhere; the shift is within what was searched."""
+        anywhere = noise.sigmas(np.r_[np.full(3, _NOWHERE_RAD), np.full(3, _NOWHERE_M)])
+        shift = noise.sigmas(np.array([max(self._options.max_shift_s, 1e-6)]))
+        return [
+            gtsam.PriorFactorPose3(E(0), gtsam.Pose3(T_enu_world), anywhere),
+            gtsam.PriorFactorVector(T(0), np.zeros(1), shift),
+        ]
+
+    def _add_fixes(self, group: GroupFactors, path: PosePath, shift_s: float, T_enu_world: Array) -> None:
+        """The antenna in the nearest scan's frame ``a``, in the run's world ``w`` and in the fixes' frame ``p``."""
+        fixes = [self._fixes[k] for k in self._rows]
+        stamps = fix_stamps(fixes, shift_s)
+        near = path.nearest(stamps)
+        points, velocities = path.points(stamps, self._antenna)
+        placed = se3.transform(T_enu_world, points)
+        T_scan_world = se3.inverse(path.poses[near])
+        levers = (T_scan_world @ np.column_stack([points, np.ones(len(points))])[..., None])[:, :3, 0]
+        drawn = (T_scan_world[:, :3, :3] @ velocities[..., None])[..., 0]
+        link = noise.sigmas(np.full(3, _LINK_M))
+        for n, (k, fix) in enumerate(zip(near.tolist(), fixes, strict=True)):
+            for key, value in ((A(n), levers[n]), (W(n), points[n]), (P(n), placed[n])):
+                group.values.insert(key, value)
+            links = [
+                _draw(n, levers[n], drawn[n], shift_s, link),
+                gtsam.ReferenceFrameFactorPoint3Pose3(A(n), X(k), W(n), link),
+                gtsam.ReferenceFrameFactorPoint3Pose3(W(n), E(0), P(n), link),
+            ]
+            group.sure.extend(links)
+            covariance = (self._scale or 1.0) ** 2 * fix.covariance_m2
+            group.doubtful.append(
+                Doubtful(
+                    partial(gtsam.PriorFactorPoint3, P(n), fix.position_m), covariance, f"GPS fix at {fix.stamp_ns} ns"
+                )
+            )
+
+    def read(self, answer: GroupAnswer) -> GpsFit:
+        """Frame, clock, and how each fix fits."""
+        T_enu_imu = answer.values.atPose3(E(0)).matrix()
+        shift = float(answer.values.atVector(T(0))[0])
+        joint = answer.covariance([E(0), T(0)])
+        count = len(self._fixes)
+        residuals, weights, used = np.full((count, 3), np.nan), np.zeros(count), np.zeros(count, bool)
+        used[self._rows] = True
+        weights[self._rows] = answer.weights
+        points, _ = _path_of(answer.states).points(
+            fix_stamps([self._fixes[k] for k in self._rows], shift), self._antenna
+        )
+        positions = np.array([self._fixes[k].position_m for k in self._rows])
+        residuals[self._rows] = se3.transform(T_enu_imu, points) - positions
+        T_imu_lidar = self._T_imu_lidar
+        covariance = se3.rotate_covariance(joint[:6, :6], se3.inverse(T_imu_lidar))
+        return GpsFit(
+            T_enu_imu @ T_imu_lidar, covariance, shift, float(np.sqrt(joint[6, 6])), residuals, used, weights,
+            self._scale or 1.0,
+        )  # fmt: skip
+
+
+def _path_of(states: Sequence[State]) -> PosePath:
+    stamps = np.array([state.stamp_ns for state in states])
+    poses = np.array([state.T_world_imu for state in states])
+    velocities = np.array([state.velocity_m_s for state in states]) if states[0].has_imu else None
+    return PosePath(stamps, poses, velocities)
+
+
+def _up_of(state: State) -> tuple[Array, float]:
+    """The direction up in the run's world, and how far it may be off."""
+    if not state.has_imu:
+        return _UP, _LEVEL_SIGMA_RAD
+    spread = float(np.sqrt(np.trace(state.gravity_covariance) / 3)) / float(np.linalg.norm(state.gravity_m_s2))
+    return -state.gravity_m_s2, float(np.hypot(spread, _PLUMB_SIGMA_RAD))
+
+
+def _draw(n: int, lever: Array, velocity: Array, shift_s: float, model: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
+    """``a = lever + velocity · (t - shift)``, which is linear and stays as it is."""
+    at = gtsam.Values()
+    at.insert(A(n), lever)
+    at.insert(T(0), np.array([shift_s]))
+    by_shift = -velocity[:, None]
+    make: Any = gtsam.JacobianFactor  # its stubs know other models than its code
+    linear = make(A(n), np.eye(3), T(0), by_shift, np.zeros(3), model)
+    return gtsam.LinearContainerFactor(linear, at)
+
+
+def _plumb_factor(start: State) -> gtsam.NonlinearFactor:
+    """The fixes' up is opposite to gravity; without IMU, the lidar started about level."""
+    if not start.has_imu:
+        model = noise.sigmas(np.full(2, _LEVEL_SIGMA_RAD))
+        return gtsam.AttitudeFactorPose3(E(0), gtsam.Unit3(_UP), model, gtsam.Unit3(_UP))
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        R = values.atPose3(E(0)).rotation().matrix()
+        gravity = values.atVector(G(0))
+        length = float(np.linalg.norm(gravity))
+        down = gravity / length
+        if jacobians is not None:
+            jacobians[0] = np.hstack([-R @ se3.hat(down), np.zeros((3, 3))])[:2]
+            jacobians[1] = (R @ (np.eye(3) - np.outer(down, down)) / length)[:2]
+        return np.asarray((R @ down)[:2])
+
+    return gtsam.CustomFactor(noise.sigmas(np.full(2, _PLUMB_SIGMA_RAD)), [E(0), G(0)], error)
+
+
+def _noise_scale(fixes: Sequence[GpsFix], residuals: Array, inliers: NDArray[np.bool_]) -> float:
+    """How many times their claimed standard deviations the fixes scatter, at least 1.
+
+    Told by second differences of consecutive residuals, which the path's drift leaves alone; by their median, and
+    without the fixes that are far off the path, so that wrong ones do not decide. An error common to neighbouring fixes
+    does not show.
+    """
+    stamps = fix_stamps(fixes) / NS_PER_S
+    steps = np.diff(stamps)
+    if len(steps) < _LEAST_FOR_SPREAD:
+        return 1.0
+    beside = np.maximum(steps[1:], steps[:-1]) < _LONGEST_PAUSE * np.median(steps)
+    regular = np.flatnonzero(beside & inliers[2:] & inliers[1:-1] & inliers[:-2])
+    if len(regular) < _LEAST_FOR_SPREAD:
+        return 1.0
+    second = residuals[regular] - 2 * residuals[regular + 1] + residuals[regular + 2]
+    covariances = np.array([fixes[k + 1].covariance_m2 for k in regular.tolist()]) * _SECOND_DIFFERENCE
+    chi2 = np.einsum("ni,nij,nj->n", second, np.linalg.inv(covariances), second)
+    return float(np.sqrt(max(np.median(chi2) / _MEDIAN_CHI2, 1.0)))

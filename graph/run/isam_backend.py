@@ -1,0 +1,147 @@
+"""The online graph: poses, velocities, biases and gravity in iSAM2 (Kaess et al., IJRR 2012)."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, G, V, X
+
+from hybridlio.core import se3
+from hybridlio.core.errors import GraphError
+from hybridlio.core.estimates import RelativePose, State
+from hybridlio.core.sensors import NS_PER_S, Frame
+from hybridlio.graph.base.isam import eager_solver, incremental_solver, reason
+from hybridlio.graph.base.marginals import step_covariance
+from hybridlio.graph.base.preintegration import bias_of
+from hybridlio.graph.run import factors
+from hybridlio.graph.run.inertial_steps import InertialSteps
+from hybridlio.graph.run.scan_numbers import Scans
+
+# While tilt, speed and biases are still found, every step linearises anew what it moves of the few poses there are; and
+# the very first, when nothing is known, solve them anew by damped steps.
+WARM_UP_STEPS = 20
+_FIRST_STEPS = 5
+
+
+class IncrementalBackend:
+    """Every scan a pose; consecutive ones joined by the IMU's samples and by the relative pose of the front end.
+
+    Args:
+        steps: sums up the samples between scans.
+    """
+
+    name = "incremental"
+    _forgets = False
+
+    def __init__(self, steps: InertialSteps) -> None:
+        self._steps = steps
+        self._T_imu_lidar = steps.T_imu_lidar
+        self._T_lidar_imu = se3.inverse(steps.T_imu_lidar)
+        self._k = 0
+
+    def start(self, state: State) -> None:
+        """Put the first scan's pose at the origin, the rest at ``state`` with its covariance."""
+        self._k = 0
+        self._scans = Scans(state.stamp_ns)
+        self._state = state
+        self._graph, self._values = factors.start_factors(state)
+        self._isam = incremental_solver(self._forgets)
+        self._isam.update(self._graph, self._values)
+
+    def update(self, frame: Frame, relative: RelativePose) -> State:
+        """Add the step to ``frame``; returns the state there.
+
+        Raises:
+            GraphError: the graph cannot be solved; names the variable.
+            DataError: a pose relative to a keyframe names a scan that there is not.
+        """
+        state, stamp_ns = self._state, frame.scan.stamp_ns
+        pim = self._steps.sum(frame, state)
+        graph = factors.step_factors(self._k, state, relative, pim, stamp_ns, self._T_imu_lidar, self._scans)
+        values, guess = gtsam.Values(), self._guess(frame, relative, pim)
+        factors.insert_step(values, self._k, state, guess, relative, self._scans)
+        try:
+            self._solve(graph, values, self._order(relative, values))
+        except RuntimeError as error:
+            raise GraphError(f"frame {frame.index}: the graph cannot be solved: {reason(error)}") from error
+        self._k += 1
+        self._scans.add(stamp_ns, on_path=relative.drift is not None)
+        self._state = self._read(stamp_ns)
+        return self._state
+
+    def last_step(self) -> RelativePose:
+        """The step to the current scan with the covariance that all factors together leave it."""
+        i, j = X(self._k - 1), X(self._k)
+        T_w_i, T_w_j = (self._isam.calculateEstimatePose3(key).matrix() for key in (i, j))
+        joint = self._isam.jointMarginalCovariance([i, j]).fullMatrix()
+        step = se3.between(T_w_i, T_w_j)
+        covariance = se3.rotate_covariance(step_covariance(joint, step), self._T_lidar_imu)
+        pose = self._T_lidar_imu @ step @ self._T_imu_lidar
+        return RelativePose(pose, (covariance + covariance.T) / 2, source=self.name, from_imu=self._state.has_imu)
+
+    def _guess(
+        self, frame: Frame, relative: RelativePose, pim: gtsam.PreintegratedCombinedMeasurements | None
+    ) -> State:
+        """Where the new variables start: the relative pose and the velocity it means; the IMU's where that failed."""
+        state, stamp_ns = self._state, frame.scan.stamp_ns
+        if pim is not None and not relative.ok:
+            then = pim.predict(gtsam.NavState(gtsam.Pose3(state.T_world_imu), state.velocity_m_s), bias_of(state))
+            T_world_imu, velocity = then.pose().matrix(), then.velocity()
+        else:
+            T_world_imu = state.T_world_imu @ self._T_imu_lidar @ relative.pose @ self._T_lidar_imu
+            dt_s = (stamp_ns - state.stamp_ns) / NS_PER_S
+            velocity = (T_world_imu[:3, 3] - state.T_world_imu[:3, 3]) / dt_s
+        return State(
+            stamp_ns, T_world_imu, velocity, state.accel_bias_m_s2, state.gyro_bias_rad_s, state.gravity_m_s2,
+            state.covariance, state.gravity_covariance, state.has_imu,
+        )  # fmt: skip
+
+    def _solve(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, order: gtsam.KeyGroupMap | None) -> None:
+        if self._k >= WARM_UP_STEPS:
+            self._isam.update(graph, values, [], order)
+            return
+        self._graph.push_back(graph)
+        if self._k < _FIRST_STEPS:
+            self._values.insert(values)
+            params = gtsam.LevenbergMarquardtParams()
+            params.setLinearSolverType("MULTIFRONTAL_QR")
+            self._values = gtsam.LevenbergMarquardtOptimizer(self._graph, self._values, params).optimize()
+            self._isam = eager_solver()
+            self._isam.update(self._graph, self._values)
+            return
+        self._isam.update(graph, values)
+        if self._k == WARM_UP_STEPS - 1:
+            self._values = self._isam.calculateEstimate()
+            self._isam = incremental_solver(self._forgets)
+            self._isam.update(self._graph, self._values)
+
+    def _order(self, relative: RelativePose, new: gtsam.Values) -> gtsam.KeyGroupMap | None:
+        """Scan by scan from the oldest that a step reaches back to; None for one that reaches to the last scan only.
+
+        By default iSAM2 eliminates all variables of the new factors last, old keyframes too; within a hundred scans
+        each update would then reach far back (fifty times as slow).
+        """
+        found = [j for k in relative.keyframes if (j := self._scans.number(k.stamp_ns)) is not None]
+        if not found or min(found) >= self._k:
+            return None
+        order = gtsam.KeyGroupMap()
+        for place, k in enumerate(range(min(found), self._k + 2)):
+            for key in (variable(k) for variable in factors.VARIABLES):
+                if self._isam.valueExists(key) or new.exists(key):
+                    order.insert2(key, place)
+        return order
+
+    def _read(self, stamp_ns: int) -> State:
+        k, isam = self._k, self._isam
+        pose = isam.calculateEstimatePose3(X(k)).matrix()
+        if not self._state.has_imu:
+            covariance = np.eye(15)
+            covariance[:6, :6] = isam.marginalCovariance(X(k))
+            zero = np.zeros(3)
+            return State(stamp_ns, pose, zero, zero, zero, self._state.gravity_m_s2, covariance, np.eye(3), False)
+        bias = isam.calculateEstimateConstantBias(B(k))
+        covariance = isam.jointMarginalCovariance([X(k), V(k), B(k)]).fullMatrix()
+        return State(
+            stamp_ns, pose, isam.calculateEstimateVector(V(k)), bias.accelerometer(), bias.gyroscope(),
+            isam.calculateEstimateVector(G(k)), (covariance + covariance.T) / 2, isam.marginalCovariance(G(k)),
+        )  # fmt: skip

@@ -1,0 +1,229 @@
+"""Offline smoothing: all of a run's factors optimised together, from its record alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, G, V, X
+from numpy.typing import NDArray
+
+from hybridlio.core import se3
+from hybridlio.core.errors import GraphError
+from hybridlio.core.estimates import Array, State
+from hybridlio.core.trajectory import Trajectory
+from hybridlio.graph.base.isam import reason
+from hybridlio.graph.base.marginals import bayes_tree, pose_covariances
+from hybridlio.graph.base.preintegration import covers, preintegrate
+from hybridlio.graph.run import factors
+from hybridlio.graph.run.factor_groups import FactorGroup
+from hybridlio.graph.run.gps_factors import GpsGroup
+from hybridlio.graph.run.ordering import chain_order
+from hybridlio.graph.run.robust import Added, check_treatment
+from hybridlio.graph.run.scan_numbers import Scans
+from hybridlio.record.record import Record
+from hybridlio.smoothing.gps_options import GpsOptions
+
+if TYPE_CHECKING:
+    from hybridlio.smoothing.loop_closure import LoopSettings
+
+Progress = Callable[[str, int, int], None]
+
+_MAX_ITERATIONS = 50
+_ITERATIONS_A_STEP = 4  # while wrong measurements are looked for
+_ROUNDS = 2  # samples are summed up again with the biases that the first round found
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """A smoothed run.
+
+    Attributes:
+        trajectory: ``N`` lidar poses in the first scan's frame, with covariances ``(N, 6, 6)``.
+        step_covariances: ``(N-1, 6, 6)`` of the relative poses between consecutive scans.
+        velocities_m_s: ``(N, 3)`` of the IMU, in the IMU's first pose; meaningless without IMU.
+        accel_biases_m_s2, gyro_biases_rad_s: ``(N, 3)`` each; meaningless without IMU.
+        gravity_m_s2: ``(3,)`` in the IMU's first pose.
+        error_before, error_after: half the sum of squared, whitened residuals at the online estimate and at the answer.
+        iterations: Levenberg-Marquardt steps of the last round.
+        converged: whether the error had stopped falling.
+        found: what each group of further measurements found, by its name.
+    """
+
+    trajectory: Trajectory
+    step_covariances: NDArray[np.float64]
+    velocities_m_s: NDArray[np.float64]
+    accel_biases_m_s2: NDArray[np.float64]
+    gyro_biases_rad_s: NDArray[np.float64]
+    gravity_m_s2: NDArray[np.float64]
+    error_before: float
+    error_after: float
+    iterations: int
+    converged: bool
+    found: dict[str, Any] = field(default_factory=dict)
+
+
+def smooth(
+    record: Record,
+    progress: Progress | None = None,
+    *,
+    loops: bool | LoopSettings = False,
+    gps: bool | GpsOptions = False,
+    groups: Sequence[FactorGroup] = (),
+    robust: str | None = None,
+) -> Smoothed:
+    """Optimise all poses, velocities, biases and gravity of a run at once (Levenberg-Marquardt).
+
+    Args:
+        record: of the run, from :meth:`hybridlio.odometry.odometry.Odometry.record` or a run folder's ``odometry.npz``.
+        progress: called with the stage, what is done of it and what there is in all.
+        loops: find where the run comes back to a place, and close the loops; settings of how, or True. What became of
+            them is ``found["loops"]``, a :class:`hybridlio.graph.run.loop_factors.ClosedLoops`.
+        gps: whether to use the record's GPS fixes, and how; what came of it is ``found["gps"]``, a
+            :class:`hybridlio.smoothing.gps_options.GpsFit`.
+        groups: more measurements.
+        robust: how to treat those of the groups' measurements that may be wrong: ``huber``, ``cauchy``,
+            ``geman-mcclure``, ``dcs`` or ``gnc``; by default as each group prefers.
+
+    Raises:
+        GraphError: the graph cannot be solved.
+        EstimationError: too few fixes lie in the run's time.
+        ConfigError: an unknown treatment.
+        DataError: loops are asked for, and the record has no keyframes.
+    """
+    report, robust = progress or _silent, check_treatment(robust)  # before the search for loops, which takes long
+    fixes = [GpsGroup(record, gps if isinstance(gps, GpsOptions) else GpsOptions())] if gps else []
+    added = Added([*fixes, *_with_loops(groups, record, loops, report)], robust)
+    states = _online_states(record)
+    error_before: float | None = None
+    for number in range(_ROUNDS):
+        report("optimising", number, _ROUNDS)
+        graph, values = _build(record, states)
+        graph, values = added.to(graph, values, states, _few_iterations)
+        error_before = graph.error(values) if error_before is None else error_before
+        optimiser = _optimiser(graph, values)
+        values = _solve(optimiser)
+        states = _read(values, states)
+        added.keep(values)
+    isam = bayes_tree(graph, values)
+    covariances = pose_covariances(isam, np.array([state.T_world_imu for state in states]), report)
+    found = added.found(values, states, isam)
+    return _smoothed(record, states, covariances, error_before or 0.0, optimiser, found)
+
+
+def _with_loops(
+    groups: Sequence[FactorGroup], record: Record, loops: bool | LoopSettings, report: Progress
+) -> Sequence[FactorGroup]:
+    if loops is False:
+        return groups
+    from hybridlio.graph.run.loop_factors import LoopClosures  # late: registration is of no use to those without loops
+
+    return (*groups, LoopClosures.of(record, None if loops is True else loops, report))
+
+
+def _silent(stage: str, done: int, total: int) -> None:
+    """Report to nobody."""
+    del stage, done, total
+
+
+def _online_states(record: Record) -> list[State]:
+    T = record.calibration.T_imu_lidar
+    poses = T @ record.online.poses @ se3.inverse(T)
+    times_s = record.online.times_s
+    velocities = np.gradient(poses[:, :3, 3], times_s, axis=0) if len(poses) > 1 else np.zeros((1, 3))
+    return [
+        replace(record.start, stamp_ns=int(stamp), T_world_imu=pose, velocity_m_s=velocity)
+        for stamp, pose, velocity in zip(record.online.stamps_ns, poses, velocities, strict=True)
+    ]
+
+
+def _build(record: Record, states: list[State]) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    graph, _ = factors.start_factors(record.start)
+    values = gtsam.Values()
+    factors.insert_state(values, 0, states[0])
+    scans = Scans(states[0].stamp_ns)
+    for i, relative in enumerate(record.relative):
+        state, stamp_ns = states[i], states[i + 1].stamp_ns
+        imu = record.imu.between(state.stamp_ns, stamp_ns)
+        usable = state.has_imu and covers(imu, state.stamp_ns, stamp_ns)
+        pim = preintegrate(imu, state, record.imu_noise) if usable else None
+        T_imu_lidar = record.calibration.T_imu_lidar
+        graph.push_back(factors.step_factors(i, state, relative, pim, stamp_ns, T_imu_lidar, scans))
+        factors.insert_step(values, i, state, states[i + 1], relative, scans)
+        scans.add(stamp_ns, on_path=relative.drift is not None)
+    return graph, values
+
+
+def _optimiser(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, iterations: int = _MAX_ITERATIONS
+) -> gtsam.LevenbergMarquardtOptimizer:
+    params = gtsam.LevenbergMarquardtParams()
+    params.setLinearSolverType("MULTIFRONTAL_QR")  # Cholesky finds long straight chains indeterminate
+    params.setRelativeErrorTol(1e-6)
+    params.setMaxIterations(iterations)
+    ordering = chain_order(graph, values)
+    if ordering is None:
+        return gtsam.LevenbergMarquardtOptimizer(graph, values, params)
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, ordering, params)
+
+
+def _solve(optimiser: gtsam.LevenbergMarquardtOptimizer) -> gtsam.Values:
+    try:
+        return optimiser.optimize()
+    except RuntimeError as error:
+        raise GraphError(f"smoothing: the graph cannot be solved: {reason(error)}") from error
+
+
+def _read(values: gtsam.Values, states: list[State]) -> list[State]:
+    return [_read_one(values, k, state) for k, state in enumerate(states)]
+
+
+def _read_one(values: gtsam.Values, k: int, state: State) -> State:
+    pose = values.atPose3(X(k)).matrix()
+    if not state.has_imu:
+        return replace(state, T_world_imu=pose)
+    bias = values.atConstantBias(B(k))
+    return replace(
+        state,
+        T_world_imu=pose,
+        velocity_m_s=values.atVector(V(k)),
+        accel_bias_m_s2=bias.accelerometer(),
+        gyro_bias_rad_s=bias.gyroscope(),
+        gravity_m_s2=values.atVector(G(k)),
+    )
+
+
+def _few_iterations(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+    return _solve(_optimiser(graph, values, _ITERATIONS_A_STEP))
+
+
+def _smoothed(
+    record: Record,
+    states: list[State],
+    covariances: tuple[Array, Array],
+    error_before: float,
+    optimiser: gtsam.LevenbergMarquardtOptimizer,
+    found: dict[str, Any],
+) -> Smoothed:
+    T = record.calibration.T_imu_lidar
+    T_inv = se3.inverse(T)
+    poses = T_inv @ np.array([state.T_world_imu for state in states]) @ T
+    stamps = np.array([state.stamp_ns for state in states])
+    iterations = int(optimiser.iterations())
+    absolute, steps = (se3.rotate_covariance(part, T_inv) for part in covariances)
+    return Smoothed(
+        trajectory=Trajectory(stamps, se3.between(poses[0], poses), absolute),
+        step_covariances=steps,
+        velocities_m_s=np.array([state.velocity_m_s for state in states]),
+        accel_biases_m_s2=np.array([state.accel_bias_m_s2 for state in states]),
+        gyro_biases_rad_s=np.array([state.gyro_bias_rad_s for state in states]),
+        gravity_m_s2=states[0].gravity_m_s2,
+        error_before=error_before,
+        error_after=float(optimiser.error()),
+        iterations=iterations,
+        converged=iterations < _MAX_ITERATIONS,
+        found=found,
+    )

@@ -1,0 +1,1 @@
+"""Solvers of a pose graph: batch, GNC, online, and their starts."""

@@ -1,0 +1,83 @@
+"""Chordal initialisation: all rotations by relaxed linear least squares, then all positions.
+
+Carlone, Tron, Daniilidis, Dellaert, "Initialization techniques for 3D SLAM: a survey on rotation estimation and its use
+in pose graph optimization" (ICRA 2015), section III.B; after Martinec and Pajdla (CVPR 2007).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.linalg import splu
+
+from hybridlio.core import se3
+from hybridlio.core.errors import GraphError
+from hybridlio.core.estimates import Array
+from hybridlio.graph.model.edge_arrays import Edges
+
+
+def chordal(roots: dict[int, Array], count: int, edges: Edges) -> Array:
+    """Poses ``(N, 4, 4)`` that fit the edges, with each root ``(4, 4)`` where it is given.
+
+    Raises:
+        GraphError: some pose is joined to no root.
+    """
+    T = np.tile(np.eye(4), (count, 1, 1))
+    for k, root in roots.items():
+        T[k] = root
+    known = np.zeros(count, dtype=bool)
+    known[list(roots)] = True
+    if len(edges.i) and not known.all():
+        by_rotation, by_position = edges.weights()
+        T[:, :3, :3] = rotations(T, known, edges, by_rotation)
+        T[:, :3, 3] = positions(T, known, edges, by_position)
+    return T
+
+
+def rotations(T: Array, known: NDArray[np.bool_], edges: Edges, weights: Array) -> Array:
+    """Rotations ``(N, 3, 3)``: ``R_i R_ij = R_j`` for any matrices; then the nearest rotations."""
+    d = 2 if edges.planar else 3
+    count, m = len(T), len(edges.i)
+    root = np.sqrt(weights / weights.mean())
+    row, column = np.indices((d, d))
+    # the unknowns are the transposes, stacked: R_ijᵀ R_iᵀ − R_jᵀ = 0
+    rows = (d * np.arange(m)[:, None, None] + row).ravel()
+    columns = (d * edges.i[:, None, None] + column).ravel()
+    values = (root[:, None, None] * np.swapaxes(edges.T[:, :d, :d], 1, 2)).ravel()
+    rows_j = (d * np.arange(m)[:, None] + np.arange(d)).ravel()
+    columns_j = (d * edges.j[:, None] + np.arange(d)).ravel()
+    A = csr_matrix(
+        (np.r_[values, -np.repeat(root, d)], (np.r_[rows, rows_j], np.r_[columns, columns_j])), (d * m, d * count)
+    )
+    given = np.swapaxes(T[:, :d, :d], 1, 2).reshape(d * count, d)
+    solved = _solve(A, np.zeros((d * m, d)), given, np.repeat(known, d)).reshape(count, d, d)
+    lifted = np.tile(np.eye(4), (count, 1, 1))
+    lifted[:, :d, :d] = np.swapaxes(solved, 1, 2)
+    return np.asarray(se3.orthonormalise(lifted)[:, :3, :3])
+
+
+def positions(T: Array, known: NDArray[np.bool_], edges: Edges, weights: Array) -> Array:
+    """Positions ``(N, 3)`` for the rotations in ``T``: ``t_j − t_i = R_i t_ij``."""
+    m = len(edges.i)
+    root = np.sqrt(weights / weights.mean())
+    number = np.arange(m)
+    A = csr_matrix((np.r_[-root, root], (np.r_[number, number], np.r_[edges.i, edges.j])), (m, len(T)))
+    steps = (T[edges.i, :3, :3] @ edges.T[:, :3, 3, None])[..., 0]
+    return _solve(A, root[:, None] * steps, T[:, :3, 3], known)
+
+
+def _solve(A: Any, b: Array, given: Array, known: NDArray[np.bool_]) -> Array:
+    """Least squares ``A x = b`` with the known rows of ``x`` as given."""
+    free = A[:, ~known]
+    rest = b - A[:, known] @ given[known]
+    options = {"SymmetricMode": True}
+    try:
+        normal = splu((free.T @ free).tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    except RuntimeError as error:
+        raise GraphError(f"chordal initialisation: some pose is joined to no root ({error})") from error
+    x = given.copy()
+    x[~known] = normal.solve(free.T @ rest)
+    return x

@@ -1,0 +1,95 @@
+"""Motion compensation: the points of a sweep moved to where they would have been seen at the scan's stamp.
+
+While a lidar turns it moves, so each point is measured in a lidar frame of its own time. Between two known poses the
+motion is taken as a constant twist (constant angular and linear velocity in the body), which is exact for a turn at
+constant speed; a point at ``s`` seconds into the step then moves by ``Exp(s·ξ)``, in closed form for all points at once
+(Solà, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics", 2018, eq. 172-174).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybridlio.core import se3
+from hybridlio.core.errors import DataError
+from hybridlio.core.sensors import NS_PER_S, Scan
+from hybridlio.core.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+_PIECE = 16384  # points at a time, so that the temporaries stay in the processor's cache
+
+
+def constant_twist(T_start_end: ArrayLike, start_ns: int, end_ns: int) -> Trajectory:
+    """The motion that goes through one relative pose at constant velocity; what :func:`deskew` takes.
+
+    Args:
+        T_start_end: ``(4, 4)`` lidar pose at ``end_ns`` in the lidar frame at ``start_ns``, such as the last scan's
+            relative pose with the stamps of the two scans: the sweep then continues that motion.
+        start_ns, end_ns: the two times.
+
+    Raises:
+        DataError: no time passes between the two, or the pose is not rigid.
+    """
+    T = se3.check_pose(T_start_end, "constant twist")
+    return Trajectory(np.array([start_ns, end_ns]), np.stack([np.eye(4), T]))
+
+
+def deskew(scan: Scan, motion: Trajectory) -> Scan:
+    """The scan as if all its points had been measured at ``scan.stamp_ns``; its time offsets are None afterwards.
+
+    A scan without time offsets needs no compensation and is returned itself, the same object. Points before the first
+    or after the last pose, and the stamp where it lies there, continue at the first or last step's velocity.
+
+    Args:
+        scan: points each in the lidar frame of its own time, with ``time_offsets_ns``.
+        motion: two or more lidar poses (``T_world_imu @ T_imu_lidar`` for those of an IMU) around the sweep, in any
+            world frame: poses at IMU stamps, or :func:`constant_twist`.
+
+    Raises:
+        DataError: the motion has fewer than two poses.
+    """
+    if scan.time_offsets_ns is None:
+        return scan
+    if len(motion) < 2:
+        raise DataError(
+            f"scan at {scan.stamp_ns} ns: motion compensation needs at least two poses around the sweep, "
+            f"got {len(motion)}; give IMU poses or a constant twist"
+        )
+    # relative to the stamp: nanoseconds since 1970 do not fit a float64
+    knots_s = (motion.stamps_ns - scan.stamp_ns) / NS_PER_S
+    twists = se3.log(se3.between(motion.poses[:-1], motion.poses[1:])) / (np.diff(motion.stamps_ns) / NS_PER_S)[:, None]
+    T_stamp_world = se3.inverse(_pose_at(0.0, knots_s, motion.poses, twists))
+    times_s = scan.time_offsets_ns / NS_PER_S
+    step = np.clip(np.searchsorted(knots_s, times_s, side="right") - 1, 0, len(twists) - 1)
+    columns, points = np.ascontiguousarray(scan.points.T), np.empty_like(scan.points)
+    for k in np.flatnonzero(np.bincount(step, minlength=len(twists))):
+        of_step = np.flatnonzero(step == k)
+        for start in range(0, len(of_step), _PIECE):
+            own = of_step[start : start + _PIECE]
+            seconds = times_s[own] - knots_s[k]
+            points[own] = _screw(T_stamp_world @ motion.poses[k], twists[k], seconds, columns[:, own]).T
+    return Scan(scan.stamp_ns, points, scan.intensity)
+
+
+def _pose_at(time_s: float, knots_s: Array, poses: Array, twists: Array) -> Array:
+    k = int(np.clip(np.searchsorted(knots_s, time_s, side="right") - 1, 0, len(twists) - 1))
+    return np.asarray(poses[k] @ se3.exp((time_s - knots_s[k]) * twists[k]))
+
+
+def _screw(T: Array, twist: Array, seconds: Array, points: NDArray[np.float32]) -> Array:
+    """``T·Exp(s_i·ξ) p_i``, ``(3, N)``, of points ``(3, N)`` and seconds ``(N,)``, for one pose and one twist."""
+    R, velocity = T[:3, :3], twist[3:]
+    rate = max(float(np.linalg.norm(twist[:3])), 1e-9)  # a slower turn is below any rounding over a sweep
+    K = se3.hat(twist[:3] / rate)
+    p = points.astype(np.float64)
+    angle = rate * seconds
+    sine, versine = np.sin(angle), 1 - np.cos(angle)
+    # Rodrigues' formula for the rotation, its integral over the angle for the translation
+    KKv = R @ (K @ (K @ velocity)) / rate
+    moved = R @ p + T[:3, 3:] + np.outer(R @ velocity, seconds)
+    moved += sine * ((R @ K) @ p - KKv[:, None])
+    moved += versine * ((R @ K @ K) @ p + (R @ K @ velocity / rate)[:, None])
+    moved += np.outer(KKv, angle)
+    return np.asarray(moved)

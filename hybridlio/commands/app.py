@@ -1,0 +1,53 @@
+"""The command line. What a command does is in ``hybridlio.commands``."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from hybridlio.commands.ablate import ablate
+from hybridlio.commands.batch import batch
+from hybridlio.commands.common import start_quietly
+from hybridlio.commands.compare import compare
+from hybridlio.commands.config import config
+from hybridlio.commands.evaluate import evaluate
+from hybridlio.commands.georeference import georeference
+from hybridlio.commands.odometry import odometry
+from hybridlio.commands.simulate import simulate
+from hybridlio.commands.smooth import smooth
+from hybridlio.commands.train import train
+from hybridlio.commands.view import view
+from hybridlio.core.version import __version__
+
+app = typer.Typer(
+    name="hybridlio",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _say_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"hybridlio {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def main(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Print the version.")
+    ] = False,
+    _verbose: Annotated[
+        int,
+        typer.Option(
+            "-v", "--verbose", count=True, metavar=" ", callback=start_quietly, show_default=False, help="Log more."
+        ),
+    ] = 0,
+) -> None:
+    """Lidar-inertial odometry: from a drive to a trajectory with covariances, a pose graph and a report."""
+
+
+for _command in (simulate, odometry, smooth, georeference, batch, compare, evaluate, train, ablate, config, view):
+    app.command()(_command)

@@ -1,0 +1,66 @@
+"""Latitude and longitude (WGS 84) to a local east-north-up frame and back, by pymap3d."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybridlio.core.errors import DataError
+
+Array = NDArray[np.float64]
+
+
+class GeodeticPoint(NamedTuple):
+    """A place on WGS 84: degrees, and metres above the ellipsoid."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+
+
+def check_geodetic(latitude_deg: float, longitude_deg: float, height_m: float, name: str) -> GeodeticPoint:
+    """The place, as plain numbers.
+
+    Raises:
+        DataError: not finite, a latitude beyond ±90° or a longitude beyond -180° to 360°; the message carries ``name``.
+    """
+    point = GeodeticPoint(float(latitude_deg), float(longitude_deg), float(height_m))
+    if not np.isfinite(point).all():
+        raise DataError(f"{name}: latitude, longitude and height must be finite, got {tuple(point)}")
+    if abs(point.latitude_deg) > 90:
+        raise DataError(f"{name}: a latitude lies between -90 and 90 degrees, got {point.latitude_deg}")
+    if not -180 <= point.longitude_deg <= 360:
+        raise DataError(f"{name}: a longitude lies between -180 and 360 degrees, got {point.longitude_deg}")
+    return point
+
+
+def enu_from_geodetic(points: ArrayLike, origin: GeodeticPoint) -> Array:
+    """East, north, up ``(N, 3)`` in metres, in the plane at ``origin``, of ``(N, 3)`` degrees, degrees, metres."""
+    import pymap3d
+
+    latitude, longitude, height = np.asarray(points, dtype=np.float64).reshape(-1, 3).T
+    return np.column_stack(pymap3d.geodetic2enu(latitude, longitude, height, *origin))
+
+
+def geodetic_from_enu(positions_m: ArrayLike, origin: GeodeticPoint) -> Array:
+    """Latitude and longitude in degrees and height in metres ``(N, 3)`` of ``(N, 3)`` east, north, up at ``origin``."""
+    import pymap3d
+
+    east, north, up = np.asarray(positions_m, dtype=np.float64).reshape(-1, 3).T
+    return np.column_stack(pymap3d.enu2geodetic(east, north, up, *origin))
+
+
+def origin_of(position_m: ArrayLike, point: GeodeticPoint) -> GeodeticPoint:
+    """The origin of the frame in which ``point`` lies at ``position_m`` ``(3,)``.
+
+    The frame at the point is taken for the one at its origin, and once more with what that gave; over a few kilometres
+    that is exact to a micrometre.
+    """
+    position = np.asarray(position_m, dtype=np.float64)
+    origin = point
+    for _ in range(5):
+        off = enu_from_geodetic([point], origin)[0] - position
+        origin = GeodeticPoint(*geodetic_from_enu([off], origin)[0].tolist())
+    return origin

@@ -1,0 +1,283 @@
+"""What sensors deliver: scans, IMU samples, GPS fixes, and the frame that joins them.
+
+Time is int64 nanoseconds. All arrays are checked where they enter, here, and trusted afterwards.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridlio.core import se3
+from hybridlio.core.errors import DataError
+from hybridlio.core.geodesy import GeodeticPoint
+from hybridlio.core.setting_checks import expect
+
+NS_PER_S = 1_000_000_000
+FARTHEST_M = 1e4  # no lidar sees farther; what is there is broken data
+LONGEST_INTERPOLATION_NS = 250_000_000  # inertial samples farther apart say nothing of what lies between them
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One lidar sweep in the lidar frame (x forward, y left, z up).
+
+    Attributes:
+        stamp_ns: the time the points refer to once compensated.
+        points: ``(N, 3)`` float32, metres; rows that are not finite, or 10 km away or more, are dropped on entry.
+        intensity: ``(N,)`` float32 reflectance 0..1, or None.
+        time_offsets_ns: ``(N,)`` int64, each point's time minus ``stamp_ns``; None where the scan needs no motion
+            compensation (KITTI ships scans already compensated).
+    """
+
+    stamp_ns: int
+    points: NDArray[np.float32]
+    intensity: NDArray[np.float32] | None = None
+    time_offsets_ns: NDArray[np.int64] | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.stamp_ns, int | np.integer):
+            raise DataError(f"scan at {self.stamp_ns!r}: its stamp must be a whole number of nanoseconds")
+        points = np.ascontiguousarray(self.points, dtype=np.float32)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise DataError(f"scan at {self.stamp_ns} ns: points must be (N, 3), got {points.shape}")
+        columns = {"intensity": (self.intensity, np.float32), "time_offsets_ns": (self.time_offsets_ns, np.int64)}
+        measurable = np.abs(points) < FARTHEST_M  # false for NaN too
+        whole = bool(measurable.all())
+        kept = np.ones(len(points), dtype=bool) if whole else measurable.all(axis=1)
+        for name, (values, dtype) in columns.items():
+            if values is None:
+                continue
+            if dtype == np.int64 and np.asarray(values).dtype.kind not in "iu":
+                raise DataError(f"scan at {self.stamp_ns} ns: {name} must be whole nanoseconds, not of seconds")
+            values = np.asarray(values, dtype=dtype)
+            if values.shape != points.shape[:1]:
+                raise DataError(f"scan at {self.stamp_ns} ns: {name} must be ({len(points)},), got {values.shape}")
+            object.__setattr__(self, name, values if whole else values[kept])
+        object.__setattr__(self, "points", points if whole else points[kept])
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, eq=False)
+class ImuSamples:
+    """Inertial samples in the IMU frame, strictly increasing in time.
+
+    Attributes:
+        stamps_ns: ``(S,)`` int64.
+        gyro_rad_s: ``(S, 3)`` angular velocity.
+        accel_m_s2: ``(S, 3)`` specific force: at rest it reads +9.81 on the axis that points up.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    gyro_rad_s: NDArray[np.float64]
+    accel_m_s2: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        stamps = np.asarray(self.stamps_ns, dtype=np.int64)
+        gyro = np.asarray(self.gyro_rad_s, dtype=np.float64).reshape(-1, 3)
+        accel = np.asarray(self.accel_m_s2, dtype=np.float64).reshape(-1, 3)
+        if not len(stamps) == len(gyro) == len(accel):
+            raise DataError(f"IMU: {len(stamps)} stamps, {len(gyro)} gyro rows, {len(accel)} accelerometer rows")
+        bad = ~(np.isfinite(gyro).all(axis=1) & np.isfinite(accel).all(axis=1))
+        if bad.any():
+            raise DataError(f"IMU: row {int(bad.argmax())} is not finite; drop or repair it before")
+        backwards = np.diff(stamps) <= 0
+        if backwards.any():
+            raise DataError(f"IMU: time does not increase at row {int(backwards.argmax()) + 1}; sort and deduplicate")
+        object.__setattr__(self, "stamps_ns", stamps)
+        object.__setattr__(self, "gyro_rad_s", gyro)
+        object.__setattr__(self, "accel_m_s2", accel)
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @classmethod
+    def empty(cls) -> ImuSamples:
+        """No samples at all."""
+        return cls(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)))
+
+    def between(self, start_ns: int, end_ns: int) -> ImuSamples:
+        """Samples from ``start_ns`` to ``end_ns``, with linearly interpolated ones at both ends.
+
+        An end outside the recording, or inside a gap of more than :data:`LONGEST_INTERPOLATION_NS`, is left out: the
+        result then starts or stops where the samples do. It is empty where ``end_ns`` lies before ``start_ns``. Takes
+        logarithmic time in the recording's length.
+        """
+        if end_ns < start_ns or not len(self):
+            return ImuSamples.empty()
+        first = int(np.searchsorted(self.stamps_ns, start_ns, side="right"))
+        last = int(np.searchsorted(self.stamps_ns, end_ns, side="left"))
+        ends = [t for t in (start_ns, end_ns) if self._near_samples(t)]
+        stamps = np.unique(np.concatenate([self.stamps_ns[first:last], np.array(ends, np.int64)]))
+        if not len(stamps):
+            return ImuSamples.empty()
+        near = slice(max(first - 1, 0), last + 1)  # with one known sample beyond each end to interpolate from
+        # relative times: nanoseconds since 1970 do not fit a float64's 53 bits
+        at, known = (stamps - stamps[0]) / NS_PER_S, (self.stamps_ns[near] - stamps[0]) / NS_PER_S
+        columns = np.hstack([self.gyro_rad_s[near], self.accel_m_s2[near]])
+        values = np.column_stack([np.interp(at, known, columns[:, i]) for i in range(6)])
+        return ImuSamples(stamps, values[:, :3], values[:, 3:])
+
+    def _near_samples(self, stamp_ns: int) -> bool:
+        """Whether samples before and after the stamp are near enough to interpolate between."""
+        after = int(np.searchsorted(self.stamps_ns, stamp_ns, side="left"))
+        if after == len(self) or (after == 0 and self.stamps_ns[0] != stamp_ns):
+            return False
+        before = max(after - 1, 0)
+        return bool(
+            self.stamps_ns[after] == stamp_ns
+            or self.stamps_ns[after] - self.stamps_ns[before] <= LONGEST_INTERPOLATION_NS
+        )
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """Continuous-time noise densities of an IMU; the defaults fit an industrial MEMS unit.
+
+    The accelerometer and gyroscope densities are white noise per root hertz, the bias walks random walks, and the two
+    ``*_bias_sigma`` say how far the biases may be from zero at power-up. Those of a simulated IMU may be 0; to estimate
+    with, all must be above.
+
+    Raises:
+        SettingError: a value is negative or not finite.
+    """
+
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
+
+    gyro_rad_s_sqrt_hz: float = 1.0e-3
+    accel_m_s2_sqrt_hz: float = 1.0e-2
+    gyro_walk_rad_s2_sqrt_hz: float = 2.0e-5
+    accel_walk_m_s3_sqrt_hz: float = 3.0e-4
+    gyro_bias_sigma_rad_s: float = 1.0e-2
+    accel_bias_sigma_m_s2: float = 1.0e-1
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            expect(self, name, 0 <= value < np.inf, "finite and 0 or more")
+
+
+@dataclass(frozen=True, eq=False)
+class GpsFix:
+    """One GPS position.
+
+    Attributes:
+        stamp_ns: time of the fix.
+        position_m: ``(3,)`` in a local east-north-up frame, the same for all fixes of a recording.
+        covariance_m2: ``(3, 3)``.
+        origin: where on Earth that frame has its origin; None where it is not known.
+
+    Raises:
+        DataError: the position is not finite, or the covariance not positive definite.
+    """
+
+    stamp_ns: int
+    position_m: NDArray[np.float64]
+    covariance_m2: NDArray[np.float64]
+    origin: GeodeticPoint | None = None
+
+    def __post_init__(self) -> None:
+        position, covariance = (np.asarray(a, dtype=np.float64) for a in (self.position_m, self.covariance_m2))
+        if position.shape != (3,) or not np.isfinite(position).all():
+            raise DataError(f"GPS fix at {self.stamp_ns} ns: expected three finite metres, got {position.tolist()}")
+        known = covariance.shape == (3, 3) and np.isfinite(covariance).all()
+        if not known or np.linalg.eigvalsh(covariance)[0] <= 0:
+            raise DataError(f"GPS fix at {self.stamp_ns} ns: its covariance must be (3, 3) and positive definite")
+        object.__setattr__(self, "position_m", position)
+        object.__setattr__(self, "covariance_m2", covariance)
+
+
+@dataclass(frozen=True)
+class LidarModel:
+    """What a spinning lidar sees.
+
+    Attributes:
+        name: the preset's name, such as ``hdl-64e``.
+        elevations_deg: one per beam, from the top.
+        columns: azimuth steps in a turn.
+        min_range_m, max_range_m: outside them there is no return.
+        range_sigma_m: standard deviation of a range.
+        dropout: share of beams that return nothing though they hit.
+        rate_hz: turns a second.
+    """
+
+    name: str
+    elevations_deg: tuple[float, ...]
+    columns: int
+    min_range_m: float
+    max_range_m: float
+    range_sigma_m: float
+    dropout: float
+    rate_hz: float = 10.0
+
+    @property
+    def beams(self) -> int:
+        """Number of beams."""
+        return len(self.elevations_deg)
+
+
+def _hdl_64e_elevations() -> tuple[float, ...]:
+    # Velodyne HDL-64E S2 manual: 32 upper lasers every 1/3° from +2°, 32 lower every 1/2° from -8.83° to -24.33°
+    upper = np.linspace(2.0, -8.33, 32)
+    lower = np.linspace(-8.83, -24.33, 32)
+    return tuple(float(e) for e in np.concatenate([upper, lower]))
+
+
+LIDAR_MODELS: dict[str, LidarModel] = {
+    "hdl-64e": LidarModel("hdl-64e", _hdl_64e_elevations(), 1875, 1.5, 120.0, 0.02, 0.03),
+    "32-beam": LidarModel("32-beam", tuple(np.linspace(15.0, -25.0, 32).tolist()), 1800, 1.0, 100.0, 0.02, 0.03),
+    "16-beam": LidarModel("16-beam", tuple(np.linspace(15.0, -15.0, 16).tolist()), 1800, 0.5, 100.0, 0.03, 0.03),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Where the sensors sit.
+
+    Attributes:
+        T_imu_lidar: ``(4, 4)``; maps lidar points into the IMU (body) frame.
+        T_camera_lidar: ``(4, 4)`` or None; KITTI pose files are in this camera's frame.
+        antenna_imu_m: ``(3,)`` the GPS antenna in the IMU frame; None where it is not known, and taken to be there.
+    """
+
+    T_imu_lidar: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    T_camera_lidar: NDArray[np.float64] | None = None
+    antenna_imu_m: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "T_imu_lidar", se3.check_pose(self.T_imu_lidar, "T_imu_lidar"))
+        if self.T_camera_lidar is not None:
+            object.__setattr__(self, "T_camera_lidar", se3.check_pose(self.T_camera_lidar, "T_camera_lidar"))
+        if self.antenna_imu_m is not None:
+            antenna = np.asarray(self.antenna_imu_m, dtype=np.float64)
+            if antenna.shape != (3,) or not np.isfinite(antenna).all():
+                raise DataError(f"antenna_imu_m: expected three finite numbers, got {antenna.tolist()}")
+            object.__setattr__(self, "antenna_imu_m", antenna)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One step's input: a scan, with what the IMU and GPS delivered since the scan before.
+
+    Attributes:
+        index: position in the recording, from 0.
+        scan: the sweep.
+        imu: samples from the previous scan's stamp to this one's, interpolated at both; for the first frame those
+            before it, possibly none.
+        gps: fixes in that time.
+        sweep_imu: samples during the sweep, for motion compensation; it may end after the scan's stamp. Empty where
+            the scan's points carry no times.
+        calibration: the extrinsics; needed where there are IMU samples.
+        imu_noise: the IMU's noise, where the recording says it.
+    """
+
+    index: int
+    scan: Scan
+    imu: ImuSamples = field(default_factory=ImuSamples.empty)
+    gps: tuple[GpsFix, ...] = ()
+    sweep_imu: ImuSamples = field(default_factory=ImuSamples.empty)
+    calibration: Calibration | None = None
+    imu_noise: ImuNoise | None = None

@@ -1,0 +1,1 @@
+"""How good a trajectory is: metrics, plots and the report."""

@@ -1,0 +1,150 @@
+"""Whether covariances tell the truth: the normalised estimation error squared (NEES) and its average (ANEES).
+
+Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), §5.4.2. Errors of poses
+are right perturbations, ``Log(estimate⁻¹·truth)``, as the covariances are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridlio.core import se3
+from hybridlio.core.errors import DataError
+from hybridlio.core.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+PROBABILITY = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Anees:
+    """The average NEES, divided by the dimension: 1 is consistent, above it the covariances are too small.
+
+    Attributes:
+        value: the average; covariances ``k`` times too small give ``k``.
+        lower, upper: where it lies in 95 of 100 cases for true covariances and independent errors. The errors of
+            absolute poses are not independent, and stray outside far more often.
+        nees: ``(N,)`` each sample's NEES, divided by the dimension.
+        dimension: of one error.
+    """
+
+    value: float
+    lower: float
+    upper: float
+    nees: Array
+    dimension: int
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the average lies within the bounds."""
+        return self.lower <= self.value <= self.upper
+
+
+@dataclass(frozen=True, eq=False)
+class PoseConsistency:
+    """ANEES of whole poses (6 dimensions), and of their rotations and positions alone (3 each).
+
+    Attributes:
+        pose, rotation, position: the averages.
+        errors: ``(N, 6)`` rad and m, rotation first.
+        sigmas: ``(N, 6)`` the standard deviations that the covariances claim.
+    """
+
+    pose: Anees
+    rotation: Anees
+    position: Anees
+    errors: Array
+    sigmas: Array
+
+
+def anees(errors: Array, covariances: Array, probability: float = PROBABILITY) -> Anees:
+    """Average NEES of ``(N, d)`` errors under their ``(N, d, d)`` covariances, with χ² bounds.
+
+    Raises:
+        DataError: shapes that do not match, no rows, or a row that is not finite or not positive definite; names it.
+    """
+    errors, covariances = np.asarray(errors, np.float64), np.asarray(covariances, np.float64)
+    if errors.ndim != 2 or not len(errors) or covariances.shape != (*errors.shape, errors.shape[1]):
+        raise DataError(
+            f"ANEES: expected (N, d) errors and (N, d, d) covariances, got {errors.shape}, {covariances.shape}"
+        )
+    nees = (_whiten(errors, covariances) ** 2).sum(axis=1) / errors.shape[1]
+    lower, upper = bounds(len(errors), errors.shape[1], probability)
+    return Anees(float(nees.mean()), lower, upper, nees, errors.shape[1])
+
+
+def bounds(samples: int, dimension: int, probability: float = PROBABILITY) -> tuple[float, float]:
+    """Where the average of independent NEES values, divided by the dimension, lies with the given probability."""
+    from scipy.stats import chi2  # here, as it takes half a second to load
+
+    freedom = samples * dimension
+    tail = (1 - probability) / 2
+    return float(chi2.ppf(tail, freedom) / freedom), float(chi2.ppf(1 - tail, freedom) / freedom)
+
+
+def pose_consistency(errors: Array, covariances: Array) -> PoseConsistency:
+    """ANEES of ``(N, 6)`` pose errors, rotation first, under ``(N, 6, 6)`` covariances; each part by its own block.
+
+    Raises:
+        DataError: as :func:`anees`.
+    """
+    errors, covariances = np.asarray(errors, np.float64), np.asarray(covariances, np.float64)
+    return PoseConsistency(
+        pose=anees(errors, covariances),
+        rotation=anees(errors[:, :3], covariances[:, :3, :3]),
+        position=anees(errors[:, 3:], covariances[:, 3:, 3:]),
+        errors=errors,
+        sigmas=np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)),
+    )
+
+
+def step_consistency(reference: Trajectory, relative_poses: Array, covariances: Array) -> PoseConsistency:
+    """Consistency of the steps from each pose to the next.
+
+    Args:
+        reference: ``N`` poses.
+        relative_poses: ``(N-1, 4, 4)`` estimated ``T_k_k1``.
+        covariances: ``(N-1, 6, 6)`` of theirs.
+
+    Raises:
+        DataError: as :func:`anees`.
+    """
+    return pose_consistency(step_errors(reference, relative_poses), covariances)
+
+
+def step_errors(reference: Trajectory, relative_poses: Array) -> Array:
+    """Errors ``(N-1, 6)`` (rad, m) of estimated steps ``(N-1, 4, 4)`` against the ``N`` reference poses'."""
+    relative_poses = np.asarray(relative_poses, np.float64)
+    if len(relative_poses) != len(reference) - 1:
+        raise DataError(f"{len(relative_poses)} steps do not fit {len(reference)} reference poses; one fewer is needed")
+    true = se3.between(reference.poses[:-1], reference.poses[1:])
+    return se3.log(se3.between(relative_poses, true))
+
+
+def absolute_consistency(reference: Trajectory, estimate: Trajectory) -> PoseConsistency:
+    """Consistency of the poses relative to the first, which itself has no error and is left out.
+
+    Raises:
+        DataError: the estimate has no covariances, the numbers of poses differ, and as :func:`anees`.
+    """
+    if estimate.covariances is None or len(reference) != len(estimate):
+        has = "no" if estimate.covariances is None else f"{len(estimate)}"
+        raise DataError(f"consistency needs a covariance for each of {len(reference)} reference poses, there are {has}")
+    errors = se3.log(se3.between(estimate.from_first().poses, reference.from_first().poses))
+    return pose_consistency(errors[1:], estimate.covariances[1:])
+
+
+def _whiten(errors: Array, covariances: Array) -> Array:
+    finite = np.isfinite(errors).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
+    if not finite.all():
+        raise DataError(f"ANEES: row {int(finite.argmin())}: the error or its covariance is not finite")
+    try:
+        roots = np.linalg.cholesky(covariances)
+    except np.linalg.LinAlgError:
+        row = int(np.linalg.eigvalsh(covariances)[:, 0].argmin())
+        raise DataError(f"ANEES: row {row}: the covariance is not positive definite") from None
+    return np.asarray(np.linalg.solve(roots, errors[..., None])[..., 0])

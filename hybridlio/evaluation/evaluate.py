@@ -1,0 +1,270 @@
+"""Everything an estimate is judged by, in one call: drift, ATE, RPE and the consistency of its covariances.
+
+The parts live in `drift`, `trajectory_errors` and `consistency` and are offered here too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridlio.core import se3
+from hybridlio.core.errors import DataError
+from hybridlio.core.sensors import NS_PER_S
+from hybridlio.core.trajectory import Trajectory
+from hybridlio.evaluation.ate_rpe import MAX_DIFFERENCE_NS, Association, PoseErrors, align, associate, ate, rpe
+from hybridlio.evaluation.consistency import (
+    Anees,
+    PoseConsistency,
+    absolute_consistency,
+    anees,
+    pose_consistency,
+    step_consistency,
+    step_errors,
+)
+from hybridlio.evaluation.drift import KITTI_LENGTHS_M, Drift, DriftAverage, kitti_drift, lengths_for
+
+__all__ = [
+    "KITTI_LENGTHS_M",
+    "Anees",
+    "Association",
+    "Drift",
+    "DriftAverage",
+    "Evaluation",
+    "PoseConsistency",
+    "PoseErrors",
+    "Steps",
+    "absolute_consistency",
+    "align",
+    "anees",
+    "associate",
+    "associated_step_errors",
+    "ate",
+    "evaluate",
+    "kitti_drift",
+    "lengths_for",
+    "pose_consistency",
+    "rpe",
+    "step_consistency",
+    "step_errors",
+]
+
+Array = NDArray[np.float64]
+
+_FRAMES_DIFFER_DEG = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """Estimated motions from each pose of an estimate to the next.
+
+    Attributes:
+        poses: ``(N-1, 4, 4)`` ``T_k_k1``.
+        covariances: ``(N-1, 6, 6)``, rad² and m², rotation first.
+    """
+
+    poses: Array
+    covariances: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """An estimate's errors against a reference; None marks what could not be computed.
+
+    Attributes:
+        poses: how many moments were compared; of them, ``duration_s`` from first to last.
+        length_m, estimate_length_m: path lengths of the reference and of the estimate.
+        t_rel_percent, r_rel_deg_per_100m: KITTI's drift over 100-800 m; None for a path under 100 m.
+        chosen_lengths_m: other segment lengths, those asked for or those that fit a short path; None if not needed.
+        chosen_t_rel_percent, chosen_r_rel_deg_per_100m: drift over the chosen lengths, not comparable with KITTI's.
+        ate_m: root mean square of the position errors after rigid alignment of the positions (Umeyama's, as in evo).
+        ate_deg: of the orientation errors, after an alignment that minds orientations too (:func:`align`).
+        rpe_m, rpe_deg: root mean square of the errors from frame to frame.
+        end_error_m: distance from the true end with the first poses laid on each other.
+        anees_rotation, anees_position: of the poses relative to the first; 1 is consistent, above is overconfident.
+        step_anees_rotation, step_anees_position: of the steps from pose to pose.
+        anees_bounds, step_anees_bounds: where 95 % of consistent estimators with independent errors would lie.
+        segments, segments_by_speed: the drift's averages by length and by speed (over the chosen lengths where
+            KITTI's do not fit).
+        warnings: why not to trust the figures.
+        drift, chosen_drift: every segment.
+        pose_consistency, step_consistency: every error with its σ; the poses' lack the first.
+    """
+
+    poses: int
+    duration_s: float
+    length_m: float
+    estimate_length_m: float
+    t_rel_percent: float | None
+    r_rel_deg_per_100m: float | None
+    chosen_lengths_m: tuple[float, ...] | None
+    chosen_t_rel_percent: float | None
+    chosen_r_rel_deg_per_100m: float | None
+    ate_m: float
+    ate_deg: float
+    rpe_m: float
+    rpe_deg: float
+    end_error_m: float
+    anees_rotation: float | None
+    anees_position: float | None
+    anees_bounds: tuple[float, float] | None
+    step_anees_rotation: float | None
+    step_anees_position: float | None
+    step_anees_bounds: tuple[float, float] | None
+    segments: list[DriftAverage]
+    segments_by_speed: list[DriftAverage]
+    warnings: list[str]
+    drift: Drift = field(repr=False)
+    chosen_drift: Drift | None = field(repr=False)
+    pose_consistency: PoseConsistency | None = field(repr=False)
+    step_consistency: PoseConsistency | None = field(repr=False)
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """Every attribute but the single segments and errors, as plain numbers, lists and None."""
+        arrays = ("drift", "chosen_drift", "pose_consistency", "step_consistency")
+        out = {name: value for name, value in vars(self).items() if name not in arrays}
+        for name, key in (("segments", "length_m"), ("segments_by_speed", "speed_m_s")):
+            out[name] = [{key if k == "at" else k: v for k, v in asdict(average).items()} for average in out[name]]
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in out.items()}
+
+
+def evaluate(
+    reference: Trajectory | None,
+    estimate: Trajectory,
+    lengths_m: Sequence[float] | None = None,
+    steps: Steps | None = None,
+    max_difference_ns: int = MAX_DIFFERENCE_NS,
+) -> Evaluation:
+    """Compare an estimate with a reference.
+
+    Args:
+        reference: the truth; None, as of a recording without, is an error.
+        estimate: poses of the same sensor; the two may use different world frames. With covariances, of the poses
+            relative to the first, their consistency is judged too.
+        lengths_m: segment lengths for the drift beside KITTI's; by default :func:`lengths_for` a path under 100 m.
+        steps: the motions behind the estimate, to judge their covariances too.
+        max_difference_ns: see :func:`associate`.
+
+    Raises:
+        DataError: there is no reference, the two share less than two moments, or the steps do not fit the estimate.
+    """
+    _check_steps(steps, estimate)
+    both = associate(_known(reference), estimate, max_difference_ns)
+    drift = kitti_drift(both.reference, both.estimate)
+    chosen = _chosen_drift(both, lengths_m, bool(len(drift)))
+    shown = drift if len(drift) or chosen is None else chosen
+    absolute, relative = ate(both.reference, both.estimate), rpe(both.reference, both.estimate)
+    warnings = _warnings(both)
+    poses = _judged(lambda: _absolute(both), "poses", warnings)
+    step = _judged(lambda: _steps(both, estimate, steps), "steps", warnings)
+    end = se3.between(both.reference.from_first().poses[-1], both.estimate.from_first().poses[-1])
+    return Evaluation(
+        poses=len(both.reference),
+        duration_s=float((both.reference.stamps_ns[-1] - both.reference.stamps_ns[0]) / NS_PER_S),
+        length_m=both.reference.length_m,
+        estimate_length_m=both.estimate.length_m,
+        t_rel_percent=drift.t_rel_percent,
+        r_rel_deg_per_100m=drift.r_rel_deg_per_100m,
+        chosen_lengths_m=chosen.lengths_m if chosen else None,
+        chosen_t_rel_percent=chosen.t_rel_percent if chosen else None,
+        chosen_r_rel_deg_per_100m=chosen.r_rel_deg_per_100m if chosen else None,
+        ate_m=ate(both.reference, both.estimate, lever_m=0.0).rmse_m,
+        ate_deg=absolute.rmse_deg,
+        rpe_m=relative.rmse_m,
+        rpe_deg=relative.rmse_deg,
+        end_error_m=float(np.linalg.norm(end[:3, 3])),
+        anees_rotation=poses.rotation.value if poses else None,
+        anees_position=poses.position.value if poses else None,
+        anees_bounds=(poses.rotation.lower, poses.rotation.upper) if poses else None,
+        step_anees_rotation=step.rotation.value if step else None,
+        step_anees_position=step.position.value if step else None,
+        step_anees_bounds=(step.rotation.lower, step.rotation.upper) if step else None,
+        segments=shown.by_length(),
+        segments_by_speed=shown.by_speed(),
+        warnings=warnings,
+        drift=drift,
+        chosen_drift=chosen,
+        pose_consistency=poses,
+        step_consistency=step,
+    )
+
+
+def _known(reference: Trajectory | None) -> Trajectory:
+    if reference is None:
+        raise DataError("there is no reference to compare with: the recording came without")
+    return reference
+
+
+def _check_steps(steps: Steps | None, estimate: Trajectory) -> None:
+    if steps is not None and not len(steps.poses) == len(steps.covariances) == len(estimate) - 1:
+        raise DataError(
+            f"{len(steps.poses)} steps with {len(steps.covariances)} covariances do not fit {len(estimate)} poses"
+        )
+
+
+def _warnings(both: Association) -> list[str]:
+    """Poses of two sensors (KITTI's camera against the lidar) align well and still make nonsense of relative errors."""
+    steps = [se3.between(t.poses[:-1], t.poses[1:])[:, :3, 3] for t in (both.reference, both.estimate)]
+    ahead = [step.sum(axis=0) for step in steps]
+    lengths = [float(np.linalg.norm(direction)) for direction in ahead]
+    if min(lengths) < 0.5 * both.reference.length_m or min(lengths) < 1.0:
+        return []
+    angle = np.degrees(np.arccos(np.clip(ahead[0] @ ahead[1] / (lengths[0] * lengths[1]), -1.0, 1.0)))
+    if angle < _FRAMES_DIFFER_DEG:
+        return []
+    towards = ["xyz"[int(np.abs(direction).argmax())] for direction in ahead]
+    return [
+        f"the reference moves along its {towards[0]} axis, the estimate along its {towards[1]}, {angle:.0f}° apart: "
+        "these are poses of two different frames (camera and lidar?), whose drift and relative errors mean nothing"
+    ]
+
+
+def _chosen_drift(both: Association, lengths_m: Sequence[float] | None, has_kitti_drift: bool) -> Drift | None:
+    if lengths_m is not None:
+        return kitti_drift(both.reference, both.estimate, lengths_m, step=1)
+    lengths = () if has_kitti_drift else lengths_for(min(both.reference.length_m, KITTI_LENGTHS_M[0]))
+    return kitti_drift(both.reference, both.estimate, lengths, step=1) if lengths else None
+
+
+def _judged(judge: Callable[[], PoseConsistency | None], what: str, warnings: list[str]) -> PoseConsistency | None:
+    # a covariance that is none must not take drift and ATE away
+    try:
+        return judge()
+    except DataError as error:
+        warnings.append(f"the covariances of the {what} are not judged: {error}")
+        return None
+
+
+def _absolute(both: Association) -> PoseConsistency | None:
+    # covariances are relative to the estimate's own first pose: without it among the moments they say nothing here
+    if both.estimate.covariances is None or both.estimate_rows[0] != 0:
+        return None
+    return absolute_consistency(both.reference, both.estimate)
+
+
+def _steps(both: Association, estimate: Trajectory, steps: Steps | None) -> PoseConsistency | None:
+    if steps is None:
+        return None
+    rows, errors = associated_step_errors(both, estimate, steps.poses)
+    return pose_consistency(errors, steps.covariances[rows]) if len(rows) else None
+
+
+def associated_step_errors(
+    both: Association, estimate: Trajectory, step_poses: Array
+) -> tuple[NDArray[np.int64], Array]:
+    """Errors of an estimate's steps ``(N-1, 4, 4)`` where the reference has both ends: which steps, ``(M, 6)`` errors.
+
+    Args:
+        both: the estimate associated with the reference.
+        estimate: the same estimate, whole.
+        step_poses: its motions ``T_k_k1`` from each pose to the next.
+    """
+    rows = both.estimate_rows
+    at_own_stamps = estimate.stamps_ns[rows] == both.reference.stamps_ns
+    pairs = np.flatnonzero((np.diff(rows) == 1) & at_own_stamps[:-1] & at_own_stamps[1:])
+    true = se3.between(both.reference.poses[pairs], both.reference.poses[pairs + 1])
+    return rows[pairs], se3.log(se3.between(step_poses[rows[pairs]], true))

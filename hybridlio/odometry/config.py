@@ -1,0 +1,104 @@
+"""The configuration: a tree that mirrors the objects it sets up; unknown keys are errors."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from hybridlio.core.errors import ConfigError
+from hybridlio.core.files import read_yaml
+from hybridlio.core.sensors import ImuNoise
+from hybridlio.core.setting_checks import SettingError
+from hybridlio.learned.source_settings import LstmSettings, NetworkResidualSettings
+from hybridlio.record.keyframes import KeyframeSettings
+from hybridlio.sources.recent_scans import RecentScansSettings
+from hybridlio.sources.scan_matching_settings import ScanMatchingSettings
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
+
+class Config(BaseModel):
+    """Everything that an odometry run can be told.
+
+    Attributes:
+        initial_pose: a name of :data:`hybridlio.odometry.registry.INITIAL_POSE_SOURCES`.
+        residual: a name of :data:`hybridlio.odometry.registry.RESIDUAL_SOURCES`.
+        backend: a name of :data:`hybridlio.odometry.registry.BACKENDS`.
+        imu_noise: the IMU's noise; without it the recording's own, where it says so, else an industrial MEMS unit's.
+        scan_matching: settings of the classical residual source.
+        recent_scans: how many earlier scans each is compared with, by ``network`` and by ``scan-matching`` to the last
+            scan; a local map is made of keyframes already.
+        lstm: settings of the learned initial-pose source.
+        network: settings of the learned residual source.
+        keyframes: which clouds are kept for closing loops.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    initial_pose: str = "preintegration"
+    residual: str = "scan-matching"
+    backend: str = "fixed-lag"
+    imu_noise: ImuNoise | None = None
+    scan_matching: ScanMatchingSettings = Field(default_factory=ScanMatchingSettings)
+    recent_scans: RecentScansSettings = Field(default_factory=RecentScansSettings)
+    lstm: LstmSettings = Field(default_factory=LstmSettings)
+    network: NetworkResidualSettings = Field(default_factory=NetworkResidualSettings)
+    keyframes: KeyframeSettings = Field(default_factory=KeyframeSettings)
+
+
+def config_to_yaml(config: Config) -> str:
+    """The configuration as YAML text that :func:`load_config` reads back."""
+    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+
+
+def load_config(path: Path) -> Config:
+    """Read a YAML configuration; what it leaves out keeps its default.
+
+    Raises:
+        ConfigError: no such file, not YAML, an unknown key or a value out of range; names each.
+    """
+    return parse_config(read_yaml(path, ConfigError) or {}, str(path))
+
+
+def parse_config(tree: object, where: str) -> Config:
+    """The configuration of a tree of plain values; ``where`` names its origin in errors.
+
+    Raises:
+        ConfigError: an unknown key or a value out of range.
+    """
+    try:
+        return Config.model_validate(tree)
+    except ValidationError as error:
+        wrong = "; ".join(map(_complaint, error.errors()))
+        raise ConfigError(f"{where}: {wrong}. `hybridlio config` prints all keys with their defaults") from None
+
+
+def _complaint(error: ErrorDetails) -> str:
+    """What is wrong with one key, and which one may have been meant."""
+    *above, last = map(str, error["loc"] or ("",))
+    path = ".".join((*above, last))
+    if not path:
+        return f"expected settings, each with its key, got {error['input']!r:.40}"
+    cause = error.get("ctx", {}).get("error")
+    if isinstance(cause, SettingError):  # settings check themselves, and do not know where they stand
+        return f"{path}.{cause.name}: {cause.complaint}"
+    if error["type"] not in ("extra_forbidden", "unexpected_keyword_argument"):
+        return f"{path}: {error['msg'].lower()}"
+    every = [".".join(keys) for keys in _keys(Config().model_dump())]
+    beside = {key.rsplit(".", 1)[-1]: key for key in every if key.split(".")[:-1] == above}
+    meant = [beside[name] for name in difflib.get_close_matches(last, beside, n=1)]
+    meant = meant or [key for key in every if key.rsplit(".", 1)[-1] == last]
+    return f"{path}: unknown key{f'; did you mean {meant[0]}?' if meant else ''}"
+
+
+def _keys(tree: dict[str, Any], above: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    for key, value in tree.items():
+        yield (*above, key)
+        if isinstance(value, dict):
+            yield from _keys(value, (*above, key))

@@ -1,0 +1,1 @@
+"""What a run leaves behind for smoothing, packed while the run goes on."""

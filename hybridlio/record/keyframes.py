@@ -1,0 +1,168 @@
+"""Keyframes: a compact cloud every few metres, kept beside a run's record so that loops can be closed afterwards.
+
+A cloud takes six bytes a point, so a kilometre takes at most ``1000 / spacing_m · max_points · 6`` bytes: 7.5 MB with
+the default settings. During a run, packed, it takes five ninths of that in memory; the file is about half of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridlio.cloud.voxel import voxel_average
+from hybridlio.core.errors import DataError
+from hybridlio.core.estimates import Array
+from hybridlio.core.files import UNREADABLE_NPZ, writing_whole
+from hybridlio.core.packed_arrays import PackedCloud
+from hybridlio.core.sensors import Scan
+from hybridlio.core.setting_checks import above_0, expect
+
+FORMAT_VERSION = 1
+RESOLUTION_M = 0.005
+_FARTHEST_M = RESOLUTION_M * np.iinfo(np.int16).max
+_ENOUGH_POINTS = 30_000  # averaging more of a scan's points takes longer and moves the means by millimetres
+_MIN_POINTS = 200
+
+
+@dataclass(frozen=True)
+class KeyframeSettings:
+    """Which clouds are kept.
+
+    Attributes:
+        spacing_m: a scan this far from the last keyframe becomes one.
+        voxel_m: side of the voxels that thin it.
+        max_range_m: points farther away are left out.
+        max_points: with more points left, they are thinned evenly to so many.
+
+    Raises:
+        SettingError: a value is out of range.
+    """
+
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
+
+    spacing_m: float = 4.0
+    voxel_m: float = 0.7
+    max_range_m: float = 80.0
+    max_points: int = 5000
+
+    def __post_init__(self) -> None:
+        above_0(self, "spacing_m", "voxel_m", "max_points")
+        within = 0 < self.max_range_m < _FARTHEST_M
+        expect(self, "max_range_m", within, f"above 0 and below {_FARTHEST_M:.0f}")
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframes:
+    """The keyframes of a run.
+
+    Attributes:
+        rows: ``(K,)`` int64, ascending; which of the run's estimates each one is.
+        stamps_ns: ``(K,)`` int64.
+        clouds: ``K`` arrays ``(n, 3)`` int16, lidar frame at the stamp, in units of :data:`RESOLUTION_M`.
+    """
+
+    rows: NDArray[np.int64]
+    stamps_ns: NDArray[np.int64]
+    clouds: tuple[NDArray[np.int16], ...]
+
+    def __post_init__(self) -> None:
+        rows, stamps = np.asarray(self.rows, np.int64), np.asarray(self.stamps_ns, np.int64)
+        if not rows.shape == stamps.shape == (len(self.clouds),):
+            raise DataError(f"keyframes: {len(self.clouds)} clouds, {rows.shape} rows and {stamps.shape} stamps")
+        if (np.diff(rows) <= 0).any() or (len(rows) and rows[0] < 0):
+            raise DataError("keyframes: their rows do not ascend")
+        if any(cloud.dtype != np.int16 or cloud.ndim != 2 or cloud.shape[1] != 3 for cloud in self.clouds):
+            raise DataError("keyframes: clouds must be (n, 3) int16")
+        object.__setattr__(self, "rows", rows)
+        object.__setattr__(self, "stamps_ns", stamps)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def until(self, row: int) -> Keyframes:
+        """Those of the estimates before ``row``."""
+        count = int(np.searchsorted(self.rows, row))
+        return Keyframes(self.rows[:count], self.stamps_ns[:count], self.clouds[:count])
+
+    def points(self, k: int) -> Array:
+        """Points ``(n, 3)`` of keyframe ``k`` in metres."""
+        return self.clouds[k].astype(np.float64) * RESOLUTION_M
+
+    def save(self, path: Path) -> None:
+        """Write them to one ``.npz`` file of plain arrays."""
+        counts = np.array([len(cloud) for cloud in self.clouds], dtype=np.int64)
+        points = np.concatenate([np.empty((0, 3), np.int16), *self.clouds])
+        with writing_whole(path) as part, part.open("wb") as file:
+            np.savez_compressed(
+                file, allow_pickle=False, version=np.int64(FORMAT_VERSION), resolution_m=np.float64(RESOLUTION_M),
+                rows=self.rows, stamps_ns=self.stamps_ns, counts=counts, points=points,
+            )  # fmt: skip
+
+    @classmethod
+    def load(cls, path: Path) -> Keyframes:
+        """Read keyframes written by :meth:`save`; never executes anything in the file.
+
+        Raises:
+            DataError: no such file, not keyframes, or of another format version.
+        """
+        if not path.is_file():
+            raise DataError(f"{path}: no keyframes, which loop closure needs; run `hybridlio odometry` again")
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                version, resolution_m = int(file["version"]), float(file["resolution_m"])
+                if version != FORMAT_VERSION or resolution_m != RESOLUTION_M:
+                    raise ValueError(f"format version {version}, this release reads {FORMAT_VERSION}")
+                counts, points = file["counts"], file["points"]
+                if counts.ndim != 1 or (counts < 0).any() or counts.sum() != len(points):
+                    raise ValueError(f"clouds of {int(counts.sum())} points, but {len(points)} points")
+                ends = np.cumsum(counts)
+                clouds = tuple(points[end - count : end] for end, count in zip(ends, counts, strict=True))
+                return cls(file["rows"], file["stamps_ns"], clouds)
+        except UNREADABLE_NPZ as error:
+            raise DataError(f"{path}: not the keyframes of a run ({error}); run `hybridlio odometry` again") from error
+
+
+class KeyframeMaker:
+    """Takes the scans of a run in order, from the second on, and keeps one every few metres."""
+
+    def __init__(self, settings: KeyframeSettings) -> None:
+        self._settings = settings
+        self._position: Array | None = None
+        self._kept: list[tuple[int, int, PackedCloud]] = []  # row, stamp, points
+        self._step = min(max(round(settings.voxel_m / RESOLUTION_M), 1), 256)
+
+    def offer(self, row: int, scan: Scan, pose: Array) -> bool:
+        """Keep the scan if it is far enough from the last one kept, and of enough points.
+
+        Args:
+            row: which of the run's estimates it is.
+            scan: compensated for motion.
+            pose: ``(4, 4)`` of the lidar, by which distance is judged.
+        """
+        position = pose[:3, 3]
+        if self._position is not None and np.linalg.norm(position - self._position) < self._settings.spacing_m:
+            return False
+        cloud = compact(scan.points, self._settings)
+        if len(cloud) < _MIN_POINTS:
+            return False
+        self._kept.append((row, scan.stamp_ns, PackedCloud.of(cloud, self._step)))
+        self._position = position.copy()
+        return True
+
+    def keyframes(self) -> Keyframes:
+        """All so far."""
+        rows, stamps = (np.array([kept[i] for kept in self._kept], np.int64) for i in (0, 1))
+        return Keyframes(rows, stamps, tuple(cloud.cloud() for _, _, cloud in self._kept))
+
+
+def compact(points: NDArray[np.float32], settings: KeyframeSettings) -> NDArray[np.int16]:
+    """The points ``(N, 3)`` within range, one a voxel, as ``(n, 3)`` int16 in units of :data:`RESOLUTION_M`."""
+    some = points[:: max(1, len(points) // _ENOUGH_POINTS)]
+    some = some[np.einsum("ij,ij->i", some, some) < np.float32(settings.max_range_m) ** 2]
+    thinned = voxel_average(some, None, settings.voxel_m)[0]
+    if len(thinned) > settings.max_points:
+        thinned = thinned[np.linspace(0, len(thinned) - 1, settings.max_points).astype(np.intp)]
+    return np.round(thinned / np.float32(RESOLUTION_M)).astype(np.int16)

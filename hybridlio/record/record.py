@@ -1,0 +1,166 @@
+"""What a run leaves for smoothing: every step's relative poses, inertial samples and fixes, and where it started."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybridlio.core.errors import DataError
+from hybridlio.core.estimates import RelativePose, State
+from hybridlio.core.files import UNREADABLE_NPZ, writing_whole
+from hybridlio.core.geodesy import GeodeticPoint
+from hybridlio.core.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
+from hybridlio.core.trajectory import Trajectory
+from hybridlio.record.keyframes import Keyframes
+from hybridlio.record.step_arrays import keyframe_arrays, relative_arrays, relatives, with_keyframes
+
+Array = NDArray[np.float64]
+
+FORMAT_VERSION = 2
+_READABLE = (1, 2)  # the first had no poses relative to keyframes
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """A run, ready to be smoothed.
+
+    Attributes:
+        online: the backend's estimate at each of ``N`` scans, with covariances.
+        initial: ``N-1`` initial relative poses.
+        relative: ``N-1`` relative poses after the residual source.
+        imu: all samples from the first scan to the last; empty where there were none.
+        gps: the fixes in that time.
+        start: the prior state at the first scan.
+        calibration: the extrinsics.
+        imu_noise: what the IMU was taken to be worth.
+        keyframes: clouds for closing loops, or None; they have a file of their own.
+    """
+
+    online: Trajectory
+    initial: tuple[RelativePose, ...]
+    relative: tuple[RelativePose, ...]
+    imu: ImuSamples
+    gps: tuple[GpsFix, ...]
+    start: State
+    calibration: Calibration
+    imu_noise: ImuNoise
+    keyframes: Keyframes | None = None
+
+    @classmethod
+    def from_odometry(
+        cls,
+        trajectory: Trajectory,
+        imu: ImuSamples | None = None,
+        gps: tuple[GpsFix, ...] = (),
+        calibration: Calibration | None = None,
+        imu_noise: ImuNoise | None = None,
+        covariances: ArrayLike | None = None,
+    ) -> Record:
+        """A record of an odometry that is not ours, to be smoothed with what else was recorded.
+
+        Args:
+            trajectory: ``N`` lidar poses, two or more, in any frame.
+            imu: samples on the same clock.
+            gps: fixes; their clock may differ by a constant.
+            calibration: where the sensors sit; by default the IMU at the lidar.
+            imu_noise: what the IMU is worth.
+            covariances: ``(N-1, 6, 6)`` of the steps between consecutive poses, or ``(6, 6)`` of each, rad² and m²,
+                rotation first, errors of different steps independent. By default they are found from how the poses
+                agree with the IMU (:func:`hybridlio.record.odometry_noise.odometry_noise`).
+
+        Raises:
+            DataError: fewer than two poses, or covariances that do not fit or are none.
+        """
+        from hybridlio.record.foreign_odometry import record_from_odometry
+
+        return record_from_odometry(trajectory, imu, gps, calibration, imu_noise, covariances)
+
+    @property
+    def origin(self) -> GeodeticPoint | None:
+        """Where on Earth the fixes' frame has its origin; None without fixes, or where it is not known."""
+        return self.gps[0].origin if self.gps else None
+
+    @property
+    def edges(self) -> list[tuple[int, int, RelativePose]]:
+        """Every relative pose measured, from the scan and to the scan by number, with all of its covariance.
+
+        As edges of a pose graph they are taken for independent of each other; :func:`hybridlio.graph.run.smooth.smooth`
+        knows better.
+        """
+        number = {int(stamp): k for k, stamp in enumerate(self.online.stamps_ns)}
+        out = []
+        for k, step in enumerate(self.relative):
+            out.append((k, k + 1, step))
+            scatter = 0 if step.drift is None or not step.ok else step.covariance - step.drift
+            for near in step.keyframes:
+                edge = RelativePose(near.pose, near.covariance + scatter, step.source)
+                out.append((number[near.stamp_ns], k + 1, edge))
+        return out
+
+    def save(self, path: Path) -> None:
+        """Write everything but the keyframes to one ``.npz`` file of plain arrays."""
+        with writing_whole(path) as part, part.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **_to_arrays(self))
+
+    @classmethod
+    def load(cls, path: Path) -> Record:
+        """Read a record written by :meth:`save`; never executes anything in the file.
+
+        Raises:
+            DataError: no such file, not a record, or of another format version.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                return _from_arrays({name: file[name] for name in file.files})
+        except UNREADABLE_NPZ as error:
+            raise DataError(f"{path}: not a record of a run ({error}); run `hybridlio odometry` again") from error
+
+
+def _to_arrays(record: Record) -> dict[str, Any]:
+    arrays: dict[str, Any] = {
+        "version": FORMAT_VERSION,
+        "stamps_ns": record.online.stamps_ns,
+        "online_poses": record.online.poses,
+        "online_covariances": record.online.covariances,
+        "imu_stamps_ns": record.imu.stamps_ns,
+        "gyro_rad_s": record.imu.gyro_rad_s,
+        "accel_m_s2": record.imu.accel_m_s2,
+        "gps_stamps_ns": np.array([fix.stamp_ns for fix in record.gps], dtype=np.int64),
+        "gps_positions_m": np.array([fix.position_m for fix in record.gps]).reshape(-1, 3),
+        "gps_covariances_m2": np.array([fix.covariance_m2 for fix in record.gps]).reshape(-1, 3, 3),
+        "T_imu_lidar": record.calibration.T_imu_lidar,
+        "imu_noise": np.array(list(asdict(record.imu_noise).values())),
+    }
+    if record.calibration.T_camera_lidar is not None:
+        arrays["T_camera_lidar"] = record.calibration.T_camera_lidar
+    if record.calibration.antenna_imu_m is not None:
+        arrays["antenna_imu_m"] = record.calibration.antenna_imu_m
+    if record.origin is not None:
+        arrays["gps_origin"] = np.array(record.origin)
+    arrays |= {f"start_{f.name}": getattr(record.start, f.name) for f in fields(State)}
+    steps = relative_arrays("initial", record.initial) | relative_arrays("relative", record.relative)
+    return arrays | steps | keyframe_arrays(record.relative)
+
+
+def _from_arrays(arrays: Mapping[str, Any]) -> Record:
+    if int(arrays["version"]) not in _READABLE:
+        raise ValueError(f"format version {int(arrays['version'])}, this release reads {FORMAT_VERSION} and older")
+    start = {f.name: arrays[f"start_{f.name}"] for f in fields(State)}
+    start |= {"stamp_ns": int(start["stamp_ns"]), "has_imu": bool(start["has_imu"])}
+    origin = GeodeticPoint(*arrays["gps_origin"].tolist()) if "gps_origin" in arrays else None
+    gps = zip(arrays["gps_stamps_ns"], arrays["gps_positions_m"], arrays["gps_covariances_m2"], strict=True)
+    return Record(
+        online=Trajectory(arrays["stamps_ns"], arrays["online_poses"], arrays["online_covariances"]),
+        initial=relatives("initial", arrays),
+        relative=with_keyframes(relatives("relative", arrays), arrays),
+        imu=ImuSamples(arrays["imu_stamps_ns"], arrays["gyro_rad_s"], arrays["accel_m_s2"]),
+        gps=tuple(GpsFix(int(stamp), position, covariance, origin) for stamp, position, covariance in gps),
+        start=State(**start),
+        calibration=Calibration(arrays["T_imu_lidar"], arrays.get("T_camera_lidar"), arrays.get("antenna_imu_m")),
+        imu_noise=ImuNoise(*map(float, arrays["imu_noise"])),
+    )

@@ -1,0 +1,69 @@
+"""Relative poses of many steps as plain arrays, for files and for memory: as objects they take five times as much."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from hybridlio.core.estimates import KeyframePose, RelativePose
+
+
+def relative_arrays(prefix: str, steps: tuple[RelativePose, ...]) -> dict[str, Any]:
+    """Steps as plain arrays, all but their details and keyframes; the arrays' names begin with ``prefix``."""
+    return {
+        f"{prefix}_poses": np.array([s.pose for s in steps]).reshape(-1, 4, 4),
+        f"{prefix}_covariances": np.array([s.covariance for s in steps]).reshape(-1, 6, 6),
+        f"{prefix}_sources": np.array([s.source for s in steps], dtype=np.str_),
+        f"{prefix}_ok": np.array([s.ok for s in steps], dtype=bool),
+        f"{prefix}_from_imu": np.array([s.from_imu for s in steps], dtype=bool),
+        f"{prefix}_drifts": np.array([np.full((6, 6), np.nan) if s.drift is None else s.drift for s in steps]).reshape(
+            -1, 6, 6
+        ),
+        f"{prefix}_degenerate_step": np.array(
+            [k for k, s in enumerate(steps) for _ in range(len(s.degenerate))], dtype=np.int64
+        ),
+        f"{prefix}_degenerate": np.concatenate([s.degenerate for s in steps] + [np.empty((0, 6))]),
+    }
+
+
+def keyframe_arrays(steps: tuple[RelativePose, ...]) -> dict[str, Any]:
+    """The steps' poses relative to keyframes as plain arrays."""
+    found = [(row, keyframe) for row, step in enumerate(steps) for keyframe in step.keyframes]
+    return {
+        "keyframe_step": np.array([row for row, _ in found], dtype=np.int64),
+        "keyframe_stamps_ns": np.array([keyframe.stamp_ns for _, keyframe in found], dtype=np.int64),
+        "keyframe_poses": np.array([keyframe.pose for _, keyframe in found]).reshape(-1, 4, 4),
+        "keyframe_covariances": np.array([keyframe.covariance for _, keyframe in found]).reshape(-1, 6, 6),
+    }
+
+
+def with_keyframes(steps: tuple[RelativePose, ...], arrays: Mapping[str, Any]) -> tuple[RelativePose, ...]:
+    """The steps with what :func:`keyframe_arrays` holds, if anything."""
+    if "keyframe_step" not in arrays:  # the first version of records had none
+        return steps
+    columns = (arrays[f"keyframe_{name}"] for name in ("step", "stamps_ns", "poses", "covariances"))
+    found: dict[int, list[KeyframePose]] = {}
+    for row, stamp, pose, covariance in zip(*columns, strict=True):
+        found.setdefault(int(row), []).append(KeyframePose(int(stamp), pose, covariance))
+    return tuple(replace(step, keyframes=tuple(found.get(row, ()))) for row, step in enumerate(steps))
+
+
+def relatives(prefix: str, arrays: Mapping[str, Any]) -> tuple[RelativePose, ...]:
+    """The steps of :func:`relative_arrays`."""
+    at, directions = arrays[f"{prefix}_degenerate_step"], arrays[f"{prefix}_degenerate"]
+    columns = (arrays[f"{prefix}_{name}"] for name in ("poses", "covariances", "sources", "ok", "from_imu", "drifts"))
+    return tuple(
+        RelativePose(
+            pose,
+            covariance,
+            str(source),
+            directions[at == k],
+            bool(ok),
+            bool(from_imu),
+            None if np.isnan(drift).any() else drift,
+        )
+        for k, (pose, covariance, source, ok, from_imu, drift) in enumerate(zip(*columns, strict=True))
+    )

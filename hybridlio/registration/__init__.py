@@ -1,0 +1,1 @@
+"""Registration of a scan to a surface or a map: matching, Gauss-Newton, degeneracy, the local map."""

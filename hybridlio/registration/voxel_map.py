@@ -1,0 +1,105 @@
+"""The local map's points in cubic cells that take in a few each, and are forgotten when no scan has hit them for long.
+
+A scan of a place that was seen before mostly hits cells that are full. Planes are fitted only to its points that a cell
+takes in, one in ten: fitting them to all would take longer than anything else that a keyframe needs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridlio.cloud.kd_tree import build_tree, threads_for
+from hybridlio.cloud.plane_fitting import LEAST_NEIGHBOURS, Fitted, Planes, fit_planes, of_several_rings
+from hybridlio.core import se3
+from hybridlio.core.estimates import Array
+from hybridlio.registration.cell_table import CellTable, cells_of
+from hybridlio.registration.ring_planes import LoosePoints
+from hybridlio.registration.surface import Surface
+
+Index = NDArray[np.intp]
+
+MOST = 10  # points a cell
+_APART_M = 0.1
+_SPARSE_RANGE_M = 20.0  # within it 64 beams leave no point without another beam's beside it; 16 beams one in six
+_SPARSE = 0.05
+
+
+class MapCells:
+    """Points with normals, map frame; starts empty.
+
+    Args:
+        side_m: of the cells.
+        horizon: a cell that so many insertions have not hit is forgotten.
+        neighbours: points of a scan to fit a plane to for a normal.
+        threads: for trees.
+    """
+
+    def __init__(self, side_m: float, horizon: int, neighbours: int, threads: int) -> None:
+        self._side_m, self._horizon, self._neighbours, self._threads = side_m, horizon, neighbours, threads
+        self._table, self._loose = CellTable(), LoosePoints()
+        self._parts: list[Planes] = []  # of every insertion since what was forgotten was dropped
+        self._insertions = 0
+
+    def insert(self, points: Array, T_map_lidar: Array, known: Surface | None) -> Planes:
+        """Take in what there is room for of a scan's points ``(N, 3)``, lidar frame; ``known`` is of the points so far.
+
+        Points that lie beside one of ``known``, or that have no neighbours to make a plane, are left out. Where the
+        neighbours of a sparse scan's are of one beam, the last keyframes' are asked.
+
+        Returns:
+            those taken in.
+        """
+        moved = se3.transform(T_map_lidar, points)
+        labels, cells = cells_of(moved, self._side_m)
+        taken = _with_room(MOST - self._table.held(cells), labels)
+        if known is not None and len(taken):
+            taken = taken[known.nearest(moved[taken], self._threads)[1] >= _APART_M**2]
+        own, planes, alone = _with_planes(points, taken, self._neighbours, self._threads)
+        if not _are_sparse(points[taken], points[alone]):
+            alone = alone[:0]  # what is farther away needs no help, and planes of several scans are less sure
+        helped, others = self._loose.take_in(moved[alone], self._threads)
+        taken = np.concatenate([own, alone[helped]])
+        self._table.hit(cells, np.bincount(labels[taken], minlength=len(cells)), self._insertions)
+        self._insertions += 1
+        normals = np.concatenate([planes.normals @ T_map_lidar[:3, :3].T, others.normals])
+        new = Planes(moved[taken], normals, np.concatenate([planes.weights, others.weights]))
+        self._parts.append(new)
+        return new
+
+    def remembered(self) -> Planes:
+        """All but those of cells that are forgotten, which are dropped."""
+        everything = Planes(*(np.concatenate(column) for column in zip(*self._parts, strict=True)))
+        self._table.forget(self._insertions - self._horizon)
+        labels, cells = cells_of(everything.points, self._side_m)
+        kept = self._table.has(cells)
+        if not kept.all():
+            everything = Planes(*(column[kept[labels]] for column in everything))
+        self._parts = [everything]
+        return everything
+
+
+def _are_sparse(points: Array, alone: Array) -> bool:
+    """Whether of the points near the lidar too many are ``alone``, with none of another beam beside them."""
+    near, near_alone = (np.einsum("ij,ij->i", p, p) < _SPARSE_RANGE_M**2 for p in (points, alone))
+    return bool(near_alone.sum() > _SPARSE * near.sum())
+
+
+def _with_room(room: NDArray[np.int64], cells: Index) -> Index:
+    """Which points find room, where ``cells`` ``(N,)`` they lie in have ``room`` for so many each."""
+    candidates = np.flatnonzero(room[cells] > 0)
+    order = candidates[np.argsort(cells[candidates], kind="stable")]
+    ordered = cells[order]
+    rank = np.arange(len(ordered)) - np.searchsorted(ordered, ordered)  # among those of the same cell
+    return np.sort(order[rank < room[ordered]])
+
+
+def _with_planes(points: Array, wanted: Index, neighbours: int, threads: int) -> tuple[Index, Fitted, Index]:
+    """Those of ``wanted`` whose nearest points make a plane, the planes, and those whose nearest are of one beam."""
+    neighbours = min(neighbours, len(points))
+    if neighbours < LEAST_NEIGHBOURS or not len(wanted):
+        return wanted[:0], fit_planes(np.empty((0, LEAST_NEIGHBOURS, 3))), wanted[:0]
+    worth = threads_for(2 * len(wanted), threads)  # ten neighbours take twice as long as one or two
+    index, _ = build_tree(points, threads).batch_knn_search(points[wanted], neighbours, worth)
+    several = of_several_rings(points, index)
+    return wanted[several], fit_planes(points.take(index[several], axis=0)), wanted[~several]

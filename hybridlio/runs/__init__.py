@@ -1,0 +1,1 @@
+"""Whole recordings: run one, write its folder, compare, batch, prepare training data."""

@@ -1,0 +1,255 @@
+"""What is written of a run: its files, its metrics, its report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from hybridlio.core import se3
+from hybridlio.core.errors import EstimationError
+from hybridlio.core.files import write_whole
+from hybridlio.core.tables import counted
+from hybridlio.core.trajectory_files import write_tum
+from hybridlio.core.version import __version__
+from hybridlio.evaluation.evaluate import Evaluation, Steps
+from hybridlio.evaluation.report import draw, write_report
+from hybridlio.evaluation.report_data import Findings, ReportData, find
+from hybridlio.odometry.config import Config, config_to_yaml
+from hybridlio.record.record import Record
+from hybridlio.runs import folder as run_folder
+from hybridlio.runs.run import Run
+
+if TYPE_CHECKING:
+    from hybridlio.graph.run.loop_factors import ClosedLoops
+    from hybridlio.graph.run.smooth import Smoothed
+    from hybridlio.smoothing.gps_options import GpsFit
+    from hybridlio.smoothing.loop_closure import Loop
+    from hybridlio.sources.innovation_gate import Verdict
+
+_ONLINE, _SMOOTHED = "odometry", "smoothed"
+_TOLD = 20
+_MANY = 0.1  # of all scans
+
+
+def write_run(folder: Path, run: Run, config: Config) -> Findings:
+    """Write everything of a run, whole or interrupted, in place of what an earlier run left in the folder.
+
+    Returns:
+        What the evaluation found.
+
+    Raises:
+        EstimationError: there is not a single estimate.
+        DataError: a file cannot be written.
+    """
+    if not run.estimates:
+        raise EstimationError(f"{run.sequence.name}: nothing was estimated")
+    run_folder.clear(folder)
+    sequence, trajectory, record = run.sequence, run.trajectory, run.record
+    if record is not None:
+        record.save(folder / run_folder.RECORD)
+        if record.keyframes is not None:
+            record.keyframes.save(folder / run_folder.KEYFRAMES)
+        run_folder.write_graph(folder, trajectory.poses, record.edges, run.skipped)
+    run_folder.write_trajectory(folder, trajectory, T_pose_files(run), run.steps, run.stamps_before)
+    if sequence.reference is not None:
+        write_tum(folder / run_folder.REFERENCE, sequence.reference)
+    text = config_to_yaml(config)
+    write_whole(folder / run_folder.CONFIG, text)
+    data = report_data(run, config, text)
+    findings = find(data)
+    write_pages(folder, data, findings)
+    run_folder.write_metrics(folder, metrics(run, config, findings.evaluations.get(_ONLINE)))
+    return findings
+
+
+def write_pages(folder: Path, data: ReportData, findings: Findings) -> None:
+    """Write ``report.html``, and the picture of the path alone."""
+    drawn = draw(data, findings)
+    write_report(folder / run_folder.REPORT, data, findings, drawn)
+    write_whole(folder / run_folder.PICTURE, drawn["trajectory"])
+
+
+def T_pose_files(run: Run) -> Any:
+    """``T_camera_lidar`` where KITTI pose files of the recording are in the camera's frame, else None."""
+    sequence = run.sequence
+    return sequence.calibration.T_camera_lidar if sequence.pose_file_frame == "camera" else None
+
+
+def notes(run: Run) -> list[str]:
+    """What a reader should know before trusting the figures."""
+    out = list(run.sequence.notes)
+    if run.stopped is not None:
+        why = "interrupted" if isinstance(run.stopped, KeyboardInterrupt) else f"stopped by an error ({run.stopped})"
+        out.append(f"{why} after {run.done} of {len(run.sequence)} scans")
+    if run.skipped:
+        out.append(f"the run starts at scan {run.skipped}; {counted(run.skipped, 'scan')} before could not be used")
+    if run.bridged:
+        out.append(f"bridged by the initial pose, as they could not be used: {counted(len(run.bridged), 'scan')}")
+    out += disagreements(run)
+    told = [f"frame {k}: {why}" for k, why in run.unreadable.items()]
+    return out + told[:_TOLD] + ([f"and {len(told) - _TOLD} more"] if len(told) > _TOLD else [])
+
+
+def disagreements(run: Run) -> list[str]:
+    """What was done with scans that contradict the IMU, in a line each, and what to check then; often none."""
+    said = {
+        "rejected": "left out, as they contradict the IMU",
+        "relocated": "the map is followed from there, the jump left out, after contradicting the IMU once too often",
+        "down-weighted": "counted for less, as they disagree with the IMU beyond their covariances",
+        "trusted again": "taken as they are, as they contradict the IMU for longer than it is to be believed",
+    }
+    counts = {what: len(run.judged(cast("Verdict", verdict))) for verdict, what in said.items()}
+    out = [f"{what}: {counted(count, 'scan')}" for what, count in counts.items() if count]
+    gross = len(run.judged("rejected")) + len(run.judged("trusted again"))
+    if gross > _MANY * len(run.estimates):
+        out.append(
+            "so many scans contradict the IMU that it may be its data that are wrong: check T_imu_lidar, units, clock"
+        )
+    return out
+
+
+def report_data(run: Run, config: Config, config_text: str) -> ReportData:
+    """The run for its report."""
+    return ReportData(
+        name=run.sequence.name,
+        estimate=run.trajectory,
+        reference=run.sequence.reference,
+        estimate_name=_ONLINE,
+        initial_poses=run.initial_poses,
+        final_poses=run.steps.poses,
+        step_covariances=run.steps.covariances,
+        timings_s=run.timings_s,
+        ok=run.ok,
+        degenerate=run.degenerate,
+        first_scan=run.skipped,
+        facts={"initial pose": config.initial_pose, "residual": config.residual, "backend": config.backend},
+        config=config_text,
+        warnings=notes(run),
+    )
+
+
+def metrics(run: Run, config: Config, evaluation: Evaluation | None) -> dict[str, Any]:
+    """The figures of a run as plain values: what was done, how quickly and, with a reference, how well."""
+    T = T_pose_files(run)
+    out: dict[str, Any] = {
+        "hybridlio": __version__,
+        "sequence": run.sequence.name,
+        "initial_pose": config.initial_pose,
+        "residual": config.residual,
+        "backend": config.backend,
+        "frames": len(run.sequence),
+        "frames_done": run.done,
+        "interrupted": run.stopped is not None,
+        "skipped": run.skipped,
+        "bridged": run.bridged,
+        "rejected": run.judged("rejected"),
+        "down_weighted": run.judged("down-weighted"),
+        "relocated": run.judged("relocated"),
+        "trusted_again": run.judged("trusted again"),
+        "degenerate": (np.flatnonzero(run.degenerate) + run.skipped + 1).tolist(),
+        "unreadable": {str(k): why for k, why in run.unreadable.items()},
+        "notes": notes(run),
+        "path_length_m": run.trajectory.length_m,
+        "forward_speed_length_m": forward_speed_length_m(run),
+        "imu_path_length_m": imu_path_length_m(run),
+        "seconds": run.seconds,
+        "ms_per_scan": ms_per_scan(run),
+        "pose_file_frame": run.sequence.pose_file_frame,
+    }
+    if T is not None:
+        out["T_camera_lidar"] = T.tolist()
+    return out | (evaluation.to_json_dict() if evaluation is not None else {})
+
+
+def ms_per_scan(run: Run) -> dict[str, float]:
+    """Median milliseconds a scan by stage, and ``total`` without reading; empty for a single estimate."""
+    stages = run.timings_s
+    if not stages:
+        return {}
+    total = np.sum([spent for stage, spent in stages.items() if stage != "reading"], axis=0)
+    return {stage: 1e3 * float(np.median(spent)) for stage, spent in {**stages, "total": total}.items()}
+
+
+def forward_speed_length_m(run: Run) -> float | None:
+    """How far the vehicle went over the estimated scans by its own forward speed (trapezoidal rule), if known."""
+    speed = run.sequence.forward_speed_m_s
+    if speed is None or len(run.estimates) < 2:
+        return None
+    rows = slice(run.skipped, run.done)
+    return float(np.trapezoid(speed[rows], run.sequence.stamps_ns[rows] / 1e9))
+
+
+def imu_path_length_m(run: Run) -> float:
+    """How far the IMU went; in bends that is another way than the lidar's, and the forward speed is of this one."""
+    poses = run.trajectory.poses @ se3.inverse(run.sequence.calibration.T_imu_lidar)
+    return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
+
+
+def write_smoothed(folder: Path, stored: run_folder.StoredRun, record: Record, smoothed: Smoothed) -> Findings:
+    """Write a smoothed run as a run folder of its own, its report showing the trajectory before and after.
+
+    Returns:
+        What the evaluation of both found.
+
+    Raises:
+        DataError: a file cannot be written.
+    """
+    run_folder.clear(folder)
+    trajectory, T = smoothed.trajectory, stored.T_camera_lidar
+    steps = Steps(se3.between(trajectory.poses[:-1], trajectory.poses[1:]), smoothed.step_covariances)
+    run_folder.write_trajectory(folder, trajectory, T, steps, stored.stamps_before)
+    loops = _closed_loops(smoothed)
+    edges = [*record.edges, *((loop.earlier, loop.later, loop.as_relative_pose()) for loop in loops)]
+    run_folder.write_graph(folder, trajectory.poses, edges, len(stored.stamps_before))
+    if stored.reference is not None:
+        write_tum(folder / run_folder.REFERENCE, stored.reference)
+    findings = find(data := _smoothed_report_data(stored, record, smoothed, steps))
+    write_pages(folder, data, findings)
+    run_folder.write_metrics(folder, _smoothed_metrics(stored, smoothed, findings.evaluations.get(_SMOOTHED)))
+    return findings
+
+
+def _closed_loops(smoothed: Smoothed) -> tuple[Loop, ...]:
+    closed: ClosedLoops | None = smoothed.found.get("loops")
+    return () if closed is None else closed.kept
+
+
+def _smoothed_report_data(stored: run_folder.StoredRun, record: Record, smoothed: Smoothed, steps: Steps) -> ReportData:
+    fit: GpsFit | None = smoothed.found.get("gps")
+    closed: ClosedLoops | None = smoothed.found.get("loops")
+    loops = _closed_loops(smoothed)
+    return ReportData(
+        name=stored.metrics["sequence"],
+        estimate=smoothed.trajectory,
+        reference=stored.reference,
+        estimate_name=_SMOOTHED,
+        others={_ONLINE: stored.trajectory},
+        final_poses=steps.poses,
+        step_covariances=steps.covariances,
+        ok=np.array([step.ok for step in record.relative]),
+        degenerate=np.array([len(step.degenerate) > 0 for step in record.relative]),
+        first_scan=len(stored.stamps_before),
+        loops=np.array([(loop.earlier, loop.later) for loop in loops], np.int64).reshape(-1, 2),
+        facts={"smoothed": f"{smoothed.iterations} iterations", "run": stored.path.name}
+        | ({} if closed is None else {"loops": closed.summary()})
+        | ({} if fit is None else {"GPS": fit.summary()}),
+        warnings=stored.metrics["notes"],
+    )
+
+
+def _smoothed_metrics(
+    stored: run_folder.StoredRun, smoothed: Smoothed, evaluation: Evaluation | None
+) -> dict[str, Any]:
+    fit: GpsFit | None = smoothed.found.get("gps")
+    closed: ClosedLoops | None = smoothed.found.get("loops")
+    kept = ("hybridlio", "sequence", "pose_file_frame", "T_camera_lidar", "frames", "frames_done", "notes")
+    figures = {name: stored.metrics[name] for name in kept if name in stored.metrics}
+    figures |= {name: getattr(smoothed, name) for name in ("error_before", "error_after", "iterations", "converged")}
+    figures |= {"path_length_m": smoothed.trajectory.length_m}
+    if closed is not None:
+        figures |= {"loops": closed.to_json_dict(len(stored.stamps_before))}
+    if fit is not None:
+        figures |= {"gps": fit.to_json_dict()}
+    return figures | (evaluation.to_json_dict() if evaluation is not None else {})

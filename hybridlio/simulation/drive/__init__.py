@@ -1,0 +1,1 @@
+"""The simulated motion: path, vehicle, traffic, recorded paths."""

@@ -1,0 +1,1 @@
+"""The simulated sensors: lidar, IMU, GPS."""

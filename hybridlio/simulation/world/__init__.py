@@ -1,0 +1,1 @@
+"""The simulated surroundings: roads, ground, houses, and the ray-casting scene."""

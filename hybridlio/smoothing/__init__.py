@@ -1,0 +1,1 @@
+"""Measurements made after the run: loop closures and GPS fixes."""

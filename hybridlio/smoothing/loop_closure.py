@@ -1,0 +1,202 @@
+"""Loop closure: where a run comes back to a place it has been at, and how its two visits lie to each other.
+
+Candidates that odometry allows and that look alike are verified by registration; of those verified, the ones that agree
+with odometry and with one another are kept. What is wrong all the same is left to a robust solve
+(:mod:`hybridlio.graph.run.loop_factors`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hybridlio.core import se3
+from hybridlio.core.errors import DataError
+from hybridlio.core.estimates import Array, RelativePose
+from hybridlio.record.keyframes import Keyframes
+from hybridlio.record.record import Record
+from hybridlio.smoothing.loop_candidates import Candidate, CandidateFinder, CandidateSettings
+from hybridlio.smoothing.loop_consistency import (
+    ConsistencySettings,
+    MeasuredLoops,
+    chi2_bound,
+    largest_agreeing,
+    odometry_chi2,
+    pairwise_chi2,
+    witnessed,
+)
+from hybridlio.smoothing.loop_verification import Verdict, VerificationSettings, Verifier
+from hybridlio.smoothing.step_uncertainty import Index, OdometryChain
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """How loops are found: one part a stage."""
+
+    candidates: CandidateSettings = field(default_factory=CandidateSettings)
+    verification: VerificationSettings = field(default_factory=VerificationSettings)
+    consistency: ConsistencySettings = field(default_factory=ConsistencySettings)
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """Two visits to a place.
+
+    Attributes:
+        earlier, later: rows of the run.
+        pose: ``(4, 4)`` ``T_earlier_later``, lidar frames.
+        covariance: ``(6, 6)`` of a right perturbation, rad² and m², rotation first.
+        matched: share of points that lie near a surface.
+        cost: mean robust cost of the registration, 0 to 1.
+    """
+
+    earlier: int
+    later: int
+    pose: Array
+    covariance: Array
+    matched: float
+    cost: float
+
+    def as_relative_pose(self) -> RelativePose:
+        """The relative pose of the two scans."""
+        return RelativePose(self.pose, self.covariance, "loop")
+
+
+@dataclass(frozen=True)
+class RejectedLoop:
+    """A candidate that is no loop.
+
+    Attributes:
+        earlier, later: rows of the run.
+        stage: ``verification``, ``consistency`` or ``solve``.
+        reason: why.
+    """
+
+    earlier: int
+    later: int
+    stage: str
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class LoopSearch:
+    """What was found in a run.
+
+    Attributes:
+        keyframes, candidates, verified: how many of each.
+        loops: those that are consistent.
+        rejected: the other candidates.
+        seconds: by stage.
+    """
+
+    keyframes: int
+    candidates: int
+    verified: int
+    loops: tuple[Loop, ...]
+    rejected: tuple[RejectedLoop, ...]
+    seconds: dict[str, float]
+
+
+def find_loops(record: Record, settings: LoopSettings | None = None, progress: Progress | None = None) -> LoopSearch:
+    """Find the loops of a run from its record alone.
+
+    Args:
+        record: with keyframes.
+        settings: limits of each stage.
+        progress: called with ``loops``, keyframes done and keyframes in all.
+
+    Raises:
+        DataError: the record has no keyframes, or they do not belong to it.
+    """
+    settings = settings or LoopSettings()
+    keyframes = _keyframes_of(record)
+    chain = OdometryChain(record)
+    rows = keyframes.rows
+    verifier = Verifier(keyframes, chain, settings.verification)
+    finder = CandidateFinder(chain, rows, _up(record), verifier.surroundings, settings.candidates)
+    seconds = {"candidates": 0.0, "verification": 0.0, "consistency": 0.0}
+    found: list[tuple[Candidate, Verdict]] = []
+    for k in range(len(keyframes)):
+        began = time.perf_counter()
+        candidates = finder.add(k)
+        chosen = time.perf_counter()
+        found += [(one, verifier.verify(one.earlier, one.later, one.guesses)) for one in candidates]
+        seconds["candidates"] += chosen - began
+        seconds["verification"] += time.perf_counter() - chosen
+        if progress is not None:
+            progress("loops", k + 1, len(keyframes))
+    began = time.perf_counter()
+    verified, rejected = _sorted(found, rows)
+    loops, inconsistent = consistent(verified, chain, settings.consistency)
+    seconds["consistency"] = time.perf_counter() - began
+    return LoopSearch(len(keyframes), len(found), len(verified), loops, (*rejected, *inconsistent), seconds)
+
+
+def consistent(
+    verified: list[Loop], chain: OdometryChain, settings: ConsistencySettings
+) -> tuple[tuple[Loop, ...], tuple[RejectedLoop, ...]]:
+    """Those loops that agree with odometry and with one another, and the others with the reason."""
+    bound = chi2_bound(settings.inlier_share)
+    chi2 = odometry_chi2(_arrays(verified), chain, settings.odometry_scale) if verified else np.empty(0)
+    rejected = [
+        _inconsistent(one, f"against odometry (χ² {x:.0f})") for one, x in zip(verified, chi2, strict=True) if x > bound
+    ]
+    left = [one for one, x in zip(verified, chi2, strict=True) if x <= bound]
+    if not left:
+        return (), tuple(rejected)
+    arrays = _arrays(left)
+    agree = pairwise_chi2(arrays, chain, settings.odometry_scale) <= bound
+    seen = witnessed(arrays, agree, chain.travelled_m, settings)
+    kept = np.zeros(len(left), bool)
+    kept[seen] = largest_agreeing(agree[np.ix_(seen, seen)])
+    for one, has_witness, is_kept in zip(left, seen, kept, strict=True):
+        if not is_kept:
+            why = "other loops disagree" if has_witness else "no other loop nearby agrees"
+            rejected.append(_inconsistent(one, why))
+    return tuple(one for one, is_kept in zip(left, kept, strict=True) if is_kept), tuple(rejected)
+
+
+def _keyframes_of(record: Record) -> Keyframes:
+    keyframes = record.keyframes
+    if keyframes is None:
+        raise DataError("the record has no keyframes, which loop closure needs; run the odometry again")
+    stamps = record.online.stamps_ns
+    if len(keyframes) and (keyframes.rows[-1] >= len(stamps) or (stamps[keyframes.rows] != keyframes.stamps_ns).any()):
+        raise DataError("the keyframes are of another run than the record; run the odometry again")
+    return keyframes
+
+
+def _up(record: Record) -> Array:
+    """``(3,)`` in the first scan's frame; the lidar's z where no inertial data tell."""
+    if not record.start.has_imu:
+        return np.array([0.0, 0.0, 1.0])
+    return np.asarray(record.calibration.T_imu_lidar[:3, :3].T @ -record.start.gravity_m_s2)
+
+
+def _sorted(found: list[tuple[Candidate, Verdict]], rows: Index) -> tuple[list[Loop], list[RejectedLoop]]:
+    loops, rejected = [], []
+    for candidate, verdict in found:
+        earlier, later = int(rows[candidate.earlier]), int(rows[candidate.later])
+        if verdict.reason:
+            rejected.append(RejectedLoop(earlier, later, "verification", verdict.reason))
+        else:
+            loops.append(Loop(earlier, later, verdict.pose, verdict.covariance, verdict.matched, verdict.cost))
+    return loops, rejected
+
+
+def _inconsistent(loop: Loop, reason: str) -> RejectedLoop:
+    return RejectedLoop(loop.earlier, loop.later, "consistency", reason)
+
+
+def _arrays(loops: list[Loop]) -> MeasuredLoops:
+    return MeasuredLoops(
+        np.array([one.earlier for one in loops], np.int64),
+        np.array([one.later for one in loops], np.int64),
+        se3.orthonormalise(np.array([one.pose for one in loops])),
+        np.array([one.covariance for one in loops]),
+    )

@@ -1,0 +1,1 @@
+"""The classical implementations of the three seams."""

@@ -1,0 +1,70 @@
+"""A Kalman filter (filterpy) as initial pose: speed and rate of turn, from past steps and the gyroscope."""
+
+from __future__ import annotations
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+
+from hybridlio.core import se3
+from hybridlio.core.estimates import RelativePose, State
+from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise
+
+# State, lidar frame: velocity, acceleration, angular velocity, gyroscope bias; three numbers each.
+_V, _A, _W, _B = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+_START_SIGMAS = np.r_[np.full(3, 20.0), np.full(3, 2.0), np.full(3, 0.3)]  # m/s, m/s², rad/s
+_JERK_M_S3 = 5.0
+_ANGULAR_ACCELERATION_RAD_S2 = 0.5
+
+
+class Kalman:
+    """Constant acceleration and rate of turn, corrected by every step, and by the gyroscope before it."""
+
+    name = "kalman"
+
+    def __init__(self, calibration: Calibration, noise: ImuNoise) -> None:
+        self._R_lidar_imu = se3.inverse(calibration.T_imu_lidar)[:3, :3]
+        self._noise = noise
+        self._stamp_ns: int | None = None
+        self._filter = KalmanFilter(dim_x=12, dim_z=6)
+        self._filter.P = np.diag(np.r_[_START_SIGMAS, np.full(3, noise.gyro_bias_sigma_rad_s)] ** 2)
+
+    def predict(self, frame: Frame, state: State) -> RelativePose:
+        """Carry speed and rate on to the frame; the gyroscope's mean rate corrects the turn, where there is one."""
+        dt_s = (frame.scan.stamp_ns - state.stamp_ns) / NS_PER_S
+        self._stamp_ns = state.stamp_ns
+        F, Q = np.eye(12), np.zeros((12, 12))
+        F[_V, _A] = np.eye(3) * dt_s
+        Q[_A, _A] = np.eye(3) * (_JERK_M_S3 * dt_s) ** 2
+        Q[_W, _W] = np.eye(3) * (_ANGULAR_ACCELERATION_RAD_S2 * dt_s) ** 2
+        Q[_B, _B] = np.eye(3) * self._noise.gyro_walk_rad_s2_sqrt_hz**2 * dt_s
+        self._filter.predict(F=F, Q=Q)
+        if len(frame.imu):
+            self._correct_turn(frame, dt_s)
+        return self._step(dt_s, from_imu=len(frame.imu) > 0)
+
+    def correct(self, frame: Frame, estimate: RelativePose) -> None:
+        """Take the step as a measurement of speed and rate."""
+        if self._stamp_ns is None:
+            return
+        dt_s = (frame.scan.stamp_ns - self._stamp_ns) / NS_PER_S
+        H = np.zeros((6, 12))
+        H[:3, _W] = H[3:, _V] = np.eye(3)
+        H[3:, _A] = np.eye(3) * -dt_s / 2  # the filter stands at the step's end, the step's mean speed at its middle
+        self._filter.update(se3.log(estimate.pose)[:, None] / dt_s, R=estimate.covariance / dt_s**2, H=H)
+
+    def _correct_turn(self, frame: Frame, dt_s: float) -> None:
+        H = np.zeros((3, 12))
+        H[:, _W] = H[:, _B] = np.eye(3)
+        rate = self._R_lidar_imu @ frame.imu.gyro_rad_s.mean(axis=0)
+        R = np.eye(3) * self._noise.gyro_rad_s_sqrt_hz**2 / dt_s
+        self._filter.update(rate[:, None], R=R, H=H)
+
+    def _step(self, dt_s: float, from_imu: bool) -> RelativePose:
+        J = np.zeros((6, 12))
+        J[:3, _W] = J[3:, _V] = np.eye(3) * dt_s
+        J[3:, _A] = np.eye(3) * -(dt_s**2) / 2
+        step = (J @ self._filter.x)[:, 0]
+        covariance = J @ self._filter.P @ J.T + np.diag(np.r_[np.full(3, 1e-4), np.full(3, 1e-3)] ** 2)
+        return RelativePose(
+            se3.exp(step), (covariance + covariance.T) / 2, source=self.name, from_imu=from_imu
+        )  # fmt: skip

@@ -1,0 +1,1 @@
+"""Training data: shards of prepared scans, and pairs of them."""

@@ -1,0 +1,1 @@
+"""The unsupervised loss and its correspondences."""

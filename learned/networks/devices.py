@@ -1,0 +1,46 @@
+"""Where to compute, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hybridlio.core.errors import ConfigError
+
+
+def pick_device(name: str = "auto") -> torch.device:
+    """The device of a name as PyTorch has it; ``auto`` is a GPU where there is one, else the CPU.
+
+    Raises:
+        ConfigError: there is no such device here.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError, ValueError) as error:
+        raise ConfigError(f"device {name!r}: {str(error).splitlines()[0]}; choose auto, cpu or cuda") from error
+    return device
+
+
+def on_device(values: NDArray[np.float32] | NDArray[np.float64], device: torch.device) -> Tensor:
+    """Values as a float32 batch of one."""
+    return torch.from_numpy(np.asarray(values, np.float32))[None].to(device)
+
+
+@contextmanager
+def at_run_time() -> Iterator[None]:
+    """Without gradients, and on one thread: scan by scan a second gains nothing, and waits where cores are busy."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        torch.set_num_threads(threads)

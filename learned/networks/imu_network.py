@@ -1,0 +1,76 @@
+"""The initial pose from inertial data: a pair of LSTMs, acceleration to translation, angular velocity to orientation.
+
+Source: UnDeepLIO, "Estimating initial relative pose from IMU". Rows are those of
+:func:`hybridlio.learned.data.imu_rows.imu_rows`.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from hybridlio.learned.networks import torch_se3 as se3
+from hybridlio.learned.settings import NetworkSettings
+
+_GRAVITY_M_S2 = 9.81
+_RATE_RAD_S = 0.5  # what a road vehicle turns at
+
+
+class ImuNetwork(nn.Module):
+    """Two LSTMs over ``S`` rows, of the same structure; with ``siamese="shared"`` of the same weights too.
+
+    Rows are divided by 9.81 m/s² and 0.5 rad/s, so that weights for both kinds are of one size. With ``velocity`` the
+    translation LSTM sees the last velocity (in units of 10 m/s) in every row, and its output is added to what that
+    velocity gives in the time between the scans: acceleration alone cannot tell a constant speed. With ``mean_rate``
+    the orientation LSTM's output is added to what the mean angular velocity gives. What is added to is a first guess,
+    so the layers that correct it start small.
+    """
+
+    def __init__(self, settings: NetworkSettings) -> None:
+        super().__init__()
+        self.settings = settings
+        self.accel_lstm = _lstm(settings, 6 if settings.velocity else 3)
+        self.gyro_lstm = self.accel_lstm if settings.siamese == "shared" else _lstm(settings, 3)
+        if settings.imu != "feature":
+            self.translation = nn.Linear(settings.imu_hidden, 3)
+            self.rotation = nn.Linear(settings.imu_hidden, 3)
+            with torch.no_grad():
+                for layer, corrects in ((self.translation, settings.velocity), (self.rotation, settings.mean_rate)):
+                    if corrects:
+                        layer.weight *= settings.residual_scale
+                        layer.bias.zero_()
+
+    def features(self, imu: Tensor, velocity_m_s: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """What the LSTMs end with, ``(B, hidden)`` of accelerations and of angular velocities.
+
+        Args:
+            imu: ``(B, S, 6)``, angular velocity (rad/s) and specific force (m/s²).
+            velocity_m_s: ``(B, 3)`` at the last scan, in its axes; only looked at with ``velocity``.
+        """
+        accel, gyro = imu[..., 3:] / _GRAVITY_M_S2, imu[..., :3] / _RATE_RAD_S
+        if self.settings.velocity and velocity_m_s is not None:
+            accel = torch.cat([accel, (velocity_m_s / 10.0)[:, None].expand_as(accel)], dim=-1)
+        return self.accel_lstm(accel)[0][:, -1], self.gyro_lstm(gyro)[0][:, -1]
+
+    def forward(self, imu: Tensor, velocity_m_s: Tensor | None = None, dt_s: Tensor | None = None) -> Tensor:
+        """Initial poses ``T_k_k1`` ``(B, 4, 4)``; arguments as :meth:`features`, ``dt_s`` ``(B,)`` between scans."""
+        of_accel, of_gyro = self.features(imu, velocity_m_s)
+        scale = self.settings.output_scale
+        t = scale * self.translation(of_accel)
+        if self.settings.velocity and velocity_m_s is not None and dt_s is not None:
+            t = t + velocity_m_s * dt_s[:, None]
+        turned = scale * self.rotation(of_gyro)
+        if self.settings.mean_rate and dt_s is not None:
+            gyro = imu[..., :3]
+            mean = ((gyro[:, 1:] + gyro[:, :-1]) / 2).mean(dim=1)
+            turned = turned + mean * dt_s[:, None]
+        return se3.make(rotation_matrix(turned, self.settings), t)
+
+
+def rotation_matrix(three: Tensor, settings: NetworkSettings) -> Tensor:
+    """Rotations ``(B, 3, 3)`` of a network's three outputs: Euler angles, or a rotation vector."""
+    return se3.so3_exp(three) if settings.rotation == "log" else se3.euler_to_rotation(three)
+
+
+def _lstm(settings: NetworkSettings, inputs: int) -> nn.LSTM:
+    return nn.LSTM(inputs, settings.imu_hidden, settings.imu_layers, batch_first=True)

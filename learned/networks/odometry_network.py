@@ -1,0 +1,164 @@
+"""The whole network: initial pose, remapping, residual, ``T = δT·T̂``. Source: UnDeepLIO, "Network Structure"."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from hybridlio.core.errors import ConfigError
+from hybridlio.learned.networks import maps
+from hybridlio.learned.networks import torch_se3 as se3
+from hybridlio.learned.networks.imu_network import ImuNetwork
+from hybridlio.learned.networks.projective_steps import ProjectiveSteps, SeenPoints
+from hybridlio.learned.networks.residual_network import ResidualNetwork
+from hybridlio.learned.settings import NetworkSettings
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkInput:
+    """What the network sees of a batch of pairs.
+
+    Attributes:
+        last, current: vertex maps ``(B, 3, H, W)`` of scan k and k+1, each in its own frame.
+        imu: ``(B, S, 6)`` rows of :func:`hybridlio.learned.data.imu_rows.imu_rows`; zeros where there are none.
+        dt_s: ``(B,)`` time between the scans.
+        velocity_m_s: ``(B, 3)`` at scan k, in its axes; zeros where not known.
+        initial: ``(B, 4, 4)`` initial poses from elsewhere, for ``imu="given"``; else None or not looked at.
+        shake: ``(B, 4, 4)`` by which initial poses are perturbed on the right before they are refined, or None.
+    """
+
+    last: Tensor
+    current: Tensor
+    imu: Tensor
+    dt_s: Tensor
+    velocity_m_s: Tensor
+    initial: Tensor | None = None
+    shake: Tensor | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkOutput:
+    """What the network says.
+
+    Attributes:
+        initial: ``T̂`` ``(B, 4, 4)``.
+        poses: ``T = δT·T̂`` ``(B, 4, 4)`` after each step; the paper's network has one.
+    """
+
+    initial: Tensor
+    poses: tuple[Tensor, ...]
+
+    @property
+    def pose(self) -> Tensor:
+        """``T_k_k1`` ``(B, 4, 4)``, the last step's."""
+        return self.poses[-1]
+
+    @property
+    def residual(self) -> Tensor:
+        """``δT`` ``(B, 4, 4)``, of all steps together."""
+        return self.pose @ se3.inverse(self.initial)
+
+
+@dataclass(frozen=True, eq=False)
+class SeenScan:
+    """What is computed of a scan alone.
+
+    Attributes:
+        vertices, normals: maps ``(B, 3, H, W)`` in its own frame.
+        points: as the projective steps see it; None in a network without.
+    """
+
+    vertices: Tensor
+    normals: Tensor
+    points: SeenPoints | None
+
+
+class OdometryNetwork(nn.Module):
+    """UnDeepLIO: from two vertex maps and the inertial data between them to the relative pose ``T_k_k1``.
+
+    Args:
+        settings: its structure.
+
+    Attributes:
+        mixed_precision: encoders compute in bfloat16; geometry and poses never do.
+    """
+
+    def __init__(self, settings: NetworkSettings) -> None:
+        super().__init__()
+        self.settings = settings
+        self.mixed_precision = False
+        self.imu_network = ImuNetwork(settings) if settings.imu in ("initial-pose", "feature") else None
+        self.projective = ProjectiveSteps(settings) if settings.projective_steps else None
+        self.residual_network = ResidualNetwork(settings) if settings.encoder else None
+
+    def forward(self, given: NetworkInput) -> NetworkOutput:
+        """Estimate the relative poses of a batch.
+
+        Raises:
+            ConfigError: the maps have other cells than the network, or an initial pose is to be given and is not.
+        """
+        geometry = self.settings.geometry
+        if given.last.shape[-2:] != (geometry.rows, geometry.columns):
+            rows, columns = given.last.shape[-2:]
+            raise ConfigError(
+                f"the network takes maps of {geometry.rows} x {geometry.columns} cells, got {rows} x {columns}"
+            )
+        initial, features = self._from_imu(given)
+        start = initial if given.shake is None else initial @ given.shake
+        refined = self.refine(given, start, features)
+        # what the IMU network says is judged as it says it; a given initial pose counts with what shook it
+        return refined if self.settings.imu == "given" else NetworkOutput(initial, refined.poses)
+
+    def refine(
+        self, given: NetworkInput, initial: Tensor, features: tuple[Tensor, Tensor] | None = None
+    ) -> NetworkOutput:
+        """Estimate the residual of any initial poses ``(B, 4, 4)``; ``features`` are those of :meth:`imu_features`."""
+        return self.refine_seen(self.look(given.last), self.look(given.current), initial, features)
+
+    def look(self, vertices: Tensor) -> SeenScan:
+        """What is computed of a scan alone, from its vertex map ``(B, 3, H, W)``: once for both pairs that it is in."""
+        normals = maps.normal_map(vertices)
+        points = None if self.projective is None else self.projective.look(vertices, normals)
+        return SeenScan(vertices, normals, points)
+
+    def refine_seen(
+        self, last: SeenScan, current: SeenScan, initial: Tensor, features: tuple[Tensor, Tensor] | None = None
+    ) -> NetworkOutput:
+        """As :meth:`refine`, for scans that :meth:`look` has seen."""
+        pose, poses = initial, []
+        for _ in range(self.settings.iterations):
+            if self.projective is not None and last.points is not None and current.points is not None:
+                poses += self.projective(last.points, current.points, pose)
+                pose = poses[-1]
+            if self.residual_network is not None:
+                moved = maps.remap(current.vertices, current.normals, pose, self.settings.geometry)
+                with torch.autocast(pose.device.type, torch.bfloat16, enabled=self.mixed_precision):
+                    residual = self.residual_network((last.vertices, last.normals), moved, features)
+                pose = residual.float() @ pose
+                poses.append(pose)
+        return NetworkOutput(initial, tuple(poses))
+
+    def imu_features(self, imu: Tensor, velocity_m_s: Tensor) -> tuple[Tensor, Tensor] | None:
+        """What the residual network is told of the IMU; None but with ``imu="feature"``. See :class:`NetworkInput`."""
+        if self.imu_network is None or self.settings.imu != "feature":
+            return None
+        return self.imu_network.features(imu, velocity_m_s)
+
+    def _from_imu(self, given: NetworkInput) -> tuple[Tensor, tuple[Tensor, Tensor] | None]:
+        if self.settings.imu == "given":
+            if given.initial is None:
+                raise ConfigError("this network takes its initial pose from elsewhere, and none was given")
+            return given.initial, None
+        nothing = se3.identity(len(given.last), given.last)
+        if self.imu_network is None:
+            return nothing, None
+        if self.settings.imu == "feature":
+            return nothing, self.imu_features(given.imu, given.velocity_m_s)
+        return self.imu_network(given.imu, given.velocity_m_s, given.dt_s), None
+
+
+def parameter_count(network: nn.Module) -> int:
+    """How many numbers training adjusts; shared ones count once."""
+    return sum(parameter.numel() for parameter in network.parameters())

@@ -1,0 +1,243 @@
+"""Steps of point-to-plane registration between two maps, with weights that a small network gives.
+
+Not in the paper. Cells are the matches: each point of the current scan, moved by the pose so far, is held against the
+plane of the last scan in the cell that it falls into, and one weighted Gauss-Newton step of the point-to-plane loss is
+solved in closed form. The steps are differentiable, so the unsupervised loss teaches the weights which points to trust
+(moving cars, edges, leaves): both scans go through the same convolutions once, and a point's weight is a small network
+of the features of both its cells, of how rough they are and of its distance. Untrained, all points count alike but for
+a robust kernel.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from hybridlio.cloud.projection import MapGeometry
+from hybridlio.learned.networks import maps
+from hybridlio.learned.networks import torch_se3 as se3
+from hybridlio.learned.networks.residual_network import CircularConv
+from hybridlio.learned.settings import NetworkSettings
+
+_KERNELS_M = (0.4, 0.05)  # of the first and the last step, before training
+_KERNEL_GAIN = 10.0  # Adam's steps are as large for one number as for a layer's weights
+_LEVER_M = 10.0  # rotations are measured at this lever, so that the system is well scaled
+_DAMPING = 1e-4  # of the normal equations a point: directions that hardly any cell constrains stay as they are
+_LIMIT_M = 1.0
+_DISTANCE_M = 0.1  # what is left after an initial pose, so that networks see numbers around 1
+_FEWEST = 9000  # so many points are not thinned any more
+_ONE_OF = (4, 2)  # so many points are taken in the first half of the steps, and in the others
+_DILATION = 3
+_COARSE = 2  # features have a cell for so many rows and columns of the maps
+
+
+@dataclass(frozen=True, eq=False)
+class SeenPoints:
+    """A scan as the steps see it, whether it is the last one or the current one; computed once a scan.
+
+    Attributes:
+        points: ``(B, 3, N)`` the cells of its vertex map, row by row.
+        seen: ``(B, 1, N)`` which cells hold a point.
+        planes: ``(B, 4, N)`` the normal n of each cell and n·v, which is infinite where there is no normal.
+        rough: ``(B, 1, N)`` of :func:`_roughness`; None without weights to be told of it.
+        as_last, as_current: ``(B, n, C)`` what the n coarse cells contribute to the weights of points that fall into
+            them, and of their own points; None without weights. Of a scan that is thinned ``as_current`` is each
+            point's, ``(B, N, C)``.
+        coarse: ``(N,)`` which coarse cell each point's own cell is a part of.
+    """
+
+    points: Tensor
+    seen: Tensor
+    planes: Tensor
+    rough: Tensor | None = None
+    as_last: Tensor | None = None
+    as_current: Tensor | None = None
+    coarse: Tensor | None = None
+
+
+class ProjectiveSteps(nn.Module):
+    """From two scans and a pose to better poses, one for each step."""
+
+    def __init__(self, settings: NetworkSettings) -> None:
+        super().__init__()
+        self.settings = settings
+        self.log_kernel = nn.Parameter(torch.zeros(settings.projective_steps))
+        first, last = map(math.log, _KERNELS_M)
+        self.register_buffer("_start", torch.linspace(first, last, settings.projective_steps), persistent=False)
+        self.weights = PointWeights(settings) if settings.weight_channels else None
+
+    def look(self, vertices: Tensor, normals: Tensor) -> SeenPoints:
+        """What the steps need of a scan, from its maps ``(B, 3, H, W)`` in its own frame."""
+        offset = (normals * vertices).sum(dim=1, keepdim=True)
+        offset = torch.where(maps.valid_cells(normals)[:, None], offset, torch.inf)
+        planes = torch.cat([normals, offset], dim=1).flatten(2)
+        seen = maps.valid_cells(vertices)[:, None]
+        points = SeenPoints(vertices.flatten(2), seen.flatten(2), planes)
+        if self.weights is None:
+            return points
+        rough = _roughness(vertices, normals)
+        as_last, as_current = self.weights.look(vertices, normals, rough, seen)
+        coarse = self.weights.coarse
+        return replace(points, rough=rough.flatten(2), as_last=as_last, as_current=as_current, coarse=coarse)
+
+    def forward(self, last: SeenPoints, current: SeenPoints, pose: Tensor) -> list[Tensor]:
+        """Poses ``T_k_k1`` ``(B, 4, 4)`` after each step.
+
+        A step takes the pose before it as given: gradients go through the weights, not back through earlier steps. The
+        first half of the steps takes every fourth point, the others every second, of large maps: more do not make
+        them better.
+        """
+        most = max(current.points.shape[-1] // _FEWEST, 1)
+        few, more = (_thinned(current, min(by, most)) for by in _ONE_OF)
+        poses = []
+        for k, kernel_m in enumerate(self.kernels_m):
+            points = few if k < self.settings.projective_steps // 2 else more
+            pose = self._step(last, points, pose.detach(), kernel_m) @ pose.detach()
+            poses.append(pose)
+        return poses
+
+    def _step(self, last: SeenPoints, current: SeenPoints, pose: Tensor, kernel_m: Tensor) -> Tensor:
+        """``δT`` ``(B, 4, 4)`` of one step."""
+        moved = torch.baddbmm(pose[:, :3, 3:], pose[:, :3, :3], current.points)
+        cell, inside = maps.cells(moved, self.settings.geometry)
+        normals, distance, there = _held_against(last.planes, moved, cell, inside[:, None] & current.seen)
+        weights = there * (kernel_m**2 / (kernel_m**2 + distance.square())).square()
+        if self.weights is not None:
+            weights = weights * self.weights(last, current, cell, distance, kernel_m)
+        return weighted_step(normals, moved, distance, weights)
+
+    @property
+    def kernels_m(self) -> Tensor:
+        """Width of each step's robust kernel, in metres."""
+        start: Tensor = self.get_buffer("_start")
+        return (start + _KERNEL_GAIN * self.log_kernel).exp()
+
+
+class PointWeights(nn.Module):
+    """What each point of the current scan counts, by the features of its cell in both maps and its distance."""
+
+    def __init__(self, settings: NetworkSettings) -> None:
+        super().__init__()
+        self.scale_m = settings.vertex_scale_m
+        channels = settings.weight_channels
+        self.features = nn.Sequential(
+            CircularConv(8, channels, 3, (_COARSE, _COARSE), bias=True),
+            nn.ReLU(),
+            CircularConv(channels, channels, 3, (1, 1), bias=True),
+            nn.ReLU(),
+            CircularConv(channels, channels, 3, (1, 1), bias=True, dilation=_DILATION),  # sees about 10° around
+            nn.ReLU(),
+        )
+        self.of_last = nn.Linear(channels, channels)
+        self.of_current = nn.Linear(channels, channels, bias=False)
+        self.of_point = nn.Linear(4, channels, bias=False)
+        self.logit = nn.Linear(channels, 1)
+        for parameter in self.logit.parameters():
+            nn.init.zeros_(parameter)
+        self.register_buffer("_coarse", _coarse_cells(settings.geometry), persistent=False)
+
+    @property
+    def coarse(self) -> Tensor:
+        """``(H·W,)`` the coarse cell that each cell of a map is a part of."""
+        return self.get_buffer("_coarse")
+
+    def look(self, vertices: Tensor, normals: Tensor, rough: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+        """What a scan's coarse cells contribute ``(B, n, C)``, as the last scan's and as the current one's."""
+        inputs = torch.cat([vertices / self.scale_m, normals, rough, seen.to(vertices.dtype)], dim=1)
+        features = self.features(inputs).flatten(2)
+        # as convolutions and copied: several times as fast as linear layers of channels last
+        as_last = functional.conv1d(features, self.of_last.weight[..., None], self.of_last.bias)
+        as_current = functional.conv1d(features, self.of_current.weight[..., None])
+        return as_last.transpose(1, 2).contiguous(), as_current.transpose(1, 2).contiguous()
+
+    def forward(
+        self, last: SeenPoints, current: SeenPoints, cell: Tensor, distance: Tensor, kernel_m: Tensor
+    ) -> Tensor:
+        """Weights ``(B, 1, N)`` from 0 to 1 of points by the cells ``(B, N)`` they fall into and their distances."""
+        assert last.rough is not None
+        assert last.as_last is not None
+        assert current.rough is not None
+        assert current.as_current is not None
+        size = distance.abs()
+        compared = (size / kernel_m.detach()).clamp(max=5.0)
+        rough = last.rough.gather(2, cell[:, None])
+        point = torch.cat([size / _DISTANCE_M, compared, rough, current.rough], dim=1)
+        batch, cells, channels = last.as_last.shape
+        # rows of a table are fetched, and worked on, faster than channels one by one
+        first = torch.arange(0, batch * cells, cells, device=cell.device)[:, None]
+        fallen_into = (self.coarse.index_select(0, cell.flatten()).reshape(cell.shape) + first).flatten()
+        there = last.as_last.reshape(-1, channels).index_select(0, fallen_into).reshape(batch, -1, channels)
+        of_point = torch.bmm(self.of_point.weight.expand(batch, -1, -1), point).transpose(1, 2)
+        # in place, since fetching memory is what takes time
+        hidden = there.add_(current.as_current).add_(of_point).relu_()
+        weights: Tensor = self.logit(hidden)
+        return weights.sigmoid_().transpose(1, 2)
+
+
+def _coarse_cells(geometry: MapGeometry) -> Tensor:
+    """``(H·W,)`` the coarse cell that each cell is a part of, both counted row by row."""
+    rows, columns = (torch.arange(n) // _COARSE for n in (geometry.rows, geometry.columns))
+    return (rows[:, None] * (int(columns[-1]) + 1) + columns).flatten()
+
+
+def _thinned(scan: SeenPoints, by: int) -> SeenPoints:
+    """Every so-manieth point, laid out anew, with what it contributes itself; what belongs to cells stays."""
+    rough, coarse = (None if x is None else x[..., ::by].contiguous() for x in (scan.rough, scan.coarse))
+    points, seen = scan.points[..., ::by].contiguous(), scan.seen[..., ::by].contiguous()
+    own = scan.as_current
+    if own is not None and coarse is not None:
+        own = own.index_select(1, coarse)
+    return replace(scan, points=points, seen=seen, rough=rough, as_current=own, coarse=coarse)
+
+
+def _roughness(vertices: Tensor, normals: Tensor) -> Tensor:
+    """``(B, 1, H, W)`` how far cells lie from between their neighbours along their normals, in units of 0.1 m, up to 5.
+
+    0 where there is no normal. On a plane it is the noise of the range.
+    """
+    around = functional.pad(vertices, (1, 1, 0, 0), mode="circular")
+    beside = (around[..., 2:] + around[..., :-2]) / 2 - vertices
+    above = torch.zeros_like(vertices)
+    above[..., 1:-1, :] = (vertices[..., 2:, :] + vertices[..., :-2, :]) / 2 - vertices[..., 1:-1, :]
+    off = [(normals * offset).sum(dim=1, keepdim=True).abs() for offset in (beside, above)]
+    return (torch.maximum(*off) / _DISTANCE_M).clamp(max=5.0)
+
+
+def _held_against(planes: Tensor, points: Tensor, cell: Tensor, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Normals ``(B, 3, N)``, signed distances ``(B, 1, N)`` in metres, and where there are such, as 0 and 1.
+
+    Args:
+        planes: ``(B, 4, H·W)`` as in :class:`SeenPoints`.
+        points: ``(B, 3, N)`` in the planes' frame.
+        cell: ``(B, N)`` they fall into.
+        known: ``(B, 1, N)`` which of them are points at all.
+    """
+    chosen = planes.gather(2, cell[:, None].expand(-1, 4, -1))
+    normals = chosen[:, :3]
+    distance = (normals * points).sum(dim=1, keepdim=True) - chosen[:, 3:]
+    there = known & (distance.abs() < _LIMIT_M)
+    return normals, torch.where(there, distance, 0.0), there.to(distance.dtype)
+
+
+def weighted_step(normals: Tensor, points: Tensor, distance: Tensor, weights: Tensor) -> Tensor:
+    """``δT`` ``(B, 4, 4)`` of one Gauss-Newton step of ``Σ w d²``, for points and the planes that they belong to.
+
+    Args:
+        normals, points: ``(B, 3, N)`` in one frame.
+        distance, weights: ``(B, 1, N)``.
+    """
+    # d of Exp(ξ)·p is n·(ω × p + v) = (p × n)·ω + n·v
+    J = torch.cat([maps.cross(points, normals, dim=1), normals], dim=1)
+    weighted = J * weights
+    total = weights.sum(-1, keepdim=True).clamp(min=1e-6)
+    unit = torch.ones(6, 1, dtype=J.dtype, device=J.device)
+    unit[:3] /= _LEVER_M
+    H = weighted @ J.transpose(1, 2) * (unit * unit.T) / total
+    g = weighted @ distance.transpose(1, 2) * unit / total
+    eye = torch.eye(6, dtype=H.dtype, device=H.device)
+    xi = -torch.linalg.solve(H + _DAMPING * eye, g)[..., 0]
+    return se3.exp(torch.cat([xi[:, :3] / _LEVER_M, xi[:, 3:]], dim=1))

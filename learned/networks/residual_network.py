@@ -1,0 +1,180 @@
+"""The residual pose from two pairs of maps: a siamese ResNet encoder, pooling, a fully connected layer, attention.
+
+Source: UnDeepLIO, "Estimating residual relative pose from the remapped maps". The encoder's sizes are not in the paper;
+they are settings. Columns wrap around: convolutions are padded circularly along them, by zeros along rows.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from hybridlio.learned.networks import torch_se3 as se3
+from hybridlio.learned.networks.attention import make_head
+from hybridlio.learned.networks.imu_network import rotation_matrix
+from hybridlio.learned.settings import NetworkSettings
+
+_GROUP = 8  # channels that are normalised together
+_MORE_CHANNELS = {"none": 0, "distance": 1, "gradient": 7}
+_DISTANCE_M = 0.1  # what is left after an initial pose, so that networks see numbers around 1
+_LEVER_M = 10.0  # makes gradients by rotation as large as those by translation
+
+
+class CircularConv(nn.Module):
+    """A square convolution whose columns wrap around; rows are padded by zeros. A bias only where no norm follows."""
+
+    def __init__(
+        self, inputs: int, outputs: int, size: int, stride: tuple[int, int], bias: bool = False, dilation: int = 1
+    ) -> None:
+        super().__init__()
+        self.reach = size // 2 * dilation
+        self.conv = nn.Conv2d(inputs, outputs, size, stride, (self.reach, 0), dilation, bias=bias)
+        nn.init.kaiming_normal_(self.conv.weight, nonlinearity="relu")
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Maps ``(B, C, H, W)`` to ``(B, outputs, ⌈H/stride⌉, ⌈W/stride⌉)``."""
+        return self.conv(functional.pad(x, (self.reach, self.reach, 0, 0), mode="circular"))  # type: ignore[no-any-return]
+
+
+class BasicBlock(nn.Module):
+    """Two convolutions of 3 × 3 beside a shortcut (He et al., "Deep residual learning for image recognition", 2016)."""
+
+    def __init__(self, inputs: int, outputs: int, stride: tuple[int, int], settings: NetworkSettings) -> None:
+        super().__init__()
+        bare = settings.normalisation == "none"
+        self.first = CircularConv(inputs, outputs, 3, stride, bare)
+        self.first_norm = _norm(outputs, settings)
+        self.second = CircularConv(outputs, outputs, 3, (1, 1), bare)
+        if bare:  # a block starts as its shortcut, so that signals keep their size through all of them
+            nn.init.zeros_(self.second.conv.weight)
+        self.second_norm = _norm(outputs, settings)
+        same = inputs == outputs and stride == (1, 1)
+        self.shortcut = (
+            nn.Identity()
+            if same
+            else nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=bare), _norm(outputs, settings))
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Maps to maps of ``outputs`` channels."""
+        inner = torch.relu(self.first_norm(self.first(x)))
+        return torch.relu(self.second_norm(self.second(inner)) + self.shortcut(x))
+
+
+class Encoder(nn.Module):
+    """Stem, stages, average pooling and a fully connected layer: maps ``(B, C, H, W)`` to features ``(B, features)``.
+
+    Every stage halves the columns, and the rows but in the first: a map has far more columns than rows. The stem halves
+    the columns too, unless the settings say more.
+    """
+
+    def __init__(self, inputs: int, settings: NetworkSettings) -> None:
+        super().__init__()
+        self.pooled_columns = settings.pooled_columns
+        self.stem = CircularConv(inputs, settings.stem, 7, settings.stem_stride, settings.normalisation == "none")
+        self.stem_norm = _norm(settings.stem, settings)
+        layers, channels = [], settings.stem
+        for stage, outputs in enumerate(settings.stages):
+            stride = (1 if stage == 0 else 2, 2)
+            layers.append(BasicBlock(channels, outputs, stride, settings))
+            layers += [BasicBlock(outputs, outputs, (1, 1), settings) for _ in range(settings.blocks - 1)]
+            channels = outputs
+        self.stages = nn.Sequential(*layers)
+        self.full = nn.Linear(channels * settings.pooled_columns, settings.features)
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """The features of maps."""
+        x = self.stages(torch.relu(self.stem_norm(self.stem(maps))))
+        pooled = functional.adaptive_avg_pool2d(x, (1, self.pooled_columns)).flatten(1)
+        return self.full(pooled)  # type: ignore[no-any-return]
+
+
+class ResidualNetwork(nn.Module):
+    """The residual ``δT`` between the last scan's maps and the current one's, moved by the initial pose."""
+
+    def __init__(self, settings: NetworkSettings) -> None:
+        super().__init__()
+        self.settings = settings
+        self.vertex_encoder = Encoder(6 + _MORE_CHANNELS[settings.distance], settings)
+        if settings.normals != "none":
+            shared = settings.siamese == "shared"
+            self.normal_encoder = self.vertex_encoder if shared else Encoder(6, settings)
+        more = settings.imu_hidden if settings.imu == "feature" else 0
+        both = settings.features * (1 if settings.normals == "none" else 2)
+        separate = settings.normals == "separate"
+        # one kind of IMU feature each where the branches are apart; both where they are not
+        translation_size, rotation_size = (
+            (settings.features + more, both + more) if separate else (both + 2 * more,) * 2
+        )
+        self.rotation_head = make_head(settings.head, rotation_size)
+        self.translation_head = make_head(settings.head, translation_size) if separate else self.rotation_head
+        self.translation = _last(translation_size, settings)
+        self.rotation = _last(rotation_size, settings)
+
+    def forward(
+        self,
+        last: tuple[Tensor, Tensor],
+        current: tuple[Tensor, Tensor],
+        imu_features: tuple[Tensor, Tensor] | None = None,
+    ) -> Tensor:
+        """Residual poses ``δT`` ``(B, 4, 4)``.
+
+        Args:
+            last: vertex and normal maps ``(B, 3, H, W)`` of the last scan.
+            current: those of the current scan, moved into the last scan's frame.
+            imu_features: of acceleration and of angular velocity, ``(B, imu_hidden)`` each, with ``imu="feature"``.
+        """
+        of_vertices = self.vertex_encoder(self._vertex_pair(last, current))
+        parts = [of_vertices.float()]
+        if self.settings.normals != "none":
+            parts.append(self.normal_encoder(torch.cat([last[1], current[1]], dim=1)).float())
+        translation_parts = parts[:1] if self.settings.normals == "separate" else parts
+        rotation_parts = parts
+        if imu_features is not None:
+            of_accel, of_gyro = imu_features
+            separate = self.settings.normals == "separate"
+            translation_parts = [*translation_parts, of_accel] if separate else [*parts, of_accel, of_gyro]
+            rotation_parts = [*parts, of_gyro] if separate else [*parts, of_accel, of_gyro]
+        t = self.translation(self.translation_head(torch.cat(translation_parts, dim=1)).float())
+        angles = self.rotation(self.rotation_head(torch.cat(rotation_parts, dim=1)).float())
+        scale = self.settings.output_scale
+        return se3.make(rotation_matrix(scale * angles.float(), self.settings), scale * t.float())
+
+    def _vertex_pair(self, last: tuple[Tensor, Tensor], current: tuple[Tensor, Tensor]) -> Tensor:
+        channels = [last[0] / self.settings.vertex_scale_m, current[0] / self.settings.vertex_scale_m]
+        if self.settings.distance != "none":
+            channels.append(_distance(last, current[0], self.settings.distance == "gradient"))
+        return torch.cat(channels, dim=1)
+
+
+def _distance(last: tuple[Tensor, Tensor], current: Tensor, gradient: bool) -> Tensor:
+    """Signed distance of points to the planes in their cells, in units of 0.1 m, within ±1 m; 0 where either lacks.
+
+    ``(B, 1, H, W)``; with ``gradient`` ``(B, 7, H, W)``: also d·n, and d·(p × n) for p in units of 10 m.
+    """
+    vertices, normals = last
+    seen = (current != 0).any(dim=1, keepdim=True)
+    distance = (normals * (current - vertices)).sum(dim=1, keepdim=True)
+    distance = torch.where(seen, distance, 0.0).clamp(-1.0, 1.0) / _DISTANCE_M
+    if not gradient:
+        return distance
+    turning = torch.linalg.cross(current / _LEVER_M, normals, dim=1)
+    return torch.cat([distance, distance * normals, distance * turning], dim=1)
+
+
+def _norm(channels: int, settings: NetworkSettings) -> nn.Module:
+    if settings.normalisation == "none":
+        return nn.Identity()
+    if settings.normalisation == "batch":
+        return nn.BatchNorm2d(channels)
+    return nn.GroupNorm(max(channels // _GROUP, 1) if channels % _GROUP == 0 else 1, channels)
+
+
+def _last(inputs: int, settings: NetworkSettings) -> nn.Linear:
+    """The layer that a pose is read off: it starts near zero, so that training starts from the initial pose."""
+    layer = nn.Linear(inputs, 3)
+    with torch.no_grad():
+        layer.weight *= settings.residual_scale
+        layer.bias.zero_()
+    return layer

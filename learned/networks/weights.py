@@ -1,0 +1,160 @@
+"""Weights in safetensors files, with what they are in the metadata: recipe, data, version, commit."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from hybridlio.core.errors import ConfigError, DataError
+from hybridlio.core.files import write_whole
+from hybridlio.core.version import __version__
+from hybridlio.learned.networks.odometry_network import OdometryNetwork
+from hybridlio.learned.settings import NetworkSettings, Recipe, from_dict, to_dict
+from hybridlio.learned.source_settings import SHIPPED
+
+_LISTED = 6  # mismatches that a message names
+
+
+def shipped(name: str = "default") -> Path:
+    """Path of the weights of a name that come with the package, ``learned/NAME.safetensors``.
+
+    Raises:
+        ConfigError: there are none; lists those there are.
+    """
+    folder = Path(__file__).resolve().parents[1]
+    path = folder / f"{name}.safetensors"
+    if not path.is_file():
+        known = ", ".join(sorted(file.stem for file in folder.glob("*.safetensors"))) or "none"
+        raise ConfigError(f"no shipped weights named {name!r}; there are {known}, or give a file's path")
+    return path
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """A file of weights.
+
+    Attributes:
+        recipe: how they were trained; its network settings are the structure that they fit.
+        about: data, steps, version and commit, as text.
+        tensors: by name.
+        where: the file, for messages.
+    """
+
+    recipe: Recipe
+    about: Mapping[str, str]
+    tensors: Mapping[str, Tensor]
+    where: str = "weights"
+
+    def fitting(self, network: NetworkSettings) -> Mapping[str, Tensor]:
+        """Those tensors that a network of these settings starts from: where initial poses are given, no LSTMs'."""
+        if self.recipe.network.imu == "initial-pose" and network.imu == "given":
+            return {name: tensor for name, tensor in self.tensors.items() if not name.startswith("imu_network.")}
+        return self.tensors
+
+    def network(self, device: torch.device | str = "cpu") -> OdometryNetwork:
+        """The trained network, ready for inference."""
+        network = OdometryNetwork(self.recipe.network)
+        put_weights(network, self.tensors, self.where)
+        return network.to(device).eval()
+
+
+def own_tensors(network: nn.Module) -> dict[str, Tensor]:
+    """A network's weights and buffers by name; what two of its parts share stands once."""
+    found: dict[str, Tensor] = {}
+    seen: set[int] = set()
+    for name, tensor in network.state_dict(keep_vars=True).items():
+        if id(tensor) not in seen:
+            seen.add(id(tensor))
+            found[name] = tensor.detach()
+    return found
+
+
+def put_weights(network: nn.Module, tensors: Mapping[str, Tensor], where: str) -> None:
+    """Copy weights into a network.
+
+    Raises:
+        ConfigError: they do not fit; names what is missing, unknown or of another shape.
+    """
+    own = own_tensors(network)
+    wrong = [f"{name} is missing" for name in own if name not in tensors]
+    wrong += [f"{name} is unknown" for name in tensors if name not in own]
+    wrong += [
+        f"{name} is {tuple(tensors[name].shape)}, the network's is {tuple(tensor.shape)}"
+        for name, tensor in own.items()
+        if name in tensors and tensors[name].shape != tensor.shape
+    ]
+    if wrong:
+        more = f" and {len(wrong) - _LISTED} more" if len(wrong) > _LISTED else ""
+        raise ConfigError(f"{where} do not fit the network: {'; '.join(wrong[:_LISTED])}{more}; use their own recipe")
+    with torch.no_grad():
+        for name, tensor in own.items():
+            tensor.copy_(tensors[name])
+
+
+def save_weights(
+    path: str | os.PathLike[str], network: OdometryNetwork, recipe: Recipe, about: Mapping[str, str]
+) -> None:
+    """Write a network's weights with the recipe and whatever text says where they come from, whole or not at all."""
+    metadata = {
+        "recipe": json.dumps(to_dict(recipe)),
+        "hybridlio": __version__,
+        "commit": _commit(),
+        **about,
+    }
+    tensors = {name: tensor.cpu().contiguous() for name, tensor in own_tensors(network).items()}
+    write_whole(path, save(tensors, metadata))
+
+
+def weights_path(name: str | os.PathLike[str]) -> Path:
+    """The file of a name as settings have it: a path, or ``shipped``.
+
+    Raises:
+        ConfigError: no weights are shipped.
+    """
+    return shipped() if str(name) == SHIPPED else Path(name).expanduser()
+
+
+def load_weights(path: str | os.PathLike[str]) -> Weights:
+    """Read weights.
+
+    Raises:
+        DataError: the file is missing, damaged, or carries no recipe.
+    """
+    path = Path(path)
+    try:
+        with safe_open(str(path), "pt") as file:
+            metadata = dict(file.metadata() or {})
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (not a mapping)
+    except (OSError, SafetensorError) as error:
+        raise DataError(f"{path}: weights cannot be read ({error})") from error
+    try:
+        recipe = from_dict(Recipe, json.loads(metadata.pop("recipe")), "recipe")
+    except (KeyError, ValueError, ConfigError) as error:
+        raise DataError(f"{path}: carries no recipe of this version ({error}); train again") from error
+    return Weights(recipe, metadata, tensors, str(path))
+
+
+def _commit() -> str:
+    """The checkout's commit, or nothing where the package is installed."""
+    root = Path(__file__).resolve().parents[1]
+    if not (root / ".git").exists():
+        return ""
+    try:
+        found = subprocess.run(
+            ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=40"],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return found.stdout.strip()

@@ -1,0 +1,1 @@
+"""The learned implementations of the initial-pose and residual seams."""

@@ -1,0 +1,125 @@
+"""The LSTMs at run time: a source of initial poses."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from hybridlio.core import se3
+from hybridlio.core.errors import ConfigError
+from hybridlio.core.estimates import RelativePose, State
+from hybridlio.core.sensors import NS_PER_S, Frame, ImuSamples
+from hybridlio.learned.data.imu_rows import imu_rows
+from hybridlio.learned.networks.devices import at_run_time, pick_device
+from hybridlio.learned.networks.weights import load_weights, weights_path
+from hybridlio.learned.settings import NetworkSettings
+from hybridlio.learned.source_settings import LstmSettings
+from hybridlio.sources.constant_velocity import unknown_motion_covariance
+
+Array = NDArray[np.float64]
+
+_STEP_S = 0.1  # what the LSTMs are trained on: scans at 10 Hz; they do not see how long a step is
+_FORGETTING = 0.05  # share of the newest step in what is known of the LSTMs' errors
+_FIRST_SIGMAS = np.r_[np.full(3, 0.01), np.full(3, 0.3)]  # rad, m in a step
+_FLOOR_SIGMAS = np.r_[np.full(3, 1e-4), np.full(3, 1e-3)]
+
+
+class LstmInitialPose:
+    """Initial poses by the LSTMs of a trained network.
+
+    The covariance is what the steps so far have shown: it starts wide (0.6°, 0.3 m) and follows the differences between
+    prediction and outcome, the newest counting most. Where the LSTMs need the last velocity and it is not known, as at
+    the start, the translation is anyone's guess, and the covariance says so. Longer steps, over missing scans, are
+    predicted in parts of a tenth of a second.
+
+    Args:
+        settings: weights and device.
+
+    Raises:
+        DataError: the weights cannot be read.
+        ConfigError: they are of a network that takes no initial pose from the IMU, or there is no such device.
+    """
+
+    name = "lstm"
+
+    def __init__(self, settings: LstmSettings | None = None) -> None:
+        settings = settings or LstmSettings()
+        path, self._device = weights_path(settings.weights), pick_device(settings.device)
+        network = load_weights(path).network(self._device)
+        if network.imu_network is None or network.settings.imu != "initial-pose":
+            raise ConfigError(
+                f"{path}: of a network with imu={network.settings.imu!r}, which predicts no initial pose; choose other "
+                "weights (lstm.weights) or another initial pose"
+            )
+        self._network, self._settings = network.imu_network, network.settings
+        self._variances = _FIRST_SIGMAS**2  # of a step of a tenth of a second
+        self._step: tuple[Array, float] | None = None
+        self._predicted: tuple[Array, float, bool] | None = None
+
+    def predict(self, frame: Frame, state: State) -> RelativePose:
+        """``T_k_k1`` from the samples since the last scan; without any, no motion, marked as not ok."""
+        dt_s = (frame.scan.stamp_ns - state.stamp_ns) / NS_PER_S
+        informed = self._step is not None or not self._settings.velocity
+        if not len(frame.imu):
+            self._predicted = None
+            return RelativePose(np.eye(4), unknown_motion_covariance(dt_s), source=self.name, ok=False)
+        pose = self._chained(frame, dt_s)
+        self._predicted = (pose, dt_s, informed)
+        covariance = np.diag(self._variances) * (dt_s / _STEP_S) ** 2
+        if not informed:
+            covariance = covariance + unknown_motion_covariance(dt_s)
+        return RelativePose(pose, covariance, source=self.name, from_imu=True)
+
+    def correct(self, frame: Frame, estimate: RelativePose) -> None:  # noqa: ARG002
+        """Learn how far off the prediction was, and the velocity for the next one."""
+        if self._predicted is None:
+            self._step = None
+            return
+        pose, dt_s, informed = self._predicted
+        if informed:
+            error = se3.log(se3.between(pose, estimate.pose)) * _STEP_S / dt_s
+            self._variances = (1 - _FORGETTING) * self._variances + _FORGETTING * (error**2 + _FLOOR_SIGMAS**2)
+        self._step = (estimate.pose, dt_s)
+
+    def _chained(self, frame: Frame, dt_s: float) -> Array:
+        """The motion in ``dt_s``, of as many equal parts as there are tenths of a second in it."""
+        parts, pose, step = max(round(dt_s / _STEP_S), 1), np.eye(4), self._step
+        first_ns = frame.scan.stamp_ns - round(dt_s * NS_PER_S)
+        ends_ns = [first_ns + round(part * dt_s * NS_PER_S / parts) for part in range(parts + 1)]
+        for start_ns, end_ns in pairwise(ends_ns):
+            samples = frame.imu if parts == 1 else frame.imu.between(start_ns, end_ns)
+            moved = self._part(samples if len(samples) else frame.imu, frame, step, dt_s / parts)
+            pose, step = se3.orthonormalise(pose @ moved), (moved, dt_s / parts)
+        return pose
+
+    def _part(self, samples: ImuSamples, frame: Frame, step: tuple[Array, float] | None, dt_s: float) -> Array:
+        rows, velocity = inertial(samples, frame, self._settings, step)
+        with at_run_time():
+            imu, v = (torch.from_numpy(x)[None].to(self._device) for x in (rows, velocity))
+            pose = self._network(imu, v, torch.tensor([_STEP_S], device=self._device))[0].double().cpu().numpy()
+        # the motion of a tenth of a second, for as long as the step took
+        return se3.exp(se3.log(se3.orthonormalise(pose)) * dt_s / _STEP_S)
+
+
+def inertial(
+    samples: ImuSamples, frame: Frame, settings: NetworkSettings, step: tuple[Array, float] | None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Inertial rows ``(S, 6)``, zeros where there are none, and the velocity ``(3,)`` at the last scan, as in shards.
+
+    Args:
+        samples: between the scans, or a part of them.
+        frame: the current scan's.
+        settings: of the network.
+        step: the last relative pose and its duration in seconds, where there was any.
+    """
+    T_imu_lidar = None if frame.calibration is None else frame.calibration.T_imu_lidar
+    rows = np.zeros((settings.imu_samples, 6), np.float32)
+    if len(samples):
+        rows = imu_rows(samples, settings.imu_samples, T_imu_lidar)
+    if step is None:
+        return rows, np.zeros(3, np.float32)
+    pose, dt_s = step
+    return rows, (pose[:3, :3].T @ pose[:3, 3] / dt_s).astype(np.float32)

@@ -1,0 +1,173 @@
+"""Train and evaluate the rows of a comparison, each at the same budget; what is done already is not done again."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from hybridlio.cloud.projection import MapGeometry
+from hybridlio.core.errors import ConfigError
+from hybridlio.core.files import write_whole
+from hybridlio.learned.data.pairs import Pairs
+from hybridlio.learned.data.shards import Shard
+from hybridlio.learned.settings import Recipe, from_dict, to_dict
+from hybridlio.learned.training import checkpoints
+from hybridlio.learned.training.driving import drive
+from hybridlio.learned.training.train import RunOptions, TrainingProgress, train
+
+RESULT = "result.json"
+
+Drift = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class RowData:
+    """What a row is trained and evaluated on: prepared as its recipe wants (cells, inertial rows, ground).
+
+    Attributes:
+        train, test: shards; drift is measured on both.
+    """
+
+    train: Sequence[Shard]
+    test: Sequence[Shard]
+
+
+@dataclass(frozen=True)
+class RowResult:
+    """A row, trained and evaluated.
+
+    Attributes:
+        name: of its recipe.
+        steps, pairs: of the optimiser, and how many pairs they saw.
+        seconds: that training took.
+        train, test: t_rel (percent) and r_rel (degrees per 100 m) by recording; None where one is too short.
+    """
+
+    name: str
+    steps: int
+    pairs: int
+    seconds: float
+    train: Mapping[str, Drift | None]
+    test: Mapping[str, Drift | None]
+
+    @property
+    def train_average(self) -> Drift | None:
+        """Over the recordings trained on; None where none is long enough."""
+        return _average(self.train)
+
+    @property
+    def test_average(self) -> Drift | None:
+        """Over the other recordings; None where none is long enough."""
+        return _average(self.test)
+
+
+def run_rows(
+    recipes: Sequence[Recipe],
+    data: Callable[[Recipe], RowData],
+    out: str | os.PathLike[str],
+    steps: int,
+    options: RunOptions | None = None,
+    progress: Callable[[Recipe, TrainingProgress], None] | None = None,
+) -> list[RowResult]:
+    """Train each recipe for so many steps and measure the drift of its chained steps, row by row.
+
+    A row's folder, ``out/NAME``, holds its training run and ``result.json``. With the same recipe and budget a finished
+    row is read from there, and an interrupted one goes on from its checkpoint.
+
+    Args:
+        recipes: the rows, of different names.
+        data: gives a row's shards.
+        out: the comparison's folder.
+        steps: of the optimiser, the same for all rows.
+        options: device and checkpoints; ``max_steps`` is set to the budget.
+        progress: called after every step of training.
+
+    Raises:
+        ConfigError: two rows have one name, or a row's folder holds a run with other settings.
+    """
+    if len({recipe.name for recipe in recipes}) != len(recipes):
+        raise ConfigError("rows of a comparison need names of their own")
+    return [_row(recipe, data, Path(out) / recipe.name, steps, options, progress) for recipe in recipes]
+
+
+def _row(
+    recipe: Recipe,
+    data: Callable[[Recipe], RowData],
+    folder: Path,
+    steps: int,
+    options: RunOptions | None,
+    progress: Callable[[Recipe, TrainingProgress], None] | None,
+) -> RowResult:
+    found = _finished(folder / RESULT, recipe, steps)
+    if found is not None:
+        return found
+    shards = data(recipe)
+    pairs = Pairs(shards.train, recipe.network)
+    an_epoch = math.ceil(len(pairs) / recipe.optimiser.batch)
+    recipe = replace(recipe, optimiser=replace(recipe.optimiser, epochs=math.ceil(steps / an_epoch)))
+    options = replace(options or RunOptions(), max_steps=steps)
+    began = time.monotonic()
+    tick = None if progress is None else lambda done: progress(recipe, done)
+    network = train(recipe, pairs, folder, options=options, progress=tick)
+    seconds = time.monotonic() - began
+    drifts = [{s.info.name: drive(network, s).drift for s in part} for part in (shards.train, shards.test)]
+    seen = sum(min(recipe.optimiser.batch, len(pairs) - k % an_epoch * recipe.optimiser.batch) for k in range(steps))
+    result = RowResult(recipe.name, steps, seen, round(seconds, 1), *drifts)
+    write_whole(folder / RESULT, json.dumps({**asdict(result), "recipe": to_dict(recipe)}, indent=2) + "\n")
+    return result
+
+
+def _finished(path: Path, recipe: Recipe, steps: int) -> RowResult | None:
+    if not path.is_file():
+        return None
+    values = json.loads(path.read_text())
+    trained = from_dict(Recipe, values.pop("recipe"), str(path))
+    wanted = replace(recipe, optimiser=replace(recipe.optimiser, epochs=trained.optimiser.epochs))
+    differing = checkpoints.differences(wanted, trained)
+    if values["steps"] != steps:
+        differing.append(f"steps: {values['steps']} → {steps}")
+    if differing:
+        raise ConfigError(f"{path}: of another comparison ({'; '.join(differing)}); give another folder, or delete it")
+    for part in ("train", "test"):
+        values[part] = {name: None if d is None else (d[0], d[1]) for name, d in values[part].items()}
+    return RowResult(**values)
+
+
+def _average(drifts: Mapping[str, Drift | None]) -> Drift | None:
+    known = [drift for drift in drifts.values() if drift is not None]
+    if not known:
+        return None
+    return sum(t for t, _ in known) / len(known), sum(r for _, r in known) / len(known)
+
+
+def reduced(recipe: Recipe, geometry: MapGeometry | None = None, batch: int = 8, rate: float = 1e-3) -> Recipe:
+    """A recipe that a CPU trains in minutes: coarser maps, a quarter of the encoder's channels, one block a stage.
+
+    What the rows of a comparison differ in stays as it is. Absolute figures are worse than at full size.
+
+    Args:
+        recipe: at full size.
+        geometry: cells of the maps; by default a half of the rows and a quarter of the columns.
+        batch: pairs a step.
+        rate: the learning rate, constant.
+    """
+    network, cells = recipe.network, recipe.network.geometry
+    if geometry is None:
+        geometry = replace(cells, rows=math.ceil(cells.rows / 2), columns=math.ceil(cells.columns / 4))
+    small = replace(
+        network,
+        geometry=geometry,
+        imu_hidden=min(network.imu_hidden, 32),
+        imu_layers=1,
+        stem=min(network.stem, 8),
+        stages=tuple(max(channels // 4, 8) for channels in network.stages),
+        blocks=1,
+        features=min(network.features, 64),
+    )
+    optimiser = replace(recipe.optimiser, batch=batch, learning_rate=rate, schedule="step", step_epochs=10**6)
+    return replace(recipe, network=small, optimiser=optimiser)

@@ -1,0 +1,110 @@
+"""Checkpoints: everything that decides how training goes on, in one file that appears whole."""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from hybridlio.core.errors import ConfigError, DataError
+from hybridlio.core.files import write_whole
+from hybridlio.learned.settings import Recipe, from_dict, to_dict
+
+FORMAT = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """A point in a training run.
+
+    Attributes:
+        recipe: of the run.
+        data: how many pairs it sees an epoch.
+        step: steps done.
+        network: its state.
+        optimiser: its state.
+        random: states of PyTorch's generators by device type.
+    """
+
+    recipe: Recipe
+    data: int
+    step: int
+    network: dict[str, Tensor]
+    optimiser: dict[str, Any]
+    random: dict[str, Tensor]
+
+
+def take(recipe: Recipe, data: int, step: int, network: nn.Module, optimiser: Optimizer) -> Checkpoint:
+    """The state of a run now."""
+    random = {"cpu": torch.get_rng_state()}
+    if torch.cuda.is_available():
+        random["cuda"] = torch.cuda.get_rng_state()
+    return Checkpoint(recipe, data, step, network.state_dict(), optimiser.state_dict(), random)
+
+
+def restore(checkpoint: Checkpoint, network: nn.Module, optimiser: Optimizer) -> None:
+    """Bring network, optimiser and generators to where the checkpoint was taken."""
+    network.load_state_dict(checkpoint.network)
+    optimiser.load_state_dict(checkpoint.optimiser)
+    torch.set_rng_state(checkpoint.random["cpu"])
+    if "cuda" in checkpoint.random and torch.cuda.is_available():
+        torch.cuda.set_rng_state(checkpoint.random["cuda"])
+
+
+def save(path: str | os.PathLike[str], checkpoint: Checkpoint) -> None:
+    """Write a checkpoint, whole or not at all."""
+    buffer = io.BytesIO()
+    values = {
+        "format": FORMAT,
+        "recipe": to_dict(checkpoint.recipe),
+        "data": checkpoint.data,
+        "step": checkpoint.step,
+        "network": checkpoint.network,
+        "optimiser": checkpoint.optimiser,
+        "random": checkpoint.random,
+    }
+    torch.save(values, buffer)
+    write_whole(path, buffer.getvalue())
+
+
+def load(path: str | os.PathLike[str]) -> Checkpoint:
+    """Read a checkpoint onto the CPU; only plain values and tensors are taken from it, never code.
+
+    Raises:
+        DataError: it is not a checkpoint, or of another format.
+    """
+    path = Path(path)
+    try:
+        values = torch.load(path, map_location="cpu", weights_only=True)
+        if values["format"] != FORMAT:
+            raise DataError(f"{path}: format {values['format']}, this version reads {FORMAT}")
+        return Checkpoint(
+            from_dict(Recipe, values["recipe"], "recipe"),
+            values["data"],
+            values["step"],
+            values["network"],
+            values["optimiser"],
+            values["random"],
+        )
+    except (OSError, RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, ConfigError) as error:
+        raise DataError(f"{path}: not a checkpoint that can be resumed ({error}); delete it to start anew") from error
+
+
+def differences(wanted: Recipe, found: Recipe) -> list[str]:
+    """Settings in which two recipes differ, as ``section.key: found → wanted``; names do not count."""
+    texts = []
+    a, b = to_dict(wanted), to_dict(found)
+    for section in ("network", "loss", "optimiser"):
+        texts += [
+            f"{section}.{key}: {b[section][key]} → {value}"
+            for key, value in a[section].items()
+            if b[section][key] != value
+        ]
+    return texts

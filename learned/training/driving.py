@@ -1,0 +1,98 @@
+"""A recording step after step, as at run time: what the network knows of its velocity is what it found before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from hybridlio.core import se3
+from hybridlio.core.errors import DataError
+from hybridlio.core.trajectory import Trajectory
+from hybridlio.evaluation.drift import kitti_drift, lengths_for
+from hybridlio.learned.data.pairs import Pairs
+from hybridlio.learned.data.shards import Shard
+from hybridlio.learned.networks.odometry_network import OdometryNetwork
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class DrivenSteps:
+    """What a network says of a recording's steps, in order.
+
+    Attributes:
+        poses, initial, reference: ``T_k_k1`` ``(N, 4, 4)`` estimated, before the residual, and true (NaN where not
+            known).
+    """
+
+    poses: Array
+    initial: Array
+    reference: Array
+
+    @property
+    def drift(self) -> tuple[float, float] | None:
+        """KITTI's drift of the chained steps, see :func:`drift_of`."""
+        return drift_of(self.poses, self.reference)
+
+
+@torch.no_grad()
+def drive(
+    network: OdometryNetwork,
+    shard: Shard,
+    progress: Callable[[int, int], None] | None = None,
+) -> DrivenSteps:
+    """Estimate a recording's steps in order.
+
+    A network that is told the last velocity is told the one it found itself, but for the first step, which gets the
+    shard's: how a run finds its first velocity is not judged here.
+
+    Raises:
+        DataError: the recording has no steps, or a gap between them.
+    """
+    pairs = Pairs([shard], network.settings)
+    gaps = np.diff([pairs.where(i)[1] for i in range(len(pairs))]) != 1
+    if gaps.any():
+        raise DataError(
+            f"{shard.folder}: scan {pairs.where(int(gaps.argmax()))[1] + 1} is not usable; steps have a gap"
+        )
+    was_training, device = network.training, next(network.parameters()).device
+    network.eval()
+    found: list[tuple[Array, Array, Array]] = []
+    velocity: torch.Tensor | None = None
+    for i in range(len(pairs)):
+        batch = pairs.batch([i]).to(device)
+        given = batch.network if velocity is None else replace(batch.network, velocity_m_s=velocity)
+        out = network(given)
+        if network.settings.velocity:
+            R, t = out.pose[:, :3, :3], out.pose[:, :3, 3:]
+            velocity = (R.transpose(1, 2) @ t)[..., 0] / given.dt_s[:, None]
+        pose, initial, reference = (x.double().cpu().numpy()[0] for x in (out.pose, out.initial, batch.reference))
+        found.append((pose, initial, reference))
+        if progress is not None:
+            progress(i + 1, len(pairs))
+    network.train(was_training)
+    return DrivenSteps(*(np.stack(column) for column in zip(*found, strict=True)))
+
+
+def drift_of(poses: Array, reference: Array) -> tuple[float, float] | None:
+    """KITTI's t_rel (percent) and r_rel (degrees per 100 m) of chained steps ``(N, 4, 4)``, a segment from every scan.
+
+    None where the reference is not known throughout, or the path is too short for any segment.
+    """
+    if not len(poses) or not np.isfinite(reference).all():
+        return None
+    path_m = float(np.linalg.norm(reference[:, :3, 3], axis=1).sum())
+    drift = kitti_drift(_chained(reference), _chained(poses), lengths_for(path_m), step=1)
+    t_rel, r_rel = drift.t_rel_percent, drift.r_rel_deg_per_100m
+    return None if t_rel is None or r_rel is None else (t_rel, r_rel)
+
+
+def _chained(steps: Array) -> Trajectory:
+    poses = [np.eye(4)]
+    for step in steps:
+        poses.append(se3.orthonormalise(poses[-1] @ step))
+    return Trajectory(np.arange(len(poses)) * 100_000_000, np.array(poses))

@@ -1,0 +1,298 @@
+"""Training: one flat loop, the same on a CPU, a GPU, or many machines under ``torchrun``.
+
+Source: UnDeepLIO, "Implementation Details". A run is a folder with ``recipe.json``, ``log.jsonl``, ``checkpoint.pt``
+and, when it has come to its end, ``weights.safetensors``; given the same folder again, it goes on exactly where its
+last checkpoint was.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from hybridlio.core.errors import ConfigError, EstimationError
+from hybridlio.core.files import write_whole
+from hybridlio.learned.data.pairs import PairBatch, Pairs, shaken
+from hybridlio.learned.losses.loss import LossValue
+from hybridlio.learned.networks.odometry_network import OdometryNetwork
+from hybridlio.learned.networks.weights import put_weights, save_weights
+from hybridlio.learned.settings import Recipe, to_dict
+from hybridlio.learned.training import checkpoints
+from hybridlio.learned.training.checkpoints import Checkpoint
+from hybridlio.learned.training.objective import Objective
+from hybridlio.learned.training.processes import Processes, processes
+from hybridlio.learned.training.schedule import epoch_order, learning_rate
+from hybridlio.learned.training.training_log import TrainingLog
+from hybridlio.learned.training.validation import Validation, validate
+
+CHECKPOINT = "checkpoint.pt"
+WEIGHTS = "weights.safetensors"
+
+
+@dataclass(frozen=True)
+class TrainingProgress:
+    """Where a run is.
+
+    Attributes:
+        step, steps: done, and in all.
+        epoch: from 0.
+        loss: of the last step, a pair's mean.
+        po2pl_m: mean distance to the matched planes in it.
+        learning_rate: in it.
+        pairs_per_s: since this start.
+        remaining_s: until all steps are done, at that rate.
+    """
+
+    step: int
+    steps: int
+    epoch: int
+    loss: float
+    po2pl_m: float
+    learning_rate: float
+    pairs_per_s: float
+    remaining_s: float
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How a run is carried out; none of it changes what it gives.
+
+    Attributes:
+        device: where to compute; by default a GPU where there is one.
+        checkpoint_every: steps between checkpoints; there is one at the end of each epoch too.
+        validate_every: epochs between validations.
+        max_steps: end after so many steps in all.
+        max_seconds: stop after so long, with a checkpoint.
+    """
+
+    device: str | None = None
+    checkpoint_every: int = 200
+    validate_every: int = 1
+    max_steps: int | None = None
+    max_seconds: float | None = None
+
+
+def train(
+    recipe: Recipe,
+    pairs: Pairs,
+    out: str | os.PathLike[str],
+    validation: Pairs | None = None,
+    start: Mapping[str, Tensor] | None = None,
+    options: RunOptions | None = None,
+    progress: Callable[[TrainingProgress], None] | None = None,
+    validated: Callable[[int, Validation], None] | None = None,
+    about: Mapping[str, str] | None = None,
+) -> OdometryNetwork:
+    """Train a network, or go on training it, and return it.
+
+    Args:
+        recipe: settings.
+        pairs: to train on.
+        out: the run's folder.
+        validation: pairs on which the error left and the drift are measured as training goes.
+        start: weights to start from, such as shipped ones, named as by
+            :func:`hybridlio.learned.networks.weights.own_tensors`; ignored when resuming.
+        options: how to carry it out.
+        progress: called after every step, in the first process only.
+        validated: called after every validation with the steps done and what was found, in the first process only.
+        about: more to say in the weights' metadata.
+
+    Raises:
+        ConfigError: the folder holds a run of another recipe or on other data, or the weights to start from do not fit;
+            names what differs.
+        EstimationError: the loss or its gradient is not finite any more; the last good checkpoint is kept.
+        DataError: the folder's checkpoint cannot be read.
+    """
+    options = options or RunOptions()
+    with processes(options.device) as place:
+        run = _Run(recipe, pairs, Path(out), place, options, start, about or {})
+        try:
+            run.train(validation, progress, validated)
+        finally:
+            run.log.close() if run.log else None
+        return run.network
+
+
+class _Run:
+    """A run's state, between its steps."""
+
+    def __init__(
+        self,
+        recipe: Recipe,
+        pairs: Pairs,
+        out: Path,
+        place: Processes,
+        options: RunOptions,
+        start: Mapping[str, Tensor] | None,
+        about: Mapping[str, str],
+    ) -> None:
+        self.recipe, self.pairs, self.out, self.place, self.options = recipe, pairs, out, place, options
+        self.about = about
+        settings = recipe.optimiser
+        torch.manual_seed(settings.seed)
+        self.network = OdometryNetwork(recipe.network).to(place.device)
+        self.network.mixed_precision = settings.mixed_precision and place.device.type == "cuda"
+        self.optimiser = torch.optim.Adam(
+            self.network.parameters(), settings.learning_rate, settings.betas, weight_decay=settings.weight_decay
+        )
+        self.step, self._between_steps = 0, True
+        found = _checkpoint_in(out, recipe, len(pairs))
+        if found is not None:
+            checkpoints.restore(found, self.network, self.optimiser)
+            self.step = found.step
+        elif start is not None:
+            put_weights(self.network, start, "the weights to start from")
+        place.wait()  # before the first process writes where the others look
+        self.log = TrainingLog(out, self.step) if place.leads else None
+        if place.leads:
+            write_whole(out / "recipe.json", json.dumps(to_dict(recipe), indent=2) + "\n")
+        self.objective = place.joined(Objective(self.network, recipe.loss))
+        self.steps_an_epoch = math.ceil(len(pairs) / settings.batch)
+        whole = self.steps_an_epoch * settings.epochs
+        self.steps = min(whole, options.max_steps or whole)
+
+    def train(
+        self,
+        validation: Pairs | None,
+        progress: Callable[[TrainingProgress], None] | None,
+        validated: Callable[[int, Validation], None] | None,
+    ) -> None:
+        began, first = time.monotonic(), self.step
+        self.network.train()
+        try:
+            for indices, batch in self._batches():
+                loss, po2pl = self._step(indices, batch)
+                seconds = time.monotonic() - began
+                self._after_step(loss, po2pl, (self.step - first) / seconds, progress)
+                if self.step % self.steps_an_epoch == 0:
+                    self._after_epoch(validation, validated)
+                if self.options.max_seconds is not None and self._agreed(seconds > self.options.max_seconds):
+                    break
+        except KeyboardInterrupt:
+            if self._between_steps:  # else weights are half updated, and the last checkpoint is the good one
+                self._save()
+            raise
+        self._save()
+        if self.step >= self.steps and self.place.leads:
+            save_weights(self.out / WEIGHTS, self.network, self.recipe, self._told())
+
+    def _batches(self) -> Iterator[tuple[list[int], PairBatch]]:
+        """The pairs of each remaining step and this process's share of them, read one step ahead."""
+        with ThreadPoolExecutor(1) as reader:
+            plan = self._plan()
+            ahead = next(plan, None)
+            reading = reader.submit(self._read, ahead) if ahead else None
+            while ahead is not None and reading is not None:
+                indices, batch = ahead, reading.result()
+                ahead = next(plan, None)
+                reading = reader.submit(self._read, ahead) if ahead else None
+                yield indices[1], batch
+
+    def _plan(self) -> Iterator[tuple[int, list[int]]]:
+        epoch, skip = divmod(self.step, self.steps_an_epoch)
+        step = self.step
+        while step < self.steps:
+            for indices in epoch_order(self.recipe.optimiser, epoch, len(self.pairs))[skip:]:
+                if step >= self.steps:
+                    return
+                yield epoch, indices
+                step += 1
+            epoch, skip = epoch + 1, 0
+
+    def _read(self, planned: tuple[int, list[int]]) -> PairBatch:
+        epoch, indices = planned
+        # a share is never empty: a short last batch is dealt out again from its start
+        mine = indices[self.place.rank :: self.place.count] or indices[:1]
+        batch, settings = self.pairs.batch(mine), self.recipe.optimiser
+        return shaken(batch, settings, seed=settings.seed * 1_000_003 + epoch)
+
+    def _step(self, indices: list[int], batch: PairBatch) -> tuple[float, float]:
+        """One step of the optimiser; the loss and the mean distance over all processes' pairs."""
+        settings = self.recipe.optimiser
+        for group in self.optimiser.param_groups:
+            group["lr"] = learning_rate(settings, self.step / self.steps_an_epoch)
+        batch = batch.to(self.place.device)
+        value: LossValue = self.objective(batch)
+        counted = self.place.rank < len(indices)  # whether this share is not a repetition
+        share = value.total.sum() / len(indices) * float(counted)
+        self.optimiser.zero_grad(set_to_none=True)
+        torch.autograd.backward(share * self.place.count)  # gradients are averaged over processes
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), settings.clip_norm or math.inf)
+        sums = torch.stack([share.detach(), value.po2pl_m.sum() / len(indices) * float(counted)])
+        loss, po2pl = self.place.total(sums).tolist()
+        if not (math.isfinite(loss) and bool(torch.isfinite(norm))):
+            raise EstimationError(self._diverged(loss, float(norm), indices))
+        self._between_steps = False
+        self.optimiser.step()
+        self.step += 1
+        self._between_steps = True
+        return loss, po2pl
+
+    def _diverged(self, loss: float, norm: float, indices: list[int]) -> str:
+        kept = self.out / CHECKPOINT
+        pairs = [f"{shard.info.name} {k}" for shard, k in map(self.pairs.where, indices[:3])]
+        return (
+            f"training diverged at step {self.step + 1} (loss {loss}, gradient {norm}; pairs {', '.join(pairs)} …); "
+            + (f"the last good checkpoint is {kept}; " if kept.is_file() else "there is no checkpoint yet; ")
+            + "lower optimiser.learning_rate or set optimiser.clip_norm"
+        )
+
+    def _after_step(
+        self, loss: float, po2pl: float, steps_per_s: float, progress: Callable[[TrainingProgress], None] | None
+    ) -> None:
+        rate = float(self.optimiser.param_groups[0]["lr"])
+        if self.log is not None:
+            self.log.write(self.step, loss=loss, po2pl_m=po2pl, learning_rate=rate)
+        if progress is not None and self.place.leads:
+            epoch = (self.step - 1) // self.steps_an_epoch
+            left = (self.steps - self.step) / steps_per_s
+            pairs_per_s = steps_per_s * self.recipe.optimiser.batch
+            progress(TrainingProgress(self.step, self.steps, epoch, loss, po2pl, rate, pairs_per_s, left))
+        if self.step % self.options.checkpoint_every == 0:
+            self._save()
+
+    def _after_epoch(self, validation: Pairs | None, validated: Callable[[int, Validation], None] | None) -> None:
+        due = self.step // self.steps_an_epoch % self.options.validate_every == 0
+        if validation is not None and due and self.log is not None:
+            found = validate(self.network, validation, self.recipe, self.place.device)
+            self.log.write(self.step, **{f"validation/{name}": value for name, value in asdict(found).items()})
+            if validated is not None:
+                validated(self.step, found)
+        self._save()
+
+    def _told(self) -> dict[str, str]:
+        data = ", ".join(f"{shard.info.name} ({len(shard)} scans)" for shard in self.pairs.shards)
+        return {"data": data, "pairs": str(len(self.pairs)), "steps": str(self.step), **self.about}
+
+    def _agreed(self, mine: bool) -> bool:
+        """Whether any process says so: all stop at the same step."""
+        return bool(self.place.total(torch.tensor(float(mine), device=self.place.device)) > 0)
+
+    def _save(self) -> None:
+        if self.place.leads:
+            checkpoints.save(self.out / CHECKPOINT, self._checkpoint())
+
+    def _checkpoint(self) -> Checkpoint:
+        return checkpoints.take(self.recipe, len(self.pairs), self.step, self.network, self.optimiser)
+
+
+def _checkpoint_in(out: Path, recipe: Recipe, pairs: int) -> Checkpoint | None:
+    path = out / CHECKPOINT
+    if not path.is_file():
+        return None
+    found = checkpoints.load(path)
+    differing = checkpoints.differences(recipe, found.recipe)
+    if found.data != pairs:
+        differing.append(f"pairs: {found.data} → {pairs}")
+    if differing:
+        raise ConfigError(f"{path}: of another run ({'; '.join(differing)}); give another folder, or delete it")
+    return found

@@ -1,0 +1,120 @@
+"""How good a network is on pairs with known truth: the error left in a step, and the drift of the steps in a row."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from hybridlio.core import se3
+from hybridlio.learned.data.pairs import Pairs, shaken
+from hybridlio.learned.networks.odometry_network import OdometryNetwork
+from hybridlio.learned.settings import Recipe
+from hybridlio.learned.training.driving import drift_of
+from hybridlio.learned.training.objective import objective
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Figures over a set of pairs; those that need truth are None where there is none.
+
+    Attributes:
+        loss: mean over the pairs.
+        po2pl_m: mean distance to the matched planes.
+        rotation_rms_deg, translation_rms_m: root mean square over pairs of the error left.
+        initial_rotation_rms_deg, initial_translation_rms_m: the same before the residual.
+        t_rel_percent, r_rel_deg_per_100m: KITTI drift of the chained steps, averaged over recordings.
+    """
+
+    loss: float
+    po2pl_m: float
+    rotation_rms_deg: float | None = None
+    translation_rms_m: float | None = None
+    initial_rotation_rms_deg: float | None = None
+    initial_translation_rms_m: float | None = None
+    t_rel_percent: float | None = None
+    r_rel_deg_per_100m: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """What a network says of every pair, in their order.
+
+    Attributes:
+        poses, initial, reference: ``(N, 4, 4)``; the reference is NaN where not known.
+        loss, po2pl_m: ``(N,)``.
+    """
+
+    poses: Array
+    initial: Array
+    reference: Array
+    loss: Array
+    po2pl_m: Array
+
+
+@torch.no_grad()
+def run_steps(
+    network: OdometryNetwork,
+    pairs: Pairs,
+    recipe: Recipe,
+    device: torch.device | str = "cpu",
+    progress: Callable[[int, int], None] | None = None,
+) -> Steps:
+    """Estimate every pair. Initial poses are shaken as in training, by draws of seed 0."""
+    was_training, size = network.training, recipe.optimiser.batch
+    network.eval()
+    parts: list[tuple[Array, ...]] = []
+    for start in range(0, len(pairs), size):
+        batch = pairs.batch(range(start, min(start + size, len(pairs))))
+        batch = shaken(batch, recipe.optimiser, seed=0).to(device)
+        out = network(batch.network)
+        value = objective(out, batch, recipe.loss, recipe.network.geometry)
+        tensors = (out.pose, out.initial, batch.reference, value.total, value.po2pl_m)
+        parts.append(tuple(tensor.double().cpu().numpy() for tensor in tensors))
+        if progress is not None:
+            progress(min(start + size, len(pairs)), len(pairs))
+    network.train(was_training)
+    return Steps(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def validate(network: OdometryNetwork, pairs: Pairs, recipe: Recipe, device: torch.device | str = "cpu") -> Validation:
+    """Run the network over pairs and compare with the truth where it is known."""
+    steps = run_steps(network, pairs, recipe, device)
+    known = np.isfinite(steps.reference).all(axis=(1, 2))
+    loss, po2pl = float(steps.loss.mean()), float(steps.po2pl_m.mean())
+    if not known.any():
+        return Validation(loss, po2pl)
+    left = step_errors(steps.poses[known], steps.reference[known])
+    before = step_errors(steps.initial[known], steps.reference[known])
+    return Validation(loss, po2pl, *left, *before, *_drift(pairs, steps))
+
+
+def step_errors(poses: Array, reference: Array) -> tuple[float, float]:
+    """Root mean square of the rotation (degrees) and translation (metres) left between poses ``(N, 4, 4)``."""
+    error = se3.between(reference, poses)
+    angles = np.linalg.norm(se3.so3_log(error[:, :3, :3]), axis=1)
+    distances = np.linalg.norm(error[:, :3, 3], axis=1)
+    return float(np.degrees(np.sqrt((angles**2).mean()))), float(np.sqrt((distances**2).mean()))
+
+
+def _drift(pairs: Pairs, steps: Steps) -> tuple[float | None, float | None]:
+    """Drift by recording, averaged; None where none is without gaps and long enough."""
+    places = [pairs.where(i) for i in range(len(pairs))]
+    found = []
+    for shard in pairs.shards:
+        rows = [i for i, (its_shard, _) in enumerate(places) if its_shard is shard]
+        gaps = np.diff([places[i][1] for i in rows]) != 1
+        if gaps.any():
+            continue
+        drift = drift_of(steps.poses[rows], steps.reference[rows])
+        if drift is not None:
+            found.append(drift)
+    if not found:
+        return None, None
+    means = np.array(found, np.float64).mean(axis=0)
+    return float(means[0]), float(means[1])

@@ -1,0 +1,33 @@
+import numpy as np
+import pytest
+
+from hybridlio.core.errors import DataError
+from hybridlio.graph.base import noise
+
+
+def test_a_residual_of_one_sigma_whitens_to_one(rng: np.random.Generator):
+    root = rng.normal(size=(6, 6))
+    covariance = root @ root.T + np.eye(6)
+    model = noise.gaussian(covariance, "step")
+    residual = rng.normal(size=6)
+    whitened = model.whiten(residual)
+    assert whitened @ whitened == pytest.approx(residual @ np.linalg.solve(covariance, residual), rel=1e-9)
+
+
+def test_sigmas_whiten_each_component_by_its_own():
+    np.testing.assert_allclose(noise.sigmas(np.array([0.5, 2.0])).whiten(np.array([1.0, 1.0])), [2.0, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("covariance", "what"),
+    [
+        (np.diag([1.0, -1.0, 1.0]), "not positive definite"),
+        (np.diag([1.0, 0.0, 1.0]), "not positive definite"),
+        (np.diag([1.0, np.nan, 1.0]), "finite"),
+        (np.array([[1.0, 0.5, 0], [0, 1.0, 0], [0, 0, 1.0]]), "not symmetric"),
+    ],
+    ids=["negative", "singular", "not finite", "asymmetric"],
+)
+def test_what_is_no_covariance_is_refused_by_the_name_of_its_owner(covariance: np.ndarray, what: str):
+    with pytest.raises(DataError, match=f"gps 7.*{what}"):
+        noise.gaussian(covariance, "gps 7")

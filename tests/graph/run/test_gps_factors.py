@@ -1,0 +1,202 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import E, G
+from scipy.spatial.transform import Rotation
+
+from hybridlio.core import se3
+from hybridlio.core.errors import DataError, EstimationError
+from hybridlio.core.pose_interpolation import PosePath
+from hybridlio.core.sensors import Calibration, GpsFix, ImuSamples
+from hybridlio.core.start_state import start_state
+from hybridlio.core.trajectory import Trajectory
+from hybridlio.evaluation.ate_rpe import ate
+from hybridlio.graph.run.gps_factors import GpsGroup, _plumb_factor
+from hybridlio.graph.run.smooth import smooth
+from hybridlio.smoothing.gps_options import GpsOptions
+
+LEVER = np.array([-0.4, 0.6, 1.1])
+SHIFT_S = 0.43
+SIGMA_M = 0.3
+ENU = se3.make(Rotation.from_euler("ZYX", (2.1, 0.0, 0.0)).as_matrix(), (350.0, -120.0, 4.0))
+
+
+def multiplied(drive: Any) -> np.ndarray:
+    poses = [np.eye(4)]
+    for relative in drive.relative:
+        poses.append(poses[-1] @ relative.pose)
+    return np.array(poses)
+
+
+def T_enu_world(drive: Any) -> np.ndarray:
+    """World is the IMU's first pose; level it so that up is up."""
+    down = drive.gravity / np.linalg.norm(drive.gravity)
+    axis = np.cross(down, [0.0, 0.0, -1.0])
+    angle = np.arccos(np.clip(-down[2], -1, 1))
+    level = se3.so3_exp(axis / max(np.linalg.norm(axis), 1e-12) * angle)
+    return ENU @ se3.make(level, np.zeros(3))
+
+
+def with_fixes(drive: Any, seed: int, rate_hz: float = 2.0, sigma_m: float = SIGMA_M, shift_s: float = SHIFT_S) -> Any:
+    """The drive's record with fixes of the antenna; stamps are ``shift_s`` early."""
+    rng = np.random.default_rng(seed)
+    record = drive.record(multiplied(drive))
+    stamps = record.online.stamps_ns
+    path = PosePath(stamps, drive.poses, drive.velocities)
+    seconds = np.arange(0.05, (stamps[-1] - stamps[0]) / 1e9, 1 / rate_hz)
+    at = stamps[0] + np.round(seconds * 1e9).astype(np.int64)
+    points = se3.transform(T_enu_world(drive), path.points(at, LEVER)[0])
+    points = points + sigma_m * rng.standard_normal(points.shape)
+    early = at - round(shift_s * 1e9)
+    fixes = tuple(GpsFix(int(t), p, np.eye(3) * sigma_m**2) for t, p in zip(early, points, strict=True))
+    return replace(record, gps=fixes, calibration=Calibration(record.calibration.T_imu_lidar, antenna_imu_m=LEVER))
+
+
+def rmse_m(smoothed: Any, drive: Any) -> float:
+    """Of the positions, the whole path aligned: where the first pose looked is no more than its own error."""
+    return ate(Trajectory(smoothed.trajectory.stamps_ns, drive.lidar_poses), smoothed.trajectory, lever_m=0.0).rmse_m
+
+
+@pytest.fixture(scope="module")
+def drive(chain: Callable[..., Any]) -> Any:
+    return chain(51, steps=240, step_sigmas=np.r_[np.full(3, 3e-3), np.full(3, 0.06)])
+
+
+@pytest.fixture(scope="module")
+def smoothed(drive: Any) -> Any:
+    return smooth(with_fixes(drive, 1), gps=True)
+
+
+def test_fixes_lower_the_error(drive: Any, smoothed: Any):
+    record = with_fixes(drive, 1)
+    assert rmse_m(smoothed, drive) < 0.75 * rmse_m(smooth(record), drive)
+
+
+def test_the_clocks_difference_is_found_as_well_as_is_said(smoothed: Any):
+    fit = smoothed.found["gps"]
+    assert fit.shift_sigma_s < 0.03
+    assert abs(fit.shift_s - SHIFT_S) < 3 * fit.shift_sigma_s
+
+
+def test_the_frame_of_the_fixes_is_found_as_well_as_is_said(drive: Any, smoothed: Any):
+    fit = smoothed.found["gps"]
+    true = T_enu_world(drive) @ drive.calibration.T_imu_lidar
+    error = se3.log(se3.between(fit.T_enu_world, true))
+    nees = error @ np.linalg.solve(fit.T_enu_world_covariance, error) / 6
+    assert nees < 3
+    assert np.abs(error[:3]).max() < 0.05
+
+
+def test_the_nominal_fixes_all_count_and_fit_as_well_as_they_scatter(smoothed: Any):
+    fit = smoothed.found["gps"]
+    assert fit.rejected.sum() == 0
+    assert fit.noise_scale < 1.3
+    assert fit.rmse_m == pytest.approx(SIGMA_M * np.sqrt(3), rel=0.25)
+    assert "fixes used, 0 rejected" in fit.summary()
+
+
+WRONG = [4, 11, 12, 20, 29, 37, 43]
+
+
+@pytest.fixture(scope="module")
+def without_wrong(drive: Any) -> Any:
+    record = with_fixes(drive, 1)
+    return smooth(replace(record, gps=tuple(fix for k, fix in enumerate(record.gps) if k not in WRONG)), gps=True)
+
+
+@pytest.mark.parametrize("robust", ["cauchy", "geman-mcclure", "gnc"])
+def test_wrong_fixes_are_rejected_and_counted(drive: Any, without_wrong: Any, robust: str):
+    record = with_fixes(drive, 1)
+    rng = np.random.default_rng(2)
+    fixes = list(record.gps)
+    for k in WRONG:
+        fixes[k] = replace(fixes[k], position_m=fixes[k].position_m + rng.uniform(8, 40, 3) * rng.choice([-1, 1], 3))
+    bent = smooth(replace(record, gps=tuple(fixes)), gps=GpsOptions(robust=robust))
+    assert np.flatnonzero(bent.found["gps"].rejected).tolist() == WRONG
+    assert rmse_m(bent, drive) < 1.2 * rmse_m(without_wrong, drive)
+
+
+def test_an_outage_is_bridged_by_odometry_and_imu(drive: Any, smoothed: Any):
+    record = with_fixes(drive, 1)
+    start = int(record.online.stamps_ns[0])
+    gap = (start + 6_000_000_000, start + 14_000_000_000)
+    out = smooth(record, gps=GpsOptions(outages=[gap]))
+    fit = out.found["gps"]
+    assert (~fit.used).sum() >= 15
+    assert (fit.weights[~fit.used] == 0).all()
+    assert rmse_m(out, drive) < 2 * rmse_m(smoothed, drive)
+
+
+def test_fixes_that_claim_too_much_are_taken_for_what_they_scatter(drive: Any):
+    record = with_fixes(drive, 1)
+    boasting = tuple(replace(fix, covariance_m2=fix.covariance_m2 / 100) for fix in record.gps)
+    fit = smooth(replace(record, gps=boasting), gps=True).found["gps"]
+    assert fit.noise_scale == pytest.approx(10.0, rel=0.35)
+    assert fit.rejected.sum() == 0
+
+
+def test_without_imu_fixes_still_help(drive: Any):
+    record = with_fixes(drive, 1)
+    start = start_state(int(record.online.stamps_ns[0]), ImuSamples.empty(), drive.noise)
+    record = replace(record, imu=ImuSamples.empty(), start=start)
+    assert rmse_m(smooth(record, gps=True), drive) < 0.75 * rmse_m(smooth(record), drive)
+
+
+def test_a_fixes_clock_that_is_known_is_not_searched(drive: Any):
+    record = with_fixes(drive, 1, shift_s=0.0)
+    fit = smooth(record, gps=GpsOptions(max_shift_s=0.0)).found["gps"]
+    assert abs(fit.shift_s) < 1e-6
+    assert fit.shift_sigma_s < 1e-5
+
+
+def test_too_few_fixes_are_a_clear_error(drive: Any):
+    record = with_fixes(drive, 1)
+    with pytest.raises(EstimationError, match=r"2 of 2 GPS fixes lie in the run's time; 3 are needed"):
+        smooth(replace(record, gps=record.gps[5:7]), gps=True)
+    with pytest.raises(EstimationError, match="no GPS fixes in the run's time"):
+        smooth(replace(record, gps=()), gps=True)
+
+
+def test_antennas_are_three_finite_numbers():
+    with pytest.raises(DataError, match="antenna_imu_m"):
+        Calibration(antenna_imu_m=np.array([1.0, np.nan, 0.0]))
+
+
+def test_the_plumb_factors_jacobian_agrees_with_differences(drive: Any):
+    rng = np.random.default_rng(3)
+    values = gtsam.Values()
+    values.insert(E(0), gtsam.Pose3(se3.exp(rng.normal(size=6))))
+    values.insert(G(0), rng.normal(size=3) * 9.0)
+    factor = _plumb_factor(drive.start)
+    jacobian, _ = factor.linearize(values).jacobian()
+    columns = []
+    for key, size in ((E(0), 6), (G(0), 3)):
+        for step in 1e-6 * np.eye(size):
+            moved = []
+            for sign in (1, -1):
+                delta = gtsam.VectorValues()
+                delta.insert(key, sign * step)
+                moved.append(-factor.linearize(values.retract(delta)).jacobian()[1])
+            columns.append((moved[0] - moved[1]) / 2e-6)
+    np.testing.assert_allclose(jacobian, np.column_stack(columns), rtol=1e-4, atol=1e-3)
+
+
+def test_the_same_group_goes_with_others(drive: Any):
+    record = with_fixes(drive, 1)
+    assert set(smooth(record, groups=[GpsGroup(record)]).found) == {"gps"}
+
+
+def test_fixes_that_are_mostly_rejected_are_doubtful_and_count_as_used_only_where_they_are(drive: Any):
+    record = with_fixes(drive, 1, shift_s=0.0)
+    fit = smooth(record, gps=GpsOptions(max_shift_s=0.0)).found["gps"]
+    assert not fit.is_doubtful
+    wrong = fit.used & (np.arange(len(fit.used)) % 5 != 0)
+    doubted = replace(fit, weights=np.where(wrong, 0.0, fit.weights))
+    assert doubted.is_doubtful
+    assert f"{int((fit.used & ~wrong & (fit.weights >= 0.1)).sum())} of {len(fit.used)} fixes used" in doubted.summary()

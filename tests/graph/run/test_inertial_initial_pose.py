@@ -1,0 +1,98 @@
+"""Initial poses by preintegration, with samples, without some and without any."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from inertial import NOISE, at_rest, state_at
+from scipy.spatial.transform import Rotation
+
+from hybridlio.core import se3
+from hybridlio.core.estimates import RelativePose, State
+from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuSamples, Scan
+from hybridlio.graph.run.inertial_initial_pose import Preintegration
+from hybridlio.graph.run.inertial_steps import InertialSteps
+
+IDENTITY = np.eye(4)
+
+
+def empty_scan(stamp_ns: int) -> Scan:
+    return Scan(stamp_ns, np.empty((0, 3), np.float32))
+
+
+def straight(steps: int, mount: np.ndarray = IDENTITY) -> tuple[State, Callable[[ImuSamples], Frame]]:
+    state = state_at(np.eye(4), np.array([10.0, 0.0, 0.0]), covariance=np.diag(np.full(15, 1e-4)))
+    return state, lambda imu: Frame(3, empty_scan(steps * NS_PER_S // 10), imu, calibration=Calibration(mount))
+
+
+def test_the_prediction_is_of_the_lidar_not_of_the_imu():
+    mount = se3.make(Rotation.from_euler("z", 90, degrees=True).as_matrix(), [1.0, 0.0, 0.5])
+    state, frame = straight(1, mount)
+    predicted = Preintegration(InertialSteps(Calibration(mount), NOISE)).predict(frame(at_rest(0.0, 0.1)), state)
+    np.testing.assert_allclose(predicted.pose, se3.make(np.eye(3), [0.0, -1.0, 0.0]), atol=1e-9)
+    assert (predicted.source, predicted.ok, predicted.from_imu) == ("preintegration", True, True)
+
+
+@pytest.mark.parametrize(
+    "imu",
+    [ImuSamples.empty(), at_rest(0.0, 0.05), at_rest(0.05, 0.1)],
+    ids=["none in this step", "ends early", "starts late"],
+)
+def test_where_samples_are_missing_it_coasts_and_says_so(imu: ImuSamples):
+    state, frame = straight(1)
+    source = Preintegration(InertialSteps(Calibration(), NOISE))
+    coasted, sure = source.predict(frame(imu), state), source.predict(frame(at_rest(0.0, 0.1)), state)
+    assert not coasted.ok
+    assert not coasted.from_imu
+    np.testing.assert_allclose(coasted.pose, se3.make(np.eye(3), [1.0, 0.0, 0.0]), atol=1e-12)
+    assert (np.diag(coasted.covariance) > np.diag(sure.covariance)).all()
+
+
+def test_coasting_goes_on_with_the_last_turn():
+    mount = se3.make(Rotation.from_euler("z", 90, degrees=True).as_matrix(), [1.0, 0.0, 0.5])
+    state, frame = straight(1, mount)
+    source = Preintegration(InertialSteps(Calibration(mount), NOISE))
+    known = source.predict(frame(at_rest(0.0, 0.1)), state)
+    turn = se3.so3_exp([0.01, -0.02, 0.05])
+    source.correct(frame(at_rest(0.0, 0.1)), replace(known, pose=se3.make(turn, known.pose[:3, 3])))
+    coasted = source.predict(frame(ImuSamples.empty()), state)
+    np.testing.assert_allclose(coasted.pose[:3, :3], turn, atol=1e-9)
+
+
+def test_longer_coasting_is_less_sure():
+    source = Preintegration(InertialSteps(Calibration(), NOISE))
+    sigmas = []
+    for steps in (1, 3, 10):
+        state, frame = straight(steps)
+        sigmas.append(np.sqrt(np.diag(source.predict(frame(ImuSamples.empty()), state).covariance)))
+    assert (np.diff(sigmas, axis=0) > 0).all()
+
+
+def test_before_the_first_samples_the_last_step_is_carried_on_and_it_says_so_once(caplog: pytest.LogCaptureFixture):
+    state, frame = straight(1)
+    state, blank = replace(state, has_imu=False), frame(ImuSamples.empty())
+    source = Preintegration(InertialSteps(Calibration(), NOISE))
+    np.testing.assert_array_equal(source.predict(blank, state).pose, np.eye(4))
+    moved = RelativePose(se3.exp(np.array([0.0, 0.0, 0.05, 1.0, 0.0, 0.0])), np.eye(6), "test")
+    source.correct(blank, moved)
+    np.testing.assert_allclose(source.predict(blank, state).pose, moved.pose, atol=1e-12)
+    assert [r.getMessage() for r in caplog.records if "no IMU samples so far" in r.getMessage()] == [
+        "frame 3: no IMU samples so far; until there are, initial poses by constant velocity"
+    ]
+
+
+def test_samples_are_summed_up_once_for_the_same_step_and_anew_for_another():
+    steps, (state, frame) = InertialSteps(Calibration(), NOISE), straight(1)
+    asked = frame(at_rest(0.0, 0.1))
+    first = steps.sum(asked, state)
+    assert first is not None
+    assert steps.sum(replace(asked, index=7), state) is first
+    assert steps.predicted(asked, state) is steps.predicted(asked, state)
+    other = replace(state, accel_bias_m_s2=np.array([0.1, 0.0, 0.0]))
+    assert steps.sum(asked, other) is not first
+    assert steps.sum(replace(asked, imu=at_rest(0.0, 0.1)), state) is not first
+    assert steps.sum(asked, replace(state, has_imu=False)) is None
+    assert steps.predicted(frame(ImuSamples.empty()), state) is None

@@ -1,0 +1,105 @@
+"""`hybridlio ablate` trains rows at one budget, shows them beside the published ones, and goes on where it was."""
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+import hybridlio.learned.training.ablation as ablation
+from hybridlio.cloud.projection import MapGeometry
+from hybridlio.commands.app import app
+from hybridlio.core.errors import EstimationError
+
+
+def run(*words):
+    return CliRunner().invoke(app, ["ablate", *map(str, words)])
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    """Maps and encoders that train in a second."""
+    reduced = ablation.reduced
+    cells = MapGeometry(15.0, -15.0, 16, 90)
+    monkeypatch.setattr(ablation, "reduced", lambda recipe: reduced(recipe, cells, batch=2))
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("shards")
+
+
+def test_rows_are_trained_shown_beside_the_published_and_not_trained_again(tiny_drive, tiny, cache, tmp_path):
+    words = (
+        tiny_drive,
+        "--table",
+        2,
+        "--test",
+        tiny_drive,
+        "--steps",
+        2,
+        "--reduced",
+        "-o",
+        tmp_path,
+        "--cache",
+        cache,
+    )
+    done = run(*words)
+    assert done.exit_code == 0, done.output
+    for name in ("paper", "imu-feature", "no-imu"):
+        assert f"measured ({name})" in done.output
+    assert "2.03 / 1.14" in done.output
+    said = json.loads((tmp_path / "table-2.json").read_text())
+    assert [line["result"]["steps"] for line in said["lines"]] == [2, 2, 2]
+    assert "2 steps a row, at reduced size" in (tmp_path / "table-2.md").read_text()
+    stamps = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/result.json")}
+    assert len(stamps) == 3
+    again = run(tiny_drive, *words)
+    assert again.exit_code == 0
+    assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
+
+
+def test_a_row_that_fails_does_not_stop_the_others(tiny_drive, tiny, cache, tmp_path, monkeypatch):
+    train = ablation.train
+
+    def failing(recipe, *args, **kwargs):
+        if recipe.name == "imu-feature":
+            raise EstimationError("training diverged at step 1")
+        return train(recipe, *args, **kwargs)
+
+    monkeypatch.setattr(ablation, "train", failing)
+    words = ("--table", 2, "--test", tiny_drive, "--steps", 1, "--reduced", "-o", tmp_path, "--cache", cache)
+    done = run(tiny_drive, *words)
+    assert done.exit_code == 1
+    assert "error: imu-feature: training diverged at step 1" in done.output
+    said = json.loads((tmp_path / "table-2.json").read_text())
+    assert [line["result"] is None for line in said["lines"]] == [False, True, False]
+
+
+def test_the_first_table_has_the_predecessors_rows_and_figures_of_those_that_are_no_presets(
+    tiny_drive, tiny, cache, tmp_path
+):
+    words = ("--table", 1, "--test", tiny_drive, "--steps", 1, "--reduced", "--rows", "cho,nubert", "-o", tmp_path)
+    done = run(tiny_drive, *words, "--cache", cache)
+    assert done.exit_code == 0, done.output
+    said = {line["method"]: line for line in json.loads((tmp_path / "table-1.json").read_text())["lines"]}
+    assert said["Cho et al."]["preset"] == "cho"
+    assert said["Nubert et al."]["result"]["steps"] == 1
+    assert said["LOAM(w/ map)"]["preset"] is None
+    assert said["SelfVoxeLO"]["published"]["t_rel_percent"]["09"] == 3.01
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("--table", 7, "--test", "x"), "table 7"),
+        (("--table", 2), "--test"),
+        (("--table", 2, "--test", "x", "--split", "easy"), "--split"),
+        (("--table", 2, "--test", "x", "--rows", "attention"), "imu-feature"),
+        (("--table", 2, "--split", "middling"), "easy, hard"),
+    ],
+    ids=str,
+)
+def test_wrong_words_are_named(words, named, tiny_drive, tmp_path):
+    refused = run(tiny_drive, *words, "-o", tmp_path)
+    assert refused.exit_code == 2
+    assert named in refused.output

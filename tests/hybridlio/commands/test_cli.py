@@ -1,0 +1,154 @@
+"""The command line: from simulation to smoothing, its settings, and how errors end."""
+
+import errno
+import json
+from pathlib import Path
+
+import pytest
+from command_line import ok, refused, run
+
+import hybridlio
+from hybridlio.core.trajectory_files import read_tum
+from hybridlio.datasets.registry import open_sequence
+from hybridlio.odometry.config import Config, parse_config
+from hybridlio.runs.folder import FILES
+
+pytestmark = pytest.mark.usefixtures("plain_logging")
+
+
+def test_the_whole_job_from_simulation_to_smoothing(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    drive = Path(ok("simulate", "town", "--seconds", "1.2", "--lidar", "16-beam").splitlines()[-1])
+    assert drive.is_dir()
+    text = ok("odometry", "town")
+    assert "12 scans" in text
+    folder = Path("runs/latest").resolve()
+    assert folder.name.startswith("2026_01_01_drive_0001-")
+    assert str(Path("runs") / folder.name / "report.html") in text
+    assert sorted(path.name for path in folder.iterdir()) == sorted(FILES)
+    assert "smoothed" in ok("smooth", "runs/latest")
+    smoothed = read_tum(folder / "smoothed/poses_tum.txt")
+    assert smoothed.stamps_ns.tolist() == open_sequence(drive).stamps_ns.tolist()
+    for path in ("runs/latest", "runs/latest/smoothed"):
+        assert "ATE [m]" in ok("evaluate", path)
+        assert ok("view", path).strip().endswith("report.html")
+
+
+def test_simulating_again_leaves_the_drive_as_it_is_and_other_settings_are_refused(tiny_drive):
+    root, same = tiny_drive.parent.parent, ("--seconds", 2.5, "--seed", 3, "--lidar", "16-beam")
+    stamp = (tiny_drive / "poses.txt").stat().st_mtime_ns
+    ok("simulate", root, *same)
+    assert (tiny_drive / "poses.txt").stat().st_mtime_ns == stamp
+    assert "another" in refused(2, "simulate", root, *same, "--gps")
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--lidar", "128-beam"), "--lidar: unknown lidar '128-beam'"),
+        (("--speed", "99"), "--speed: "),
+        (("--seconds", "-1"), "--seconds: "),
+        (("--seconds", "1e9"), "--seconds: "),
+        (("--poses", "none.txt"), "none.txt"),
+    ],
+)
+def test_a_wrong_setting_of_the_simulation_is_named_by_its_option(options, named, tmp_path):
+    assert named in refused(2, "simulate", tmp_path, *options)
+
+
+def test_a_configuration_is_printed_changed_and_used(tiny_drive, tmp_path, without_pages):
+    text = ok("config")
+    import yaml
+
+    assert parse_config(yaml.safe_load(text), "printed") == Config()
+    changed = tmp_path / "my.yaml"
+    changed.write_text(text.replace("residual: scan-matching", "residual: none"))
+    ok(
+        "odometry",
+        tiny_drive,
+        "--config",
+        changed,
+        "--initial-pose",
+        "identity",
+        "--frames",
+        ":5",
+        "-o",
+        tmp_path / "r",
+    )
+    metrics = json.loads((tmp_path / "r/metrics.json").read_text())
+    assert (metrics["initial_pose"], metrics["residual"]) == ("identity", "none")
+    changed.write_text(text.replace("residual:", "residul:"))
+    assert "residul" in refused(2, "odometry", tiny_drive, "--config", changed, "-o", tmp_path / "s")
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("odometry", "nowhere"), "nowhere"),
+        (("odometry", "DRIVE", "--initial-pose", "guess"), "'guess'; choose one of"),
+        (("odometry", "DRIVE", "--residual", "guess"), "'guess'"),
+        (("odometry", "DRIVE", "--backend", "guess"), "'guess'"),
+        (("odometry", "DRIVE", "--sequence", "7"), "'7'"),
+        (("odometry", "DRIVE", "--reader", "rosbag"), "'rosbag'"),
+        (("odometry", "DRIVE", "--frames", "x"), "'x'"),
+        (("odometry", "nowhere", "--frames", "x"), "'x'"),  # which is known before the recording is looked for
+        (("odometry", "DRIVE", "--config", "none.yaml"), "none.yaml"),
+        (("compare", "DRIVE", "--initial-pose", "kalman,guess"), "'guess'"),
+        (("compare", "DRIVE", "--residual", ","), "no name"),
+        (("smooth", "DRIVE"), "no run in it"),
+        (("evaluate", "nowhere", "--reference", "DRIVE"), "nowhere"),
+        (("view", "DRIVE"), "report.html"),
+    ],
+)
+def test_input_that_cannot_be_used_is_one_line_and_leaves_nothing(words, named, tiny_drive, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert named in refused(2, *(tiny_drive if word == "DRIVE" else word for word in words))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("flag", "level"), [("-v", "info"), ("-vv", "debug")])
+def test_verbose_says_more_on_stderr(flag, level, tiny_drive, tmp_path, without_pages):
+    quiet = run("odometry", tiny_drive, "--residual", "none", "--frames", ":4", "-o", tmp_path / "a")
+    loud = run("odometry", tiny_drive, "--residual", "none", "--frames", ":4", "-o", tmp_path / "b", flag)
+    assert f"{level}: " in loud.stderr
+    assert f"{level}: " not in quiet.stderr
+    assert ("frame 3" in loud.stderr) == (flag == "-vv")
+
+
+def test_a_fault_shows_its_traceback_only_when_asked_to(tiny_drive, tmp_path, monkeypatch):
+    def fail(*_):
+        raise ZeroDivisionError("a fault")
+
+    monkeypatch.setattr("hybridlio.odometry.config.config_to_yaml", fail)
+    assert "ZeroDivisionError: a fault" in refused(1, "config")
+    for words in (("-vv", "config"), ("config", "-vv")):
+        result = run(*words)
+        assert result.exit_code == 1
+        assert "Traceback" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (PermissionError(errno.EACCES, "Permission denied", "/root/map"), "error: /root/map: Permission denied"),
+        (OSError(errno.ENOSPC, "No space left on device"), "error: No space left on device"),
+        (MemoryError(), "error: out of memory"),
+    ],
+)
+def test_what_the_system_refuses_is_no_fault_of_the_librarys(error, said, monkeypatch):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr("hybridlio.odometry.config.config_to_yaml", fail)
+    assert said in (words := refused(1, "config"))
+    assert "fault" not in words
+
+
+def test_progress_goes_to_stderr_so_that_results_can_be_piped(tiny_drive, tmp_path, without_pages):
+    result = run("odometry", tiny_drive, "--residual", "none", "-o", tmp_path / "run")
+    assert "25/25 scans (100 %)" in result.stderr
+    assert "(100 %)" not in result.stdout
+
+
+def test_the_version_is_the_packages():
+    assert ok("--version").split() == ["hybridlio", hybridlio.__version__]

@@ -1,0 +1,66 @@
+"""Inertial samples that nobody measured. Filled gaps are tested with what they were found in, georeferencing."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybridlio.core.sensors import ImuSamples
+from hybridlio.datasets.imu_faults import spikes
+from hybridlio.datasets.registry import open_sequence
+
+
+def driving(rng: np.random.Generator, count: int = 1000) -> ImuSamples:
+    """Hard turns and braking at 100 Hz, vibration of a metre a square second."""
+    t = np.arange(count) / 100
+    gyro = np.column_stack([0.1 * np.sin(9 * t), 0.2 * np.sin(5 * t), 1.2 * np.sin(2 * t)])
+    accel = np.column_stack([7 * np.sin(t), 6 * np.cos(2 * t), np.full(count, 9.81)])
+    noise = rng.normal(size=(2, count, 3))
+    return ImuSamples(np.arange(count) * 10**7, gyro + 0.01 * noise[0], accel + noise[1])
+
+
+@pytest.mark.parametrize(
+    ("gyro", "accel"), [([0, 0, 35], None), ([20, 20, 20], None), (None, [0, 0, 1e3]), (None, [-300, 0, 0])]
+)
+@pytest.mark.parametrize("row", [0, 1, 500, 998, 999])
+def test_a_sample_that_no_vehicle_can_have_caused_is_found_wherever_it_lies(rng, row, gyro, accel):
+    imu = driving(rng)
+    for values, spike in ((imu.gyro_rad_s, gyro), (imu.accel_m_s2, accel)):
+        if spike is not None:
+            values[row] = spike
+    assert spikes(imu).tolist() == [row]
+
+
+def test_two_spikes_in_a_row_are_found(rng):
+    imu = driving(rng)
+    imu.gyro_rad_s[500:502] = 35.0
+    assert spikes(imu).tolist() == [500, 501]
+
+
+def test_driving_has_none_and_neither_have_a_hand_another_unit_or_a_handful_of_samples(rng):
+    imu = driving(rng)
+    hand = ImuSamples(imu.stamps_ns, 4 * imu.gyro_rad_s, 3 * imu.accel_m_s2)
+    degrees = ImuSamples(
+        imu.stamps_ns, np.rad2deg(driving(rng).gyro_rad_s + 0.1 * rng.normal(size=(1000, 3))), imu.accel_m_s2
+    )
+    few = ImuSamples(np.arange(3), np.diag([0.0, 99.0, 0.0]), np.zeros((3, 3)))
+    for one in (imu, hand, degrees, few, ImuSamples.empty()):
+        assert len(spikes(one)) == 0
+
+
+def test_a_recording_is_opened_without_them_and_says_so(tiny_drive: Path, tmp_path: Path):
+    date = shutil.copytree(tiny_drive.parent, tmp_path / tiny_drive.parent.name)
+    clean = open_sequence(date)
+    (rows,) = date.glob("*_extract/oxts/data")
+    row = sorted(rows.iterdir())[150]
+    fields = row.read_text().split()
+    fields[17:20] = ["0", "0", "35"]  # wx wy wz
+    row.write_text(" ".join(fields) + "\n")
+    opened = open_sequence(date)
+    assert len(opened.imu) == len(clean.imu) - 1
+    assert np.abs(opened.imu.gyro_rad_s).max() < 2
+    (note,) = set(opened.notes) - set(clean.notes)
+    assert "left out 1 inertial sample far off those around" in note

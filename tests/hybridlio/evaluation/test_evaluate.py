@@ -1,0 +1,166 @@
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from hybridlio.core import se3
+from hybridlio.core.errors import DataError
+from hybridlio.core.trajectory import Trajectory
+from hybridlio.evaluation import evaluate as metrics
+from hybridlio.evaluation.evaluate import Evaluation, Steps, evaluate
+from hybridlio.evaluation.figures import evaluation_table, figures
+
+STEP_COVARIANCE = np.diag([1e-4, 1e-4, 4e-4, 1e-4, 1e-4, 4e-4])
+
+
+def drive(rng: np.random.Generator, n: int, speed_m: float = 1.0) -> tuple[Trajectory, Trajectory, Steps]:
+    """A winding reference, an estimate whose steps err by a known covariance, and those steps."""
+    bends = np.cumsum(rng.normal(0, [0.001, 0.001, 0.004], (n - 1, 3)), axis=0)
+    true_steps = se3.exp(np.hstack([bends, np.tile([speed_m, 0, 0], (n - 1, 1))]))
+    errors = rng.normal(size=(n - 1, 6)) * np.sqrt(np.diag(STEP_COVARIANCE))
+    steps = true_steps @ se3.exp(errors)
+    reference, poses, covariances = [np.eye(4)], [np.eye(4)], [np.zeros((6, 6))]
+    for true_step, step in zip(true_steps, steps, strict=True):
+        reference.append(reference[-1] @ true_step)
+        poses.append(poses[-1] @ step)
+        covariances.append(se3.compose_covariance(covariances[-1], step, STEP_COVARIANCE))
+    stamps = np.arange(n) * 100_000_000
+    estimate = Trajectory(stamps, np.array(poses), np.array(covariances))
+    return Trajectory(stamps, np.array(reference)), estimate, Steps(steps, np.tile(STEP_COVARIANCE, (n - 1, 1, 1)))
+
+
+def rendered(evaluations: dict[str, Evaluation]) -> str:
+    console = Console(width=400)
+    with console.capture() as text:
+        console.print(evaluation_table(evaluations))
+    return text.get()
+
+
+def test_the_whole_evaluation_is_the_sum_of_its_parts(rng: np.random.Generator) -> None:
+    reference, estimate, steps = drive(rng, 600)
+    result = evaluate(reference, estimate, steps=steps)
+    assert result.t_rel_percent == metrics.kitti_drift(reference, estimate).t_rel_percent
+    assert result.ate_m == metrics.ate(reference, estimate, lever_m=0.0).rmse_m
+    assert result.rpe_deg == metrics.rpe(reference, estimate).rmse_deg
+    assert result.length_m == pytest.approx(599, abs=0.5)
+    assert result.step_anees_rotation == pytest.approx(1, abs=0.15)
+    assert result.step_anees_position == pytest.approx(1, abs=0.15)
+    assert result.anees_rotation == metrics.absolute_consistency(reference, estimate).rotation.value
+    assert result.chosen_lengths_m is None
+    assert [s.at for s in result.segments] == [100, 200, 300, 400, 500]
+
+
+def test_an_estimate_equal_to_the_reference_has_no_error_at_all(rng: np.random.Generator) -> None:
+    reference, _, _ = drive(rng, 300)
+    result = evaluate(reference, Trajectory(reference.stamps_ns, se3.exp([0, 0, 1, 5, 5, 0]) @ reference.poses))
+    for name in ("t_rel_percent", "r_rel_deg_per_100m", "ate_m", "ate_deg", "rpe_m", "rpe_deg", "end_error_m"):
+        assert getattr(result, name) == pytest.approx(0, abs=1e-5), name
+
+
+def test_a_short_run_has_no_kitti_drift_but_one_over_lengths_that_fit_and_say_so(rng: np.random.Generator) -> None:
+    reference, estimate, _ = drive(rng, 80)
+    result = evaluate(reference, estimate)
+    assert result.t_rel_percent is None
+    assert result.r_rel_deg_per_100m is None
+    assert result.chosen_lengths_m == (5, 10, 15, 20, 25, 30, 35, 40)
+    assert result.chosen_t_rel_percent is not None
+    assert [s.at for s in result.segments] == list(result.chosen_lengths_m)
+    text = rendered({"short": result})
+    assert "drift over 5–40 m [%]" in text
+    assert "t_rel [%]" not in text
+
+
+def test_lengths_asked_for_stand_beside_kittis(rng: np.random.Generator) -> None:
+    reference, estimate, _ = drive(rng, 300)
+    result = evaluate(reference, estimate, lengths_m=(10, 20))
+    own = metrics.kitti_drift(reference, estimate, (10, 20), step=1)
+    assert result.chosen_t_rel_percent == own.t_rel_percent
+    assert result.t_rel_percent == evaluate(reference, estimate).t_rel_percent
+
+
+def test_a_vehicle_at_rest_is_evaluated_without_drift(rng: np.random.Generator) -> None:
+    reference, estimate, _ = drive(rng, 20, speed_m=0.0)
+    result = evaluate(reference, estimate)
+    assert (result.t_rel_percent, result.chosen_lengths_m, result.segments) == (None, None, [])
+    assert result.ate_m > 0
+    json.dumps(result.to_json_dict(), allow_nan=False)
+
+
+def test_the_json_has_the_figures_and_nothing_that_json_cannot_hold(rng: np.random.Generator) -> None:
+    reference, estimate, steps = drive(rng, 300)
+    result = evaluate(reference, estimate, steps=steps)
+    back = json.loads(json.dumps(result.to_json_dict(), allow_nan=False))
+    for name in ("t_rel_percent", "r_rel_deg_per_100m", "ate_m", "ate_deg", "rpe_m", "rpe_deg", "length_m"):
+        assert back[name] == getattr(result, name)
+    assert back["segments"][0] == {
+        "length_m": 100.0,
+        "count": result.segments[0].count,
+        "t_rel_percent": result.segments[0].t_rel_percent,
+        "r_rel_deg_per_100m": result.segments[0].r_rel_deg_per_100m,
+    }
+
+
+def test_camera_poses_against_lidar_poses_are_warned_of_and_like_against_like_is_not(
+    rng: np.random.Generator,
+) -> None:
+    reference, estimate, _ = drive(rng, 300)
+    T_camera_lidar = se3.make([[0, -1, 0], [0, 0, -1], [1, 0, 0]], [0, -0.08, -0.27])
+    camera = Trajectory(reference.stamps_ns, T_camera_lidar @ reference.poses @ se3.inverse(T_camera_lidar))
+    assert "along its z axis, the estimate along its x" in evaluate(camera, estimate).warnings[0]
+    assert evaluate(reference, estimate).warnings == []
+    still, shaken, _ = drive(rng, 50, speed_m=0.0)
+    assert evaluate(still, shaken).warnings == []
+
+
+def test_steps_are_judged_only_where_the_reference_has_both_ends(rng: np.random.Generator) -> None:
+    reference, estimate, steps = drive(rng, 300)
+    rows = np.r_[0:100, 150:300]
+    partial = Trajectory(reference.stamps_ns[rows], reference.poses[rows])
+    result = evaluate(partial, estimate, steps=steps, max_difference_ns=10_000_000)
+    assert result.poses == 250
+    errors = metrics.step_errors(reference, steps.poses)[np.r_[0:99, 150:299]]
+    expected = metrics.pose_consistency(errors, steps.covariances[: len(errors)])
+    assert result.step_anees_position == pytest.approx(expected.position.value)
+
+
+def test_covariances_relative_to_a_pose_that_the_reference_lacks_are_not_judged(rng: np.random.Generator) -> None:
+    reference, estimate, _ = drive(rng, 300)
+    late = Trajectory(reference.stamps_ns[5:], reference.poses[5:])
+    assert evaluate(late, estimate).anees_rotation is None
+    assert evaluate(reference, estimate).anees_rotation is not None
+
+
+def test_steps_that_do_not_fit_the_estimate_are_refused(rng: np.random.Generator) -> None:
+    reference, estimate, steps = drive(rng, 30)
+    with pytest.raises(DataError, match="28 steps with 29 covariances do not fit 30 poses"):
+        evaluate(reference, estimate, steps=Steps(steps.poses[1:], steps.covariances))
+
+
+def test_a_covariance_that_is_none_leaves_the_other_figures_standing(rng: np.random.Generator) -> None:
+    reference, estimate, steps = drive(rng, 300)
+    assert estimate.covariances is not None
+    broken = Trajectory(estimate.stamps_ns, estimate.poses, -estimate.covariances)
+    result = evaluate(reference, broken, steps=Steps(steps.poses, steps.covariances * np.nan))
+    assert result.t_rel_percent == pytest.approx(evaluate(reference, estimate).t_rel_percent)
+    assert result.anees_rotation is None
+    assert result.step_anees_rotation is None
+    assert "poses are not judged: ANEES: row 298: the covariance is not positive definite" in result.warnings[0]
+    assert "steps are not judged: ANEES: row 0: " in result.warnings[1]
+
+
+def test_the_table_has_a_line_for_each_figure_and_a_column_for_each_run(rng: np.random.Generator) -> None:
+    reference, estimate, steps = drive(rng, 300)
+    full, bare = evaluate(reference, estimate, steps=steps), evaluate(reference, reference)
+    lines = rendered({"with": full, "without": bare}).splitlines()
+    for heading, value in figures(full).items():
+        line = next(line for line in lines if heading in line)
+        assert value in line
+        # the reference has no covariances to judge
+        assert figures(bare).get(heading, "–") in line
+
+
+def test_without_a_reference_there_is_one_clear_error():
+    path = Trajectory(np.arange(3), np.tile(np.eye(4), (3, 1, 1)))
+    with pytest.raises(DataError, match="no reference to compare with"):
+        evaluate(None, path)

@@ -1,0 +1,194 @@
+import dataclasses
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybridlio.core import se3
+from hybridlio.core.errors import DataError
+from hybridlio.core.trajectory import Trajectory
+from hybridlio.evaluation.evaluate import Steps, evaluate
+from hybridlio.evaluation.figures import figures
+from hybridlio.evaluation.report import ReportData, find, pictures, write_report
+
+SIGMAS = [*np.radians([0.03, 0.03, 0.05]).tolist(), 0.02, 0.01, 0.02]
+
+
+def run(n: int = 400, seed: int = 5, claim: float = 1.0) -> ReportData:
+    """A drive through bends at 10 Hz, estimated with step errors whose covariance is ``claim`` times what it says."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(n - 1) * 0.1
+    yaw_rate = 0.05 * np.sin(time / 7) + 0.04 * np.sin(time / 23)
+    speed_m = 1.0 + 0.3 * np.sin(time / 11)
+    zero = np.zeros(n - 1)
+    true_steps = se3.exp(np.column_stack([zero, 0.002 * np.sin(time / 5), yaw_rate, speed_m, zero, zero]))
+    covariance = np.diag(np.square(SIGMAS))
+    final = true_steps @ se3.exp(-rng.normal(size=(n - 1, 6)) * SIGMAS)
+    initial = true_steps @ se3.exp(rng.normal(size=(n - 1, 6)) * np.array(SIGMAS) * 6)
+    reference, poses, covariances = [np.eye(4)], [np.eye(4)], [np.zeros((6, 6))]
+    for true_step, step in zip(true_steps, final, strict=True):
+        reference.append(reference[-1] @ true_step)
+        poses.append(poses[-1] @ step)
+        covariances.append(se3.compose_covariance(covariances[-1], step, covariance))
+    stamps = 1_317_384_506_000_000_000 + np.arange(n) * 100_000_000
+    ok, degenerate = np.ones(n - 1, bool), np.zeros(n - 1, bool)
+    ok[[99, 199, 200, 201]] = False
+    degenerate[300:310] = True
+    return ReportData(
+        name="town <1>",
+        estimate=Trajectory(stamps, np.array(poses), np.array(covariances) / claim),
+        reference=Trajectory(stamps, se3.exp([0, 0, 0.8, 20, 10, 3]) @ np.array(reference)),
+        estimate_name="smoothed",
+        others={"before smoothing": Trajectory(stamps, np.array(poses) @ se3.exp(rng.normal(0, 0.02, (n, 6))))},
+        initial_poses=initial,
+        final_poses=final,
+        step_covariances=np.tile(covariance / claim, (n - 1, 1, 1)),
+        timings_s={
+            name: rng.gamma(9, mean / 9, n) for name, mean in (("prepare", 0.011), ("match", 0.016), ("graph", 0.004))
+        },
+        ok=ok,
+        degenerate=degenerate,
+        facts={"initial pose": "preintegration", "residual": "scan-matching", "backend": "incremental"},
+        config="odometry:\n  residual: scan-matching\n  voxel_m: 0.5\n",
+        warnings=["The IMU has a gap of 0.42 s before scan 100."],
+    )
+
+
+class Page(HTMLParser):
+    """Collects what a page would fetch, and checks that what opens is closed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.sources: list[str] = []
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.sources += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data", "action")]
+        if tag not in ("meta", "img", "br", "link", "input", "hr"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+@pytest.fixture(scope="module")
+def data() -> ReportData:
+    return run()
+
+
+@pytest.fixture(scope="module")
+def html(data: ReportData, tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("report") / "new" / "report.html"
+    write_report(path, data)
+    assert [p.name for p in path.parent.iterdir()] == ["report.html"]
+    return path.read_text()
+
+
+def test_the_page_is_whole_and_fetches_nothing(html: str) -> None:
+    page = Page(html)
+    assert page.open == []
+    assert len(page.sources) == 7
+    assert all(source.startswith("data:image/png;base64,iVBOR") for source in page.sources)
+    assert not re.search(r"https?:|url\(|@import|<script|<link", html)
+
+
+def test_the_page_holds_the_figures_that_the_evaluation_gives(data: ReportData, html: str) -> None:
+    assert data.reference is not None
+    assert data.final_poses is not None
+    assert data.step_covariances is not None
+    steps = Steps(data.final_poses, data.step_covariances)
+    for heading, value in figures(evaluate(data.reference, data.estimate, steps=steps)).items():
+        assert heading in html
+        assert f"<td>{value}</td>" in html
+    for average in evaluate(data.reference, data.estimate).segments:
+        assert f"<td>{average.t_rel_percent:.3f}</td>" in html
+
+
+def test_the_page_says_what_went_wrong_where_and_with_which_settings(html: str) -> None:
+    assert "<b>100, 200–202</b>" in html  # step k leads to scan k+1
+    assert "<b>301–310</b>" in html
+    for text in ("gap of 0.42 s", "voxel_m: 0.5", "preintegration", "before smoothing", "numpy"):
+        assert text in html
+
+
+def test_scans_to_look_at_are_counted_as_the_recording_counts_them(data: ReportData, tmp_path: Path) -> None:
+    write_report(tmp_path / "r.html", dataclasses.replace(data, first_scan=7))
+    html = (tmp_path / "r.html").read_text()
+    assert "<b>107, 207–209</b>" in html
+    assert "<b>308–317</b>" in html
+
+
+def test_names_are_text_and_never_markup(html: str) -> None:
+    assert "town &lt;1&gt;" in html
+    assert "town <1>" not in html
+
+
+def test_wrong_covariances_are_called_so(data: ReportData, tmp_path: Path) -> None:
+    assert find(data).steps.consistency.rotation.consistent  # type: ignore[union-attr]
+    write_report(tmp_path / "r.html", dataclasses.replace(run(claim=9.0), others={}, timings_s={}, initial_poses=None))
+    assert re.search(r"<td>σ (2\.9\d?|3|3\.\d+) times too small</td>", (tmp_path / "r.html").read_text())
+
+
+EVERY_PICTURE = {"trajectory", "drift", "steps", "timing", "nees", "sigma_steps", "sigma_poses"}
+GONE_WITH = {
+    "reference": EVERY_PICTURE - {"trajectory", "timing"},
+    "initial_poses": set(),
+    "final_poses": {"nees", "sigma_steps"},
+    "step_covariances": {"nees", "sigma_steps"},
+    "ok": set(),
+    "degenerate": set(),
+}
+
+
+@pytest.mark.parametrize("absent", GONE_WITH)
+def test_whatever_is_absent_only_takes_its_own_pictures_away(data: ReportData, absent: str) -> None:
+    assert set(pictures(data, find(data))) == EVERY_PICTURE
+    less = dataclasses.replace(data, **{absent: None})
+    assert set(pictures(less, find(less))) == EVERY_PICTURE - GONE_WITH[absent]
+
+
+def test_an_estimate_alone_has_a_report(data: ReportData, tmp_path: Path) -> None:
+    write_report(tmp_path / "r.html", ReportData("bare", data.estimate))
+    text = (tmp_path / "r.html").read_text()
+    assert Page(text).open == []
+    assert re.findall("<h2>(.*?)</h2>", text) == ["Trajectory", "Versions"]
+    assert "There is no reference" in text
+
+
+@pytest.mark.parametrize(
+    ("poses", "text"),
+    [(1, "the estimate has 1 poses"), (2, "ATE [m]"), (40, "too short for KITTI")],
+)
+def test_a_run_of_one_pose_and_a_short_one_still_have_a_report(
+    data: ReportData, tmp_path: Path, poses: int, text: str
+) -> None:
+    short = Trajectory(data.estimate.stamps_ns[:poses], data.estimate.poses[:poses])
+    write_report(tmp_path / "r.html", ReportData("short", short, data.reference))
+    assert text in (tmp_path / "r.html").read_text()
+
+
+def test_a_reference_of_another_time_is_a_warning_and_not_the_end(data: ReportData, tmp_path: Path) -> None:
+    assert data.reference is not None
+    elsewhen = Trajectory(data.reference.stamps_ns - 10**18, data.reference.poses)
+    write_report(tmp_path / "r.html", dataclasses.replace(data, reference=elsewhen))
+    assert "only 0 poses of the same time" in (tmp_path / "r.html").read_text()
+
+
+def test_the_drawn_lines_are_the_data(data: ReportData) -> None:
+    figure = pictures(data, find(data))["trajectory"]
+    lines = {line.get_label(): line.get_xydata() for line in figure.axes[0].lines}
+    assert data.reference is not None
+    np.testing.assert_allclose(lines["reference"], data.reference.poses[:, :2, 3])
+    laid = data.reference.poses[0] @ data.estimate.poses
+    np.testing.assert_allclose(lines["smoothed"], laid[:, :2, 3], atol=1e-9)
+    np.testing.assert_allclose(lines["scan bridged"], laid[[100, 200, 201, 202], :2, 3], atol=1e-9)
+
+
+def test_arrays_that_do_not_fit_the_poses_are_refused_by_name(data: ReportData) -> None:
+    with pytest.raises(DataError, match=r"final_poses must be \(399, 4, 4\) for 400 poses, not \(400, 4, 4\)"):
+        dataclasses.replace(data, final_poses=data.estimate.poses)
+    with pytest.raises(DataError, match="timing of 'match'"):
+        dataclasses.replace(data, timings_s={"match": np.array([0.1, np.nan])})

@@ -1,0 +1,38 @@
+import numpy as np
+
+from hybridlio.registration.cell_table import CellTable, cells_of
+
+
+def test_a_cell_has_one_key_whatever_else_is_seen(rng: np.random.Generator):
+    points = rng.uniform(-50, 50, (3000, 3))
+    labels, keys = cells_of(points, 2.0)
+    assert (np.diff(keys) > 0).all()
+    cells, inverse = np.unique(np.floor(points / 2.0), axis=0, return_inverse=True)
+    assert len(keys) == len(cells)
+    _, firsts = np.unique(inverse, return_index=True)
+    np.testing.assert_array_equal(keys[labels], keys[labels[firsts]][inverse])
+    some = rng.permutation(3000)[:700]
+    fewer, theirs = cells_of(points[some], 2.0)
+    np.testing.assert_array_equal(theirs[fewer], keys[labels[some]])
+
+
+def test_of_no_points_there_are_no_cells():
+    labels, keys = cells_of(np.empty((0, 3)), 2.0)
+    assert len(labels) == len(keys) == 0
+
+
+def test_the_table_counts_like_a_dictionary(rng: np.random.Generator):
+    table, held, hit = CellTable(), {}, {}
+    for time in range(30):
+        keys = np.unique(rng.integers(0, 60, 20))
+        added = rng.integers(0, 3, len(keys))
+        for key, more in zip(keys.tolist(), added.tolist(), strict=True):
+            if key in held or more:
+                held[key], hit[key] = held.get(key, 0) + more, time
+        table.hit(keys, added, time)
+        if time % 7 == 6:
+            table.forget(time - 3)
+            held = {key: count for key, count in held.items() if hit[key] >= time - 3}
+        asked = np.arange(-5, 70)
+        np.testing.assert_array_equal(table.held(asked), [held.get(key, 0) for key in asked.tolist()])
+        np.testing.assert_array_equal(table.has(asked), [key in held for key in asked.tolist()])

@@ -1,0 +1,294 @@
+import json
+import re
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from threading import Barrier
+
+import numpy as np
+import pytest
+from scipy.integrate import trapezoid
+from scipy.spatial.transform import Rotation
+
+from hybridlio.core import se3
+from hybridlio.core.errors import ConfigError, DataError, EstimationError
+from hybridlio.core.sensors import Calibration
+from hybridlio.core.trajectory_files import read_kitti, read_tum
+from hybridlio.datasets.registry import open_sequence
+from hybridlio.odometry.config import Config, load_config
+from hybridlio.odometry.odometry import Odometry
+from hybridlio.record.record import Record
+from hybridlio.runs import folder as run_folder
+from hybridlio.runs.run import Run, run_odometry
+from hybridlio.runs.write import report_data, write_run
+
+CONFIG = Config(residual="none")
+T_CAMERA_LIDAR = se3.exp([1.2, -1.2, 1.2, 0.1, -0.2, 0.3])
+
+
+def run_of(drive: Path, **changes: object) -> Run:
+    sequence = replace(open_sequence(drive).part(0, 12), **changes)
+    return run_odometry(sequence, Odometry(config=CONFIG))
+
+
+@pytest.fixture(scope="module")
+def run(tiny_drive) -> Run:
+    return run_of(tiny_drive)
+
+
+@pytest.fixture(scope="module")
+def folder(run, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("run")
+    write_run(path, run, CONFIG)
+    return path
+
+
+def test_a_run_leaves_every_file_that_was_promised_and_nothing_else(folder):
+    assert sorted(path.name for path in folder.iterdir()) == sorted(run_folder.FILES)
+
+
+def test_both_pose_files_have_a_row_for_each_scan_with_nine_decimals_at_least(folder, run):
+    for name, columns in (("poses_tum.txt", 8), ("poses_kitti.txt", 12)):
+        rows = [line.split() for line in (folder / name).read_text().splitlines() if not line.startswith("#")]
+        assert len(rows) == len(run.sequence)
+        assert {len(row) for row in rows} == {columns}
+        assert min(len(number.partition(".")[2]) for row in rows for number in row) >= 9
+
+
+def test_the_pose_files_hold_the_estimate(folder, run):
+    tum = read_tum(folder / "poses_tum.txt")
+    assert tum.stamps_ns.tolist() == run.trajectory.stamps_ns.tolist()
+    np.testing.assert_allclose(tum.poses, run.trajectory.poses, atol=1e-9)
+    np.testing.assert_allclose(read_kitti(folder / "poses_kitti.txt").poses, run.trajectory.poses, atol=1e-9)
+
+
+def test_covariances_are_those_of_the_poses_and_of_the_steps(folder, run):
+    with np.load(folder / "covariances.npz") as file:
+        assert file["stamps_ns"].tolist() == run.sequence.stamps_ns.tolist()
+        np.testing.assert_array_equal(file["absolute"], run.trajectory.covariances)
+        np.testing.assert_array_equal(file["relative"], run.steps.covariances)
+        np.testing.assert_array_equal(file["relative_poses"], run.steps.poses)
+        assert file["estimated"].all()
+
+
+def test_the_record_and_the_configuration_can_be_used_again(folder, run):
+    record = Record.load(folder / "odometry.npz")
+    np.testing.assert_allclose(record.online.poses, run.trajectory.poses, atol=1e-12)
+    assert load_config(folder / "config.yaml") == CONFIG
+
+
+def test_the_metrics_say_what_was_done_and_how_good_it_is(folder, run):
+    said = json.loads((folder / "metrics.json").read_text())
+    assert (said["frames_done"], said["frames"], said["interrupted"]) == (12, 12, False)
+    assert (said["initial_pose"], said["residual"], said["backend"]) == (
+        CONFIG.initial_pose, CONFIG.residual, CONFIG.backend,
+    )  # fmt: skip
+    path, true = run.trajectory.poses[:, :3, 3], run.sequence.reference.poses[:, :3, 3]
+    assert said["path_length_m"] == pytest.approx(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    driven = trapezoid(run.sequence.forward_speed_m_s, run.sequence.stamps_ns / 1e9)
+    assert said["forward_speed_length_m"] == pytest.approx(driven)
+    assert said["forward_speed_length_m"] == pytest.approx(run.sequence.reference.length_m, rel=0.02)
+    _, left = Rotation.align_vectors(true - true.mean(0), path - path.mean(0))
+    assert said["ate_m"] == pytest.approx(left / np.sqrt(len(path)), rel=1e-6)
+    assert said["ms_per_scan"]["total"] > said["ms_per_scan"]["graph"] > 0
+
+
+def test_a_run_is_read_as_it_was_written(folder, run):
+    stored = run_folder.read_run(folder)
+    np.testing.assert_allclose(stored.trajectory.poses, run.trajectory.poses, atol=1e-9)
+    np.testing.assert_array_equal(stored.trajectory.covariances, run.trajectory.covariances)
+    np.testing.assert_array_equal(stored.steps.poses, run.steps.poses)
+    np.testing.assert_allclose(stored.reference.poses, run.sequence.reference.poses, atol=1e-9)
+    assert len(stored.stamps_before) == 0
+    assert stored.T_camera_lidar is None
+
+
+def test_a_recording_without_reference_or_speed_is_written_without_them(tiny_drive, without_pages, tmp_path):
+    run = run_of(tiny_drive, reference=None, forward_speed_m_s=None)
+    write_run(tmp_path, run, CONFIG)
+    assert not (tmp_path / "reference_tum.txt").exists()
+    stored = run_folder.read_run(tmp_path)
+    assert stored.reference is None
+    assert stored.metrics["forward_speed_length_m"] is None
+    assert "ate_m" not in stored.metrics
+
+
+def test_kitti_poses_of_an_odometry_sequence_are_the_cameras(tiny_drive, without_pages, run, tmp_path):
+    calibration = Calibration(run.sequence.calibration.T_imu_lidar, T_CAMERA_LIDAR)
+    seen = run_of(tiny_drive, calibration=calibration, pose_file_frame="camera")
+    write_run(tmp_path, seen, CONFIG)
+    camera = T_CAMERA_LIDAR @ seen.trajectory.poses @ se3.inverse(T_CAMERA_LIDAR)
+    np.testing.assert_allclose(read_kitti(tmp_path / "poses_kitti.txt").poses, camera, atol=1e-9)
+    np.testing.assert_allclose(read_tum(tmp_path / "poses_tum.txt").poses, seen.trajectory.poses, atol=1e-9)
+    np.testing.assert_allclose(run_folder.read_run(tmp_path).T_camera_lidar, T_CAMERA_LIDAR)
+
+
+def test_scans_before_the_first_usable_one_have_rows_that_claim_nothing(tiny_drive, without_pages, tmp_path):
+    sequence = open_sequence(tiny_drive).part(0, 12)
+
+    def load(k):
+        if k < 3:
+            raise DataError(f"{k}.bin: truncated")
+        return sequence.load_scan(k)
+
+    run = run_odometry(replace(sequence, load_scan=load), Odometry(config=CONFIG))
+    assert report_data(run, CONFIG, "").first_scan == 3
+    write_run(tmp_path, run, CONFIG)
+    whole = read_tum(tmp_path / "poses_tum.txt")
+    assert whole.stamps_ns.tolist() == sequence.stamps_ns.tolist()
+    np.testing.assert_allclose(whole.poses[:3], np.tile(np.eye(4), (3, 1, 1)), atol=1e-9)
+    with np.load(tmp_path / "covariances.npz") as file:
+        assert file["estimated"].tolist() == [False] * 3 + [True] * 9
+        sigmas_m = np.sqrt(file["absolute"][:, 3, 3])
+    assert (sigmas_m[:3] > 1).all()
+    assert (np.diff(sigmas_m[:4]) < 0).all()  # the longer before, the less is known
+    stored = run_folder.read_run(tmp_path)
+    assert stored.trajectory.stamps_ns.tolist() == sequence.stamps_ns[3:].tolist()
+    assert len(stored.steps.poses) == 8
+    assert stored.metrics["skipped"] == 3
+    vertices = re.findall(r"^VERTEX_SE3:QUAT (\d+)", (tmp_path / "graph.g2o").read_text(), re.MULTILINE)
+    assert list(map(int, vertices)) == list(range(3, 12))
+
+
+def test_a_single_estimate_is_written_without_record_and_graph(tiny_drive, tmp_path):
+    run = run_odometry(open_sequence(tiny_drive).part(0, 1), Odometry(config=CONFIG))
+    write_run(tmp_path, run, CONFIG)
+    assert len(read_tum(tmp_path / "poses_tum.txt")) == 1
+    assert not (tmp_path / "odometry.npz").exists()
+    assert (tmp_path / "report.html").exists()
+
+
+def test_a_run_without_estimates_is_refused_and_leaves_an_older_one_alone(folder, tiny_drive):
+    run = Run(open_sequence(tiny_drive), Odometry())
+    with pytest.raises(EstimationError, match="nothing was estimated"):
+        write_run(folder, run, CONFIG)
+    assert run_folder.is_run_folder(folder)
+
+
+def test_a_run_is_never_replaced_unasked(folder):
+    with pytest.raises(ConfigError, match="--overwrite"):
+        run_folder.new_run_folder("town", folder, overwrite=False)
+    assert run_folder.new_run_folder("town", folder, overwrite=True) == folder
+
+
+def test_a_new_run_in_an_old_ones_folder_leaves_nothing_of_it_but_what_others_put_there(without_pages, run, tmp_path):
+    write_run(tmp_path, run, CONFIG)
+    (tmp_path / "smoothed").mkdir()
+    (tmp_path / "smoothed/poses_tum.txt").write_text("old")
+    (tmp_path / "my notes.txt").write_text("mine")
+    short = replace(run, sequence=replace(run.sequence, reference=None))
+    write_run(tmp_path, short, CONFIG)
+    assert not (tmp_path / "smoothed").exists()
+    assert not (tmp_path / "reference_tum.txt").exists()
+    assert (tmp_path / "my notes.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "smoothed/thesis.txt"])
+def test_a_folder_with_files_of_a_runs_names_that_is_no_run_is_refused_unasked(tmp_path, name):
+    mine = tmp_path / name
+    mine.parent.mkdir(exist_ok=True)
+    mine.write_text("mine")
+    with pytest.raises(ConfigError, match=f"holds {name.split('/')[0]} and is no finished run"):
+        run_folder.new_run_folder("town", tmp_path, overwrite=False)
+    assert run_folder.new_run_folder("town", tmp_path, overwrite=True) == tmp_path
+    assert mine.read_text() == "mine"
+
+
+def test_what_is_cleared_is_a_runs_alone(without_pages, run, tmp_path):
+    write_run(tmp_path, run, CONFIG)
+    (tmp_path / "smoothed").mkdir()
+    for name in ("poses_tum.txt", "metrics.json", "thesis.txt"):
+        (tmp_path / "smoothed" / name).write_text("old")
+    run_folder.clear(tmp_path)
+    assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.*")] == ["smoothed/thesis.txt"]
+
+
+def test_default_folders_are_named_after_the_sequence_and_never_shared(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    made = [run_folder.new_run_folder("town", None, overwrite=False) for _ in range(3)]
+    assert len(set(made)) == 3
+    assert all(re.fullmatch(r"runs/town-\d{8}-\d{6}(-\d)?", str(path)) for path in made)
+    assert all(path.is_dir() for path in made)
+
+
+def test_runs_that_begin_at_once_get_folders_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ready = Barrier(8)
+
+    def begin(_: int) -> Path:
+        ready.wait()
+        return run_folder.new_run_folder("town", None, overwrite=False)
+
+    with ThreadPoolExecutor(8) as runs:
+        assert len(set(runs.map(begin, range(8)))) == 8
+
+
+def test_a_place_where_no_folder_can_be_made_is_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("runs").write_text("a file")
+    for out in (None, Path("runs/mine")):
+        with pytest.raises(DataError, match="cannot make the run folder runs/"):
+            run_folder.new_run_folder("town", out, overwrite=False)
+
+
+def test_latest_points_at_the_newest_and_works_after_the_folder_above_moved(tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        run_folder.point_latest_at(tmp_path / "runs" / name)
+    (tmp_path / "runs").rename(tmp_path / "moved")
+    assert (tmp_path / "moved/latest").resolve() == tmp_path / "moved/b"
+    assert sorted(path.name for path in (tmp_path / "moved").iterdir()) == ["a", "b", "latest"]
+
+
+def test_a_folder_that_is_called_latest_is_left_alone(tmp_path):
+    (tmp_path / "latest").mkdir()
+    (tmp_path / "a").mkdir()
+    run_folder.point_latest_at(tmp_path / "a")
+    assert not (tmp_path / "latest").is_symlink()
+
+
+@pytest.mark.parametrize(
+    ("name", "text"), [("metrics.json", "{"), ("covariances.npz", "no zip"), ("poses_tum.txt", "1 2")]
+)
+def test_a_damaged_run_is_refused_by_name(name, text, folder, tmp_path):
+    damaged = shutil.copytree(folder, tmp_path / "run")
+    (damaged / name).write_text(text)
+    with pytest.raises(DataError, match=str(damaged)):
+        run_folder.read_run(damaged)
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path):
+    with pytest.raises(DataError, match="no run in it"):
+        run_folder.read_run(tmp_path)
+    with pytest.raises(DataError, match="no such folder"):
+        run_folder.read_run(tmp_path / "none")
+
+
+def _halved(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def _flipped(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    third = len(content) // 3
+    content[third : third + 60] = bytes(byte ^ 0xFF for byte in content[third : third + 60])
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        ("covariances.npz", _halved),
+        ("covariances.npz", _flipped),
+        ("metrics.json", _halved),
+        ("metrics.json", lambda path: path.write_text("[]")),
+        ("metrics.json", lambda path: path.write_text('{"sequence": "town"}')),
+        ("poses_tum.txt", lambda path: path.write_text("".join(path.read_text().splitlines(True)[:5]))),
+    ],
+)
+def test_a_damaged_run_is_refused_with_its_folder(folder, tmp_path, name, damage):
+    damaged = shutil.copytree(folder, tmp_path / "run")
+    damage(damaged / name)
+    with pytest.raises(DataError, match=rf"{damaged}: its metrics.json, poses_tum.txt or covariances.npz cannot"):
+        run_folder.read_run(damaged)

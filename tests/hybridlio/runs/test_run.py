@@ -1,0 +1,225 @@
+import logging
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybridlio.core import se3
+from hybridlio.core.errors import ConfigError, DataError, GraphError
+from hybridlio.core.packed_arrays import PackedCloud
+from hybridlio.core.sensors import GpsFix, Scan
+from hybridlio.datasets.sequence import Sequence, part_of
+from hybridlio.graph import PoseGraph
+from hybridlio.graph.run.smooth import smooth
+from hybridlio.odometry.config import Config
+from hybridlio.odometry.odometry import Odometry
+from hybridlio.record.keyframes import KeyframeMaker, KeyframeSettings
+from hybridlio.record.record import Record
+from hybridlio.record.recorder import RecordMaker
+from hybridlio.runs.run import Run, run_odometry
+from hybridlio.runs.write import notes, write_run
+from hybridlio.sources.constant_velocity import NoResidual
+from hybridlio.sources.innovation_gate import Agreement
+
+
+@pytest.fixture(scope="module")
+def whole(sequence) -> Run:
+    return run_odometry(sequence, Odometry())
+
+
+def with_scans(sequence: Sequence, bad: dict[int, Exception | Scan]) -> Sequence:
+    """The sequence, with what ``bad`` says in place of some scans."""
+
+    def load(k: int) -> Scan:
+        scan = bad[k] if k in bad else sequence.load_scan(k)
+        if isinstance(scan, Exception):
+            raise scan
+        return scan
+
+    return replace(sequence, load_scan=load)
+
+
+def end_error_m(run: Run) -> float:
+    """Distance of the last pose from the reference's, both in the first estimate's frame."""
+    true = se3.between(run.sequence.reference.poses[run.skipped], run.sequence.reference.poses[run.done - 1])
+    return float(np.linalg.norm(run.trajectory.poses[-1, :3, 3] - true[:3, 3]))
+
+
+def test_every_scan_has_an_estimate_at_its_stamp(whole, sequence):
+    assert whole.stopped is None
+    assert whole.trajectory.stamps_ns.tolist() == sequence.stamps_ns.tolist()
+    assert whole.done == len(sequence)
+    assert whole.ok.all()
+    assert end_error_m(whole) < 0.2
+
+
+def test_progress_is_told_of_each_scan_and_of_the_distance(sequence, tiny_drive):
+    told = []
+    run = run_odometry(sequence, Odometry(residual="none"), lambda *values: told.append(values))
+    assert [(done, total) for done, total, _ in told] == [(k + 1, len(sequence)) for k in range(len(sequence))]
+    assert told[-1][2] == pytest.approx(run.trajectory.length_m)
+
+
+def test_every_stage_is_timed_at_every_scan_after_the_first(whole, sequence):
+    assert {"reading", "initial pose", "residual", "graph"} <= set(whole.timings_s)
+    for spent in whole.timings_s.values():
+        assert spent.shape == (len(sequence) - 1,)
+        assert (spent >= 0).all()
+    assert sum(spent.sum() for spent in whole.timings_s.values()) < whole.seconds
+
+
+@pytest.mark.parametrize("kind", ["unreadable", "empty"])
+def test_a_scan_without_points_is_bridged_by_the_initial_pose(kind, whole, sequence, caplog):
+    empty = Scan(int(sequence.stamps_ns[15]), np.empty((0, 3), np.float32))
+    bad = {15: DataError("scans/15.bin: truncated") if kind == "unreadable" else empty}
+    with caplog.at_level(logging.WARNING, logger="hybridlio"):
+        run = run_odometry(with_scans(sequence, bad), Odometry())
+    assert run.stopped is None
+    assert run.done == len(sequence)
+    assert run.bridged == [15]
+    assert run.estimates[15].relative.source == "preintegration"
+    assert run.steps.covariances[14].trace() > whole.steps.covariances[14].trace()
+    assert end_error_m(run) < 0.2
+    if kind == "unreadable":
+        assert run.unreadable == {15: "scans/15.bin: truncated"}
+        assert "scans/15.bin: truncated" in caplog.text
+
+
+def test_the_run_starts_at_the_first_scan_that_can_be_used(sequence, caplog):
+    few = Scan(int(sequence.stamps_ns[1]), np.ones((5, 3), np.float32))
+    bad = {0: DataError("scans/0.bin: no such scan"), 1: few, 12: DataError("scans/12.bin: truncated")}
+    with caplog.at_level(logging.WARNING, logger="hybridlio"):
+        run = run_odometry(with_scans(sequence, bad), Odometry())
+    assert run.skipped == 2
+    assert run.stamps_before.tolist() == sequence.stamps_ns[:2].tolist()
+    assert run.trajectory.stamps_ns.tolist() == sequence.stamps_ns[2:].tolist()
+    assert run.done == len(sequence)
+    assert run.bridged == [12]
+    assert sorted(run.unreadable) == [0, 1, 12]
+    assert end_error_m(run) < 0.3
+    assert "scans/0.bin: no such scan" in caplog.text
+
+
+def test_a_recording_without_a_single_usable_scan_ends_in_an_error_that_says_why(sequence):
+    bad = {k: DataError(f"scans/{k}.bin: truncated") for k in range(len(sequence))}
+    for residual in ("scan-matching", "none"):
+        run = run_odometry(with_scans(sequence, bad), Odometry(residual=residual))
+        assert run.done == 0
+        assert isinstance(run.stopped, DataError)
+        assert "scans/0.bin: truncated" in str(run.stopped)
+
+
+def test_an_interrupt_keeps_what_was_estimated(whole, sequence):
+    def interrupt(done: int, total: int, metres: float) -> None:
+        if done == 9:
+            raise KeyboardInterrupt
+
+    run = run_odometry(sequence, Odometry(), interrupt)
+    assert isinstance(run.stopped, KeyboardInterrupt)
+    assert run.done == 9
+    np.testing.assert_array_equal(run.trajectory.poses, whole.trajectory.poses[:9])
+    assert len(run.record.online) == 9
+
+
+@pytest.mark.parametrize("within", [KeyframeMaker.offer, PackedCloud.of, RecordMaker.add, Odometry.step])
+def test_an_interrupt_at_the_end_of_any_bookkeeping_leaves_a_run_that_can_be_smoothed(within, sequence, tmp_path):
+    """When a call returns for the seventh time, its work done, and its caller's not."""
+    returned = iter(range(1, 100))
+
+    def tracer(frame, event, _arg):
+        if frame.f_code is not within.__code__:
+            return None
+        if event == "return" and next(returned) == 7:
+            raise KeyboardInterrupt
+        return tracer
+
+    config = Config(residual="none", keyframes=KeyframeSettings(spacing_m=1e-6))
+    sys.settrace(tracer)
+    try:
+        run = run_odometry(sequence, Odometry(config=config))
+    finally:
+        sys.settrace(None)
+    assert isinstance(run.stopped, KeyboardInterrupt)
+    record = run.record
+    assert len(record.online) == len(run.estimates) > 4
+    assert (record.keyframes.rows < len(record.online)).all()
+    write_run(tmp_path / "run", run, config)
+    assert len(smooth(Record.load(tmp_path / "run/odometry.npz")).trajectory) == run.done
+    assert len(PoseGraph.load(tmp_path / "run/graph.g2o")) == run.done
+
+
+class Failing(NoResidual):
+    """Raises at frame 8."""
+
+    def __init__(self, error: BaseException) -> None:
+        self._error = error
+
+    def refine(self, frame, initial):
+        if frame.index == 8:
+            raise self._error
+        return initial
+
+
+@pytest.mark.parametrize("error", [GraphError("no"), ValueError("a fault"), KeyboardInterrupt()])
+def test_trouble_in_the_middle_of_a_step_keeps_the_steps_before_and_nothing_of_it(error, sequence):
+    run = run_odometry(sequence, Odometry(residual=Failing(error)))
+    assert run.stopped is error
+    assert run.done == 8
+    assert run.record.imu.stamps_ns[-1] == run.record.online.stamps_ns[-1] == sequence.stamps_ns[7]
+
+
+def test_less_than_two_estimates_are_no_record(sequence):
+    run = run_odometry(sequence.part(0, 1), Odometry(config=Config(residual="none")))
+    assert run.done == 1
+    assert run.record is None
+    assert run.timings_s == {}
+    assert run.steps.poses.shape == (0, 4, 4)
+
+
+@pytest.mark.parametrize(("text", "rows"), [("5:9", (5, 9)), ("20:", (20, 25)), (":4", (0, 4)), ("-3:", (22, 25))])
+def test_part_of_a_recording_is_the_same_frames_in_the_first_ones_frame(text, rows, sequence):
+    part = part_of(sequence, text)
+    start, stop = rows
+    assert part.stamps_ns.tolist() == sequence.stamps_ns[start:stop].tolist()
+    np.testing.assert_array_equal(part[1].scan.points, sequence[start + 1].scan.points)
+    np.testing.assert_array_equal(part[1].imu.stamps_ns, sequence[start + 1].imu.stamps_ns)
+    poses = sequence.reference.poses
+    np.testing.assert_allclose(part.reference.poses, se3.between(poses[start], poses[start:stop]), atol=1e-12)
+    assert len(part.forward_speed_m_s) == stop - start
+
+
+def test_without_a_range_the_recording_is_whole(sequence):
+    assert part_of(sequence, None) is sequence
+
+
+@pytest.mark.parametrize(
+    ("text", "error"), [("5", ConfigError), ("1:2:3", ConfigError), ("a:b", ConfigError), ("9:9", DataError)]
+)
+def test_a_range_that_is_none_or_holds_no_scan_is_refused(text, error, sequence):
+    with pytest.raises(error, match=r"range such as|no scans in"):
+        part_of(sequence, text)
+
+
+def test_an_imu_that_many_scans_contradict_is_named_as_what_may_be_wrong(whole):
+    estimates = list(whole.estimates)
+    for count, told in ((1, False), (5, True)):
+        doubted = [replace(e, agreement=Agreement("trusted again", 1e3)) for e in estimates[-count:]]
+        said = notes(replace(whole, estimates=[*estimates[:-count], *doubted]))
+        assert f"{count} scan" in said[0]
+        assert ("check T_imu_lidar, units, clock" in said[-1]) == told
+
+
+def test_fixes_by_another_clock_stay_with_the_run_for_smoothing_to_place(sequence):
+    stamps = [sequence.stamps_ns[0] + round(seconds * 1e9) for seconds in (-40, -18, 1, 18, 40)]
+    fixes = tuple(GpsFix(int(stamp), np.zeros(3), np.eye(3)) for stamp in stamps)
+    run = run_odometry(replace(sequence, gps=fixes), Odometry(residual="none"))
+    assert run.record.gps == fixes[1:4]
+
+
+def test_a_scan_that_is_delivered_twice_is_bridged_and_told(sequence, caplog):
+    again = with_scans(sequence, {6: replace(sequence.load_scan(5), stamp_ns=int(sequence.stamps_ns[6]))})
+    run = run_odometry(again, Odometry())
+    assert run.bridged == [6]
+    assert "frame 6: bridged by the initial pose: its points are those of the scan before" in caplog.text
+    assert end_error_m(run) < 0.3
