@@ -19,10 +19,10 @@ import numpy as np
 import hybridlio as hl
 from hybridlio.core import se3
 from hybridlio.core.estimates import RelativePose, State
+from hybridlio.core.motion_limits import unknown_motion_covariance
 from hybridlio.core.sensors import NS_PER_S, Frame
 from hybridlio.evaluation.consistency import PoseConsistency, pose_consistency
 from hybridlio.simulation.chain import Chain, make_chain
-from hybridlio.sources.constant_velocity import unknown_motion_covariance
 
 KINDS = {"independent steps": None, "matched to a map": 0.02}
 BACKENDS = ("incremental", "fixed-lag")

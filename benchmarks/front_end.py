@@ -22,11 +22,11 @@ from pathlib import Path
 import numpy as np
 import small_gicp
 import torch
-from numpy.typing import NDArray
 
 from hybridlio.cloud.preparation import prepare
 from hybridlio.cloud.projection import vertex_map
 from hybridlio.core import se3, tables
+from hybridlio.core.arrays import Array
 from hybridlio.core.files import write_whole
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
@@ -40,7 +40,6 @@ from hybridlio.learned.training.validation import step_errors
 from hybridlio.runs.recipes import adaptation
 from hybridlio.runs.training_data import DataOptions, shards_of
 
-Array = NDArray[np.float64]
 Row = dict[str, str]
 
 SIZES = ((0.41, 0.145), (0.10, 0.054))  # degrees and metres, root mean square over pairs

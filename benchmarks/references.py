@@ -22,7 +22,7 @@ from systems import our_systems, peer_systems
 
 from hybridlio.commands.terminal import progress
 from hybridlio.core import se3, tables
-from hybridlio.core.estimates import Array
+from hybridlio.core.arrays import Array
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.evaluation.evaluate import evaluate

@@ -20,9 +20,9 @@ from pathlib import Path
 
 import numpy as np
 import small_gicp
-from numpy.typing import NDArray
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose, ResidualSource
 from hybridlio.core.files import write_whole
 from hybridlio.core.sensors import ImuNoise
@@ -30,8 +30,6 @@ from hybridlio.datasets.registry import open_sequence, sequence_names
 from hybridlio.datasets.sequence import Sequence, part_of
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.registry import RESIDUAL_SOURCES, Setup
-
-Array = NDArray[np.float64]
 
 
 @dataclass

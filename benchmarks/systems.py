@@ -8,15 +8,13 @@ from functools import partial
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.sensors import Frame
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.registry import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

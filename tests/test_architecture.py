@@ -4,29 +4,38 @@ from __future__ import annotations
 
 import ast
 import functools
+import graphlib
 import json
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = {"torch", "gtsam", "open3d", "matplotlib", "small_gicp", "scipy", "pydantic", "typer", "joblib"}
-# the only modules of hybridlio that may know that graph and learned exist
-JOINING = (
-    "__main__",
-    "batch",
-    "cli",
-    "compare",
-    "config",
-    "odometry",
-    "recipes",
-    "run",
-    "run_folder",
-    "run_outputs",
-    "sources",
-    "training_data",
-)
+# a room imports only rooms of lower floors
+FLOORS = {
+    "core": 1,
+    "cloud": 2,
+    "datasets": 2,
+    "evaluation": 2,
+    "registration": 3,
+    "record": 3,
+    "sources": 4,
+    "smoothing": 4,
+    "simulation": 4,
+    "learned": 4,
+    "graph": 5,
+    "odometry": 6,
+    "runs": 7,
+    "commands": 8,
+}
+APART = {"graph", "learned", "simulation"}  # they do not know each other
+JOINING_FLOOR = 6  # nothing below it knows graph or learned
+LOOSE = {"__init__.py", "__main__.py", "cli.py", "py.typed"}
+MAX_ROOMS, MAX_MODULES_IN_FOLDER, MAX_CHAIN = 12, 20, 20
+MAX_PARAMETERS, MAX_COMPLEXITY = 7, 12
 MAX_MODULE_LINES, MAX_TEST_LINES, MAX_FUNCTION_LINES, MAX_IMPORT_S = 300, 400, 60, 0.3
 
 
@@ -78,8 +87,30 @@ def inside(package: str) -> set[str]:
     return {module for module in MODULES if module == package or module.startswith(package + ".")}
 
 
-TOP = {f"hybridlio.{name}" for name in JOINING} | inside("hybridlio.commands") | {"hybridlio"}
 GRAPH, LEARNED = inside("hybridlio.graph"), inside("hybridlio.learned")
+
+
+def room(module: str) -> str:
+    """The room that a module lies in; empty for the package itself and its entry point."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 and parts[1] in FLOORS else ""
+
+
+@functools.cache
+def module_imports(module: str) -> frozenset[str]:
+    """Modules of hybridlio that a module imports, wherever in the file; names count as the module that holds them."""
+    found = set()
+    for name in imports(MODULES[module]):
+        while name and name not in MODULES:
+            name = name.rpartition(".")[0]
+        found.add(name)
+    packages = {name.rpartition(".")[0] for name in found}  # "from a import b" names both a and a.b
+    return frozenset(name for name in found if name.startswith("hybridlio.") and name != module) - packages
+
+
+def order() -> list[str]:
+    """Modules so that each stands behind all that it imports; raises CycleError where that cannot be."""
+    return list(graphlib.TopologicalSorter({module: module_imports(module) for module in MODULES}).static_order())
 
 
 def test_the_three_packages_are_found():
@@ -102,15 +133,49 @@ def test_learned_trains_on_a_machine_without_open3d():
     assert importing(LEARNED, "open3d") == {}
 
 
-def test_graph_and_learned_know_the_leaves_but_neither_each_other_nor_what_joins_them():
-    joining = TOP - {"hybridlio"}
-    assert importing(GRAPH, "hybridlio.learned", *joining) == {}
-    assert importing(LEARNED, "hybridlio.graph", *joining) == {}
+def test_a_room_imports_only_rooms_of_lower_floors():
+    wrong = [
+        f"{module} -> {other}"
+        for module in MODULES
+        for other in module_imports(module)
+        if room(module) and room(other) and room(module) != room(other)
+        if FLOORS[room(other)] >= FLOORS[room(module)]
+    ]
+    assert wrong == []
 
 
-def test_leaves_know_neither_graph_nor_learned_nor_what_joins_them():
-    leaves = set(MODULES) - GRAPH - LEARNED - TOP
-    assert importing(leaves, "hybridlio.graph", "hybridlio.learned", *TOP - {"hybridlio"}) == {}
+def test_graph_learned_and_simulation_do_not_know_each_other():
+    pairs = {(room(module), room(other)) for module in MODULES for other in module_imports(module)}
+    assert {(a, b) for a, b in pairs if {a, b} <= APART and a != b} == set()
+
+
+def test_nothing_below_the_odometry_knows_graph_or_learned():
+    below = {m for m in MODULES if room(m) and FLOORS[room(m)] < JOINING_FLOOR} - GRAPH - LEARNED
+    assert importing(below, "hybridlio.graph", "hybridlio.learned") == {}
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    assert set(order()) >= set(MODULES)
+
+
+def test_no_chain_of_imports_is_long():
+    length: dict[str, int] = {}
+    for module in order():
+        length[module] = 1 + max((length[other] for other in module_imports(module)), default=0)
+    assert max(length.values()) <= MAX_CHAIN
+
+
+def test_there_are_few_rooms_and_no_loose_modules():
+    entries = [path for path in (ROOT / "hybridlio").iterdir() if not path.name.startswith("__pycache__")]
+    rooms = {path.name for path in entries if path.is_dir() and not path.is_symlink()}
+    assert rooms | {"graph", "learned"} == set(FLOORS)
+    assert len(rooms) <= MAX_ROOMS
+    assert {path.name for path in entries if path.is_file()} <= LOOSE
+
+
+def test_no_folder_holds_many_modules():
+    folders = Counter(path.parent for path in MODULES.values() if path.name != "__init__.py")
+    assert {str(folder): count for folder, count in folders.items() if count > MAX_MODULES_IN_FOLDER} == {}
 
 
 def test_the_folders_bare_names_are_never_imported():

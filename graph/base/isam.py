@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import gtsam
 import numpy as np
 
-from hybridlio.core.estimates import Array
+from hybridlio.core.arrays import Array
 
 # A change of the newest pose hardly moves the oldest: below this change (rad, m, m/s) it is not carried on to older
 # variables, which would make each update cost as much as the run is long. The newest are always solved in full.

@@ -9,8 +9,8 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
-from hybridlio.core.estimates import Array
 from hybridlio.graph.base.isam import incremental_solver, reason
 
 Progress = Callable[[str, int, int], None]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from hybridlio.core.estimates import Array, check_covariance
+from hybridlio.core.arrays import Array
+from hybridlio.core.estimates import check_covariance
 
 
 def gaussian(covariance: Array, name: str) -> gtsam.noiseModel.Base:

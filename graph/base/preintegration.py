@@ -6,16 +6,16 @@ import gtsam
 import numpy as np
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
-from hybridlio.core.estimates import Array, State
+from hybridlio.core.estimates import State
+from hybridlio.core.motion_limits import (
+    ANGULAR_ACCELERATION_SIGMA_RAD_S2,
+    JERK_SIGMA_M_S3,
+    LARGEST_ACCELERATION_M_S2,
+    LARGEST_RATE_RAD_S,
+)
 from hybridlio.core.sensors import NS_PER_S, ImuNoise, ImuSamples
-
-# What a vehicle can do between two samples that linear interpolation does not see. At 100 Hz it is below the sensor's
-# own noise; at 10 Hz, or across a gap, it is what the uncertainty consists of.
-_JERK_M_S3 = 5.0
-_ANGULAR_ACCELERATION_RAD_S2 = 0.5
-LARGEST_ACCELERATION_M_S2 = 4.0
-LARGEST_RATE_RAD_S = 0.6
 
 
 def sampling_noise(noise: ImuNoise, gap_s: float) -> tuple[float, float]:
@@ -24,8 +24,8 @@ def sampling_noise(noise: ImuNoise, gap_s: float) -> tuple[float, float]:
     Adds to the sensor's own noise the motion that samples so far apart cannot show, growing with the gap up to the
     accelerations and rates a vehicle reaches; constant over the gap, so its density is the deviation times √gap.
     """
-    accel = min(_JERK_M_S3 * gap_s / 4, LARGEST_ACCELERATION_M_S2) * np.sqrt(gap_s)
-    gyro = min(_ANGULAR_ACCELERATION_RAD_S2 * gap_s / 4, LARGEST_RATE_RAD_S) * np.sqrt(gap_s)
+    accel = min(JERK_SIGMA_M_S3 * gap_s / 4, LARGEST_ACCELERATION_M_S2) * np.sqrt(gap_s)
+    gyro = min(ANGULAR_ACCELERATION_SIGMA_RAD_S2 * gap_s / 4, LARGEST_RATE_RAD_S) * np.sqrt(gap_s)
     return float(np.hypot(noise.accel_m_s2_sqrt_hz, accel)), float(np.hypot(noise.gyro_rad_s_sqrt_hz, gyro))
 
 

@@ -16,7 +16,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridlio.core.estimates import Array, RelativePose
+from hybridlio.core.arrays import Array
+from hybridlio.core.estimates import RelativePose
 from hybridlio.core.files import write_whole
 from hybridlio.graph.model import coordinates as co
 

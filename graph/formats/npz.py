@@ -9,8 +9,8 @@ from typing import Any, get_args
 
 import numpy as np
 
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
-from hybridlio.core.estimates import Array
 from hybridlio.core.files import UNREADABLE_NPZ, write_whole
 from hybridlio.core.sensors import ImuSamples
 from hybridlio.graph.model import coordinates as co

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError, GraphError
-from hybridlio.core.estimates import Array
 from hybridlio.graph.formats.g2o import BY_ROWS, ROWS, Row
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.keys import PLAIN_KEYS, Key, from_integer

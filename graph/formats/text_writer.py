@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
-from hybridlio.core.estimates import Array
 from hybridlio.core.files import write_whole
 from hybridlio.graph.formats.g2o import ROWS, format_numbers, information_numbers, pose_numbers
 from hybridlio.graph.model import coordinates as co

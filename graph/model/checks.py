@@ -11,8 +11,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
-from hybridlio.core.estimates import Array
 from hybridlio.core.sensors import ImuNoise
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, named

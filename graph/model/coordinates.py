@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
-from hybridlio.core.estimates import Array
 
 Dimension: TypeAlias = Literal[2, 3]
 

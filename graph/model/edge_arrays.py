@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.core import se3
-from hybridlio.core.estimates import Array
+from hybridlio.core.arrays import Array
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybridlio.core.estimates import Array
+from hybridlio.core.arrays import Array
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.keys import Key
 from hybridlio.graph.model.measurements import Factor, Form, Noise, Robust

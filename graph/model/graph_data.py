@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
-from hybridlio.core.estimates import Array
 from hybridlio.core.geodesy import GeodeticPoint, check_geodetic
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.edge_table import FORMS, EdgeTable, Rows

@@ -13,7 +13,8 @@ from typing import Any, Protocol
 import gtsam
 import numpy as np
 
-from hybridlio.core.estimates import Array, State
+from hybridlio.core.arrays import Array
+from hybridlio.core.estimates import State
 from hybridlio.graph.base import noise
 
 

@@ -14,9 +14,10 @@ import numpy as np
 from gtsam.symbol_shorthand import B, G, M, V, X
 
 from hybridlio.core import se3
-from hybridlio.core.estimates import Array, RelativePose, State
+from hybridlio.core.arrays import Array
+from hybridlio.core.estimates import RelativePose, State
+from hybridlio.core.motion_limits import BRIDGED_ACCELERATION_SIGMA_M_S2, GRAVITY_M_S2, GRAVITY_MAGNITUDE_SIGMA_M_S2
 from hybridlio.core.sensors import NS_PER_S
-from hybridlio.core.start_state import GRAVITY_M_S2, GRAVITY_MAGNITUDE_SIGMA_M_S2
 from hybridlio.graph.base import noise
 from hybridlio.graph.run.scan_numbers import Scans
 
@@ -26,7 +27,6 @@ VARIABLES = (X, V, B, G, M)  # what a scan may have
 
 _GAUGE_SIGMA = 1e-6  # the first pose defines world
 _GRAVITY_CHAIN_SIGMA_M_S2 = 1e-6  # per scan; 0.1 mm/s² after 10,000 scans
-_BRIDGED_ACCELERATION_M_S2 = 3.0
 
 
 def start_factors(state: State) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -138,7 +138,7 @@ def bridge_factors(i: int, j: int, dt_s: float) -> Factors:
     """
     no_change = gtsam.imuBias.ConstantBias()
     bias_sigmas = np.r_[np.full(3, 1e-2), np.full(3, 1e-3)] * np.sqrt(dt_s)
-    velocity_sigmas = np.full(3, _BRIDGED_ACCELERATION_M_S2 * dt_s)
+    velocity_sigmas = np.full(3, BRIDGED_ACCELERATION_SIGMA_M_S2 * dt_s)
     return [
         gtsam.BetweenFactorVector(V(i), V(j), np.zeros(3), noise.sigmas(velocity_sigmas)),
         gtsam.BetweenFactorConstantBias(B(i), B(j), no_change, noise.sigmas(bias_sigmas)),

@@ -23,7 +23,8 @@ from gtsam.symbol_shorthand import A, E, G, P, T, W, X
 from numpy.typing import NDArray
 
 from hybridlio.core import se3
-from hybridlio.core.estimates import Array, State
+from hybridlio.core.arrays import Array
+from hybridlio.core.estimates import State
 from hybridlio.core.pose_interpolation import PosePath
 from hybridlio.core.sensors import NS_PER_S, GpsFix
 from hybridlio.graph.base import noise

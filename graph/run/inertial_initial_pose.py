@@ -7,9 +7,10 @@ import logging
 import numpy as np
 
 from hybridlio.core import se3
-from hybridlio.core.estimates import Array, RelativePose, State
+from hybridlio.core.arrays import Array
+from hybridlio.core.estimates import RelativePose, State
+from hybridlio.core.motion_limits import LARGEST_ACCELERATION_M_S2, LARGEST_RATE_RAD_S
 from hybridlio.core.sensors import NS_PER_S, Frame
-from hybridlio.graph.base.preintegration import LARGEST_ACCELERATION_M_S2, LARGEST_RATE_RAD_S
 from hybridlio.graph.run.inertial_steps import PREINTEGRATION, InertialSteps
 from hybridlio.sources.constant_velocity import ConstantVelocity
 

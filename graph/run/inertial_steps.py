@@ -5,7 +5,8 @@ from __future__ import annotations
 import gtsam
 
 from hybridlio.core import se3
-from hybridlio.core.estimates import Array, RelativePose, State
+from hybridlio.core.arrays import Array
+from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.sensors import Calibration, Frame, ImuNoise, ImuSamples
 from hybridlio.graph.base.preintegration import covers, predict_step, preintegrate
 

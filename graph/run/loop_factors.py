@@ -11,7 +11,8 @@ import gtsam
 from gtsam.symbol_shorthand import X
 
 from hybridlio.core import se3
-from hybridlio.core.estimates import Array, State
+from hybridlio.core.arrays import Array
+from hybridlio.core.estimates import State
 from hybridlio.graph.run.factor_groups import Doubtful, GroupAnswer, GroupFactors
 from hybridlio.record.record import Record
 from hybridlio.smoothing.loop_closure import Loop, LoopSearch, LoopSettings, RejectedLoop, find_loops

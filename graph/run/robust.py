@@ -8,8 +8,9 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError
-from hybridlio.core.estimates import Array, State
+from hybridlio.core.estimates import State
 from hybridlio.graph.base import noise
 from hybridlio.graph.model.measurements import KERNELS, Robust, default_width
 from hybridlio.graph.run.factor_groups import Doubtful, FactorGroup, GroupAnswer, GroupFactors, chi2_of

@@ -12,8 +12,9 @@ from gtsam.symbol_shorthand import B, G, V, X
 from numpy.typing import NDArray
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
-from hybridlio.core.estimates import Array, State
+from hybridlio.core.estimates import State
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.graph.base.isam import reason
 from hybridlio.graph.base.marginals import bayes_tree, pose_covariances

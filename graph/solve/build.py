@@ -9,10 +9,11 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
-from hybridlio.core.estimates import Array, State
+from hybridlio.core.estimates import State
+from hybridlio.core.motion_limits import GRAVITY_M_S2
 from hybridlio.core.sensors import NS_PER_S, ImuNoise
-from hybridlio.core.start_state import GRAVITY_M_S2
 from hybridlio.graph.base.preintegration import preintegrate
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.checks import chains_without_bias

@@ -12,8 +12,8 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 from scipy.special import gammaincinv
 
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
-from hybridlio.core.estimates import Array
 from hybridlio.graph.base.isam import reason
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.checks import components

@@ -13,8 +13,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
-from hybridlio.core.estimates import Array
 from hybridlio.graph.base.isam import reason
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData

@@ -10,8 +10,8 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError, GraphError
-from hybridlio.core.estimates import Array
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.checks import Chain, chains_without_bias, check_determined
 from hybridlio.graph.model.edge_table import Rows

@@ -8,8 +8,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError, GraphError
-from hybridlio.core.estimates import Array
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.checks import check_determined, labels
 from hybridlio.graph.model.edge_arrays import Edges, edges_of

@@ -10,8 +10,8 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
-from hybridlio.core.estimates import Array
 from hybridlio.graph.base.isam import incremental_solver, reason
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData

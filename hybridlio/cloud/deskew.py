@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import NS_PER_S, Scan
 from hybridlio.core.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 _PIECE = 16384  # points at a time, so that the temporaries stay in the processor's cache
 

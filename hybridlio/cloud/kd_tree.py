@@ -10,14 +10,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hybridlio.core.estimates import Array
+from hybridlio.core.arrays import Array, Index
 
 if TYPE_CHECKING:
     import small_gicp
 
-Index = NDArray[np.int64]
 
 _QUERIES_A_THREAD = 2000  # half a millisecond
 _POINTS_A_THREAD = 10_000

@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybridlio.cloud.plane_fitting import LEAST_NEIGHBOURS
 from hybridlio.cloud.voxel import label_means, voxel_labels
+from hybridlio.core.arrays import Floats
 from hybridlio.core.errors import ConfigError
-
-Floats = NDArray[np.float32]
 
 _TABLE_CELLS = 1 << 24
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlio.core.estimates import Array
+from hybridlio.core.arrays import Array
 
 LEAST_NEIGHBOURS = 5  # that make a plane; small_gicp, too, fits none to fewer
 _THIN_M = 0.15  # so thick a plane counts half

@@ -10,18 +10,16 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridlio.cloud.deskew import deskew
 from hybridlio.cloud.ground import GroundOptions, GroundPlane, find_ground
 from hybridlio.cloud.normals import estimate_normals
 from hybridlio.cloud.projection import MAP_GEOMETRIES, MapGeometry, normal_map, vertex_map
 from hybridlio.cloud.voxel import VoxelCloud, voxel_average, voxel_to_count
+from hybridlio.core.arrays import Floats
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.sensors import Scan
 from hybridlio.core.trajectory import Trajectory
-
-Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

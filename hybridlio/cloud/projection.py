@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Floats
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.sensors import LIDAR_MODELS, LidarModel
-
-Floats = NDArray[np.float32]
 
 _EMPTY = np.iinfo(np.uint64).max
 _PIECE = 16384

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from hybridlio.core import se3
-from hybridlio.core.estimates import Array
+from hybridlio.core.arrays import Array
+from hybridlio.core.motion_limits import SWEEP_RATE_SIGMA_RAD_S
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise
 from hybridlio.core.trajectory import Trajectory
 
 _FEWEST_SAMPLES = 2
-_RATE_SIGMA_RAD_S = 0.02  # of a car on its springs, about its mean rate over a step
 
 
 def sweep_motion(sweep: Frame, step: Trajectory, gyro_bias_rad_s: Array, calibration: Calibration) -> Trajectory:
@@ -53,6 +53,6 @@ def compensation_noise(sweep: Frame, noise: ImuNoise) -> Array:
     assert offsets_ns is not None
     sweep_s = float(np.ptp(offsets_ns)) / NS_PER_S if len(offsets_ns) else 0.0
     by_gyro = len(sweep.sweep_imu) >= _FEWEST_SAMPLES
-    spread = noise.gyro_rad_s_sqrt_hz**2 * sweep_s if by_gyro else (_RATE_SIGMA_RAD_S * sweep_s) ** 2
+    spread = noise.gyro_rad_s_sqrt_hz**2 * sweep_s if by_gyro else (SWEEP_RATE_SIGMA_RAD_S * sweep_s) ** 2
     both_scans = 2 * spread / 12
     return np.diag(np.r_[np.full(3, both_scans), np.zeros(3)])

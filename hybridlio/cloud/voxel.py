@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybridlio.core.arrays import Floats
 from hybridlio.core.errors import ConfigError, DataError
-
-Floats = NDArray[np.float32]
 
 _DENSE_CELLS = 1 << 23  # up to so many, a table of all cells beats sorting the occupied ones
 _FINEST_M, _COARSEST_M = 1e-3, 1e5

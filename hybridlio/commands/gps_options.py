@@ -9,7 +9,7 @@ import typer
 from hybridlio.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from hybridlio.core.estimates import Array
+    from hybridlio.core.arrays import Array
     from hybridlio.smoothing.gps_options import GpsOptions
 
 Antenna = Annotated[

@@ -11,13 +11,11 @@ from dataclasses import dataclass, field, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import Frame
-
-Array = NDArray[np.float64]
 
 
 def check_covariance(covariance: Array, name: str, size: int = 6) -> Array:

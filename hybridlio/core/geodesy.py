@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 
-Array = NDArray[np.float64]
+EARTH_RADIUS_M = 6378137.0  # equatorial, WGS 84; KITTI's Mercator projection uses it
 
 
 class GeodeticPoint(NamedTuple):

@@ -7,9 +7,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.sensors import NS_PER_S
-
-Array = NDArray[np.float64]
 
 _NEAR_NS = NS_PER_S // 100  # velocities are those over so long to either side
 

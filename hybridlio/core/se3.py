@@ -9,12 +9,11 @@ Formulas: Solà, Deray, Atchuthan, "A micro Lie theory for state estimation in r
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
-
-Array = NDArray[np.float64]
 
 _EYE, _LAST = np.eye(3), [0.0, 0.0, 0.0, 1.0]
 _SMALL_ANGLE_RAD = 1e-4  # below it the closed forms lose digits and the series are exact to 1e-17

@@ -10,13 +10,10 @@ import numpy as np
 
 from hybridlio.core.errors import DataError
 from hybridlio.core.estimates import State
+from hybridlio.core.motion_limits import GRAVITY_M_S2, MEAN_ACCELERATION_SIGMA_M_S2, UNKNOWN_SPEED_SIGMA_M_S
 from hybridlio.core.sensors import ImuNoise, ImuSamples
 
-GRAVITY_M_S2 = 9.81
 _LEAST_FORCE_M_S2 = 1e-3  # less than any accelerometer's own error: there is none
-GRAVITY_MAGNITUDE_SIGMA_M_S2 = 0.03  # 9.78 at the equator, 9.83 at the poles
-_UNKNOWN_ACCELERATION_SIGMA_M_S2 = 1.5  # braking, cornering: what the mean specific force may be off by
-_UNKNOWN_SPEED_SIGMA_M_S = 20.0
 
 
 def start_state(stamp_ns: int, imu: ImuSamples, noise: ImuNoise) -> State:
@@ -34,7 +31,7 @@ def start_state(stamp_ns: int, imu: ImuSamples, noise: ImuNoise) -> State:
         The state, at the origin, with speed and biases zero and gravity opposite to the mean specific force, as unsure
         every way as the vehicle's own acceleration; that its magnitude is known is for the graph to add.
     """
-    speed = np.full(3, _UNKNOWN_SPEED_SIGMA_M_S)
+    speed = np.full(3, UNKNOWN_SPEED_SIGMA_M_S)
     biases = np.r_[np.full(3, noise.accel_bias_sigma_m_s2), np.full(3, noise.gyro_bias_sigma_rad_s)]
     covariance = np.diag(np.r_[np.full(6, 1e-6), speed, biases] ** 2)
     zero = np.zeros(3)
@@ -50,5 +47,5 @@ def start_state(stamp_ns: int, imu: ImuSamples, noise: ImuNoise) -> State:
         )
     gravity = -GRAVITY_M_S2 * mean_force / magnitude
     standard_error = imu.accel_m_s2.std(axis=0).max() / np.sqrt(len(imu))
-    gravity_covariance = np.eye(3) * (_UNKNOWN_ACCELERATION_SIGMA_M_S2**2 + standard_error**2)
+    gravity_covariance = np.eye(3) * (MEAN_ACCELERATION_SIGMA_M_S2**2 + standard_error**2)
     return State(stamp_ns, np.eye(4), zero, zero, zero, gravity, covariance, gravity_covariance)

@@ -16,12 +16,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.files import write_whole
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.trajectory import Trajectory
 
-Array = NDArray[np.float64]
 PathLike = str | os.PathLike[str]
 
 KITTI_PERIOD_NS = NS_PER_S // 10

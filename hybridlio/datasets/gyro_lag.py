@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+from hybridlio.core.arrays import Array
 
 _STEP_S = 0.1  # attitudes this far apart: long enough for the rates to show above the attitudes' noise
 _GRID_S = np.arange(0.0, 0.121, 0.01)

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import Scan
-
-Array = NDArray[np.float64]
 
 
 def read_calibration(path: Path) -> dict[str, Array]:

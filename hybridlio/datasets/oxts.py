@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
+from hybridlio.core.geodesy import EARTH_RADIUS_M
 from hybridlio.core.sensors import ImuSamples
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.gyro_lag import gyro_lag_ns
@@ -23,12 +25,9 @@ from hybridlio.datasets.reference import poses_at
 from hybridlio.datasets.sequence import Notes
 from hybridlio.datasets.stamps import MISSING_STAMP, note_gaps, read_stamps, sorted_unique
 
-Array = NDArray[np.float64]
-
 COLUMNS = 30
 _LAT, _LON, _ALT, _FORWARD = 0, 1, 2, 8
 _ATTITUDE, _ACCEL, _GYRO = slice(3, 6), slice(11, 14), slice(17, 20)  # roll pitch yaw; forward left up
-_EARTH_RADIUS_M = 6378137.0
 _SLOW_NS = 20_000_000
 
 
@@ -74,7 +73,7 @@ class OxtsRows:
     def T_enu_imu(self) -> Array:
         """Poses ``(R, 4, 4)``, east-north-up with its origin at the first row's position."""
         lat, lon = self.values[:, _LAT], self.values[:, _LON]
-        scale_m = _EARTH_RADIUS_M * np.cos(np.radians(lat[0]))
+        scale_m = EARTH_RADIUS_M * np.cos(np.radians(lat[0]))
         east, north = scale_m * np.radians(lon), scale_m * np.log(np.tan(np.pi / 4 + np.radians(lat) / 2))
         position = np.column_stack([east, north, self.values[:, _ALT]])
         attitude = Rotation.from_euler("ZYX", self.values[:, _ATTITUDE][:, ::-1]).as_matrix()

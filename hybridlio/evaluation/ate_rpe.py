@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError, DataError, EstimationError
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.trajectory import Trajectory
 
-Array = NDArray[np.float64]
 Alignment = Literal["se3", "sim3", "first", "none"]
 DeltaUnit = Literal["frames", "seconds", "metres"]
 

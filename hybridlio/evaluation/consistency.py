@@ -9,13 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 PROBABILITY = 0.95
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.trajectory import Trajectory
@@ -53,7 +54,6 @@ __all__ = [
     "step_errors",
 ]
 
-Array = NDArray[np.float64]
 
 _FRAMES_DIFFER_DEG = 20.0
 

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 from numpy.typing import NDArray
 
+from hybridlio.core.arrays import Array
 from hybridlio.evaluation.consistency import Anees, PoseConsistency, bounds
 from hybridlio.evaluation.drift import Drift, DriftAverage
 from hybridlio.evaluation.report_data import DrawnPath
@@ -22,7 +23,6 @@ from hybridlio.evaluation.report_data import DrawnPath
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Array = NDArray[np.float64]
 
 REFERENCE = "#444444"
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#000000")

@@ -8,14 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.evaluation.ate_rpe import Association, align, associate
 from hybridlio.evaluation.consistency import PoseConsistency
 from hybridlio.evaluation.evaluate import Evaluation, Steps, associated_step_errors, evaluate
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,13 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from hybridlio.core.estimates import Backend, State
+from hybridlio.core.motion_limits import BRIDGED_ACCELERATION_SIGMA_M_S2
 from hybridlio.core.sensors import NS_PER_S, Frame, ImuSamples, Scan
 from hybridlio.core.start_state import start_state
 from hybridlio.record.record import Record
 
 _log = logging.getLogger(__name__)
-
-_ACCELERATION_M_S2 = 3.0  # by which the speed at a step's end may differ from the mean speed in it
 
 
 def take_up_imu(backend: Backend, record: Record, frame: Frame, state: State) -> tuple[State, State]:
@@ -52,6 +51,6 @@ def _with_speed(now: State, before: State) -> State:
     dt_s = (now.stamp_ns - before.stamp_ns) / NS_PER_S
     covariance = now.covariance.copy()
     covariance[6:9] = covariance[:, 6:9] = 0.0
-    covariance[6:9, 6:9] = np.eye(3) * (_ACCELERATION_M_S2 * dt_s) ** 2
+    covariance[6:9, 6:9] = np.eye(3) * (BRIDGED_ACCELERATION_SIGMA_M_S2 * dt_s) ** 2
     velocity = (now.T_world_imu[:3, 3] - before.T_world_imu[:3, 3]) / dt_s
     return replace(now, velocity_m_s=velocity, covariance=covariance)

@@ -12,8 +12,9 @@ import numpy as np
 from hybridlio.cloud.deskew import constant_twist, deskew
 from hybridlio.cloud.sweep import compensation_noise, sweep_motion
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError, DataError, EstimationError
-from hybridlio.core.estimates import Array, Backend, InitialPoseSource, RelativePose, ResidualSource, State, TakesBack
+from hybridlio.core.estimates import Backend, InitialPoseSource, RelativePose, ResidualSource, State, TakesBack
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples
 from hybridlio.core.setting_checks import above_0
 from hybridlio.core.start_state import start_state

@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING
 from hybridlio.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:  # the command line lists the names, and must start quickly
+    from hybridlio.cloud.preparation import PreparationOptions
     from hybridlio.core.estimates import Backend, InitialPoseSource, ResidualSource
     from hybridlio.core.sensors import Calibration, ImuNoise
     from hybridlio.graph.run.inertial_steps import InertialSteps
+    from hybridlio.learned.settings import Recipe
     from hybridlio.learned.sources.network_residual import NetworkResidual
     from hybridlio.odometry.config import Config
     from hybridlio.sources.recent_scans import PairSource
@@ -79,7 +81,6 @@ def _scan_matching(setup: Setup) -> ResidualSource:
 def _network_alone(setup: Setup) -> NetworkResidual:
     from hybridlio.cloud.preparation import prepare
     from hybridlio.learned.sources.network_residual import NetworkResidual
-    from hybridlio.runs.recipes import preparation_for
 
     return NetworkResidual(lambda recipe: partial(prepare, options=preparation_for(recipe)), setup.config.network)
 
@@ -101,7 +102,7 @@ def _network_then_scan_matching(setup: Setup) -> ResidualSource:
 
 
 def _no_residual(_: Setup) -> ResidualSource:
-    from hybridlio.sources.constant_velocity import NoResidual
+    from hybridlio.sources.residual_chain import NoResidual
 
     return NoResidual()
 
@@ -191,3 +192,10 @@ def check_names(initial_pose: object, residual: object, backend: object) -> None
     for kind, choice, known in seams:
         if isinstance(choice, str) and choice not in known:
             raise ConfigError(f"unknown {kind} {choice!r}; choose one of {', '.join(known)}")
+
+
+def preparation_for(recipe: Recipe) -> PreparationOptions:
+    """How scans are prepared for a network and its loss."""
+    from hybridlio.cloud.preparation import PreparationOptions
+
+    return PreparationOptions(geometry=recipe.network.geometry, remove_ground=not recipe.loss.keep_ground)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.sensors import NS_PER_S, Calibration, GpsFix, ImuNoise, ImuSamples
@@ -13,8 +14,6 @@ from hybridlio.core.start_state import start_state
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.record.odometry_noise import odometry_noise
 from hybridlio.record.record import Record
-
-Array = NDArray[np.float64]
 
 _SOURCE = "odometry"
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.cloud.voxel import voxel_average
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
-from hybridlio.core.estimates import Array
 from hybridlio.core.files import UNREADABLE_NPZ, writing_whole
 from hybridlio.core.packed_arrays import PackedCloud
 from hybridlio.core.sensors import Scan

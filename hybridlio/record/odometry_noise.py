@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.pose_interpolation import PosePath
 from hybridlio.core.sensors import NS_PER_S, Calibration, ImuSamples
 from hybridlio.core.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 # Lidar odometry is off by half a per cent after 100 m; that grows with the root of the way.
 DRIFT_M_SQRT_M = 0.05

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from hybridlio.core.errors import DataError
 from hybridlio.core.estimates import RelativePose, State
@@ -18,8 +18,6 @@ from hybridlio.core.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.record.keyframes import Keyframes
 from hybridlio.record.step_arrays import keyframe_arrays, relative_arrays, relatives, with_keyframes
-
-Array = NDArray[np.float64]
 
 FORMAT_VERSION = 2
 _READABLE = (1, 2)  # the first had no poses relative to keyframes

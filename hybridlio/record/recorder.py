@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hybridlio.core.estimates import Array, RelativePose, State
+from hybridlio.core.arrays import Array
+from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.packed_arrays import PackedArray, packed, unpacked
 from hybridlio.core.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.core.trajectory import Trajectory

@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.cloud.voxel import voxel_labels
-from hybridlio.core.estimates import Array
+from hybridlio.core.arrays import Array, Index
 
-Index = NDArray[np.intp]
 Keys = NDArray[np.int64]
 
 _BITS = 21  # of a cell's place along an axis

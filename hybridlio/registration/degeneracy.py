@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.core import se3
-from hybridlio.core.estimates import Array
+from hybridlio.core.arrays import Array
 from hybridlio.registration.icp import Registration, RegistrationSettings, register
 from hybridlio.registration.information import UNKNOWN_SIGMA_M, covariance_of, weak_basis
 from hybridlio.registration.surface import Surface

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridlio.core import se3
-from hybridlio.core.estimates import Array
+from hybridlio.core.arrays import Array
 from hybridlio.core.setting_checks import above_0
 from hybridlio.registration.information import newton_step
 from hybridlio.registration.point_to_point import MixedMatches, MixedNeighbours

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hybridlio.core.arrays import Array
+from hybridlio.core.motion_limits import MEASUREMENT_FLOOR_SIGMAS
 
 
 class NormalNoise(NamedTuple):
@@ -29,7 +30,6 @@ class NormalNoise(NamedTuple):
 
 NORMAL_NOISE = NormalNoise(2e-3, 8e-3)
 NORMAL_NOISE_OF_THIN = NormalNoise(1.2e-3, 8e-3)  # where planes count the less the thicker they are
-FLOOR_SIGMAS = np.r_[np.full(3, 5e-5), np.full(3, 1e-3)]  # rad, m: no single step is known better
 UNKNOWN_SIGMA_M = 10.0
 _HALF = 0.5  # an eigenvector lies in what is held, or at a right angle to it
 
@@ -84,7 +84,7 @@ def covariance_of(
     scale: float,
     levers_m: Array | None = None,
     normal_noise: float = NORMAL_NOISE.mean,
-    floor_sigmas: Array = FLOOR_SIGMAS,
+    floor_sigmas: Array = MEASUREMENT_FLOOR_SIGMAS,
     held: Array | None = None,
 ) -> Array:
     """``scale·σ²·H⁻¹`` ``(6, 6)``, rad² and m², rotation first; 10 m where the matches say nothing.

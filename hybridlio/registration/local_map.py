@@ -8,7 +8,7 @@ import numpy as np
 
 from hybridlio.cloud.plane_fitting import LEAST_NEIGHBOURS
 from hybridlio.core import se3
-from hybridlio.core.estimates import Array
+from hybridlio.core.arrays import Array
 from hybridlio.core.setting_checks import above_0, expect
 from hybridlio.registration.surface import Surface
 from hybridlio.registration.voxel_map import MapCells

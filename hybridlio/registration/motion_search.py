@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 
 from hybridlio.core import se3
-from hybridlio.core.estimates import Array
+from hybridlio.core.arrays import Array
 from hybridlio.registration.icp import Fit, RegistrationSettings, fit_at, register
 from hybridlio.registration.surface import Surface
 

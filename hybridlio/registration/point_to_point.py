@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridlio.core.estimates import Array
+from hybridlio.core.arrays import Array
 from hybridlio.registration.information import lever_arms
 from hybridlio.registration.surface import Matches, Neighbours, System
 

@@ -7,13 +7,10 @@ plane, and without it little tells the pitch. The next keyframes' rings lie betw
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridlio.cloud.kd_tree import build_tree, threads_for
 from hybridlio.cloud.plane_fitting import LEAST_NEIGHBOURS, Fitted, fit_planes
-from hybridlio.core.estimates import Array
-
-Index = NDArray[np.intp]
+from hybridlio.core.arrays import Array, Index
 
 _KEYFRAMES = 5
 _NEIGHBOURS = 15

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.cloud.kd_tree import PointTree
-from hybridlio.core.estimates import Array
+from hybridlio.core.arrays import Array
 from hybridlio.registration.information import NORMAL_NOISE, NORMAL_NOISE_OF_THIN, lever_arms
 
 

@@ -12,12 +12,10 @@ from numpy.typing import NDArray
 from hybridlio.cloud.kd_tree import build_tree, threads_for
 from hybridlio.cloud.plane_fitting import LEAST_NEIGHBOURS, Fitted, Planes, fit_planes, of_several_rings
 from hybridlio.core import se3
-from hybridlio.core.estimates import Array
+from hybridlio.core.arrays import Array, Index
 from hybridlio.registration.cell_table import CellTable, cells_of
 from hybridlio.registration.ring_planes import LoosePoints
 from hybridlio.registration.surface import Surface
-
-Index = NDArray[np.intp]
 
 MOST = 10  # points a cell
 _APART_M = 0.1

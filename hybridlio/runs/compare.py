@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybridlio.core import tables
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
-from hybridlio.core.estimates import Array
 from hybridlio.core.files import write_whole
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.evaluation.evaluate import Evaluation, associate, associated_step_errors, evaluate

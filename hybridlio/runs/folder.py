@@ -22,12 +22,12 @@ from numpy.typing import ArrayLike, NDArray
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.files import UNREADABLE_NPZ, write_whole, writing_whole
+from hybridlio.core.motion_limits import unknown_motion_covariance
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.core.trajectory_files import read_tum, write_kitti, write_tum
 from hybridlio.evaluation.ate_rpe import select
 from hybridlio.evaluation.evaluate import Steps
-from hybridlio.sources.constant_velocity import unknown_motion_covariance
 
 _log = logging.getLogger(__name__)
 

@@ -8,7 +8,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hybridlio.cloud.preparation import PreparationOptions
 from hybridlio.cloud.projection import map_geometry
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.files import read_yaml
@@ -83,11 +82,6 @@ def recipe_for(
     if epochs is not None:
         recipe = replace(recipe, optimiser=replace(recipe.optimiser, epochs=epochs))
     return recipe
-
-
-def preparation_for(recipe: Recipe) -> PreparationOptions:
-    """How scans are prepared for a network and its loss."""
-    return PreparationOptions(geometry=recipe.network.geometry, remove_ground=not recipe.loss.keep_ground)
 
 
 def lasting(recipe: Recipe, steps: int, pairs: int) -> Recipe:

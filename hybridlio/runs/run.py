@@ -11,8 +11,8 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
-from hybridlio.core.estimates import Array
 from hybridlio.core.packed_arrays import PackedList
 from hybridlio.core.sensors import NS_PER_S, Frame
 from hybridlio.core.trajectory import Trajectory

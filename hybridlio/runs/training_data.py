@@ -22,8 +22,10 @@ import numpy as np
 
 from hybridlio.cloud.deskew import constant_twist, deskew
 from hybridlio.cloud.preparation import prepare
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError, DataError
-from hybridlio.core.estimates import Array, RelativePose
+from hybridlio.core.estimates import RelativePose
+from hybridlio.core.motion_limits import UNKNOWN_TRANSLATION_SIGMA_M
 from hybridlio.core.sensors import Scan
 from hybridlio.datasets.registry import check_options, open_sequence, sequence_names
 from hybridlio.datasets.sequence import Sequence
@@ -34,14 +36,14 @@ from hybridlio.learned.presets import split as sequences_of
 from hybridlio.learned.settings import NetworkSettings, Recipe
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.odometry import Odometry
-from hybridlio.runs.recipes import LSTM, preparation_for
+from hybridlio.odometry.registry import preparation_for
+from hybridlio.runs.recipes import LSTM
 from hybridlio.runs.run import run_odometry
 
 Progress = Callable[[str, int, int], None]
 
 _VERSION = 2  # of what is put into shards; another one prepares recordings anew
 _SCANS_IN_DIGEST = 16  # with all, a long recording would be read twice
-_UNSURE_TRANSLATION_M = 0.5  # an initial pose as unsure as this is none
 _UNSURE_STEP_M = 0.05  # a step that scans tell no better gives no velocity
 
 
@@ -252,7 +254,7 @@ def _odometry(
     return initial, steps, sure
 
 
-def _sure(pose: RelativePose, limit_m: float = _UNSURE_TRANSLATION_M) -> bool:
+def _sure(pose: RelativePose, limit_m: float = UNKNOWN_TRANSLATION_SIGMA_M) -> bool:
     return pose.ok and pose.translation_sigma_m <= limit_m
 
 

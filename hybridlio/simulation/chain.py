@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import KeyframePose, RelativePose, State
+from hybridlio.core.motion_limits import GRAVITY_MAGNITUDE_SIGMA_M_S2
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples, Scan
-from hybridlio.core.start_state import GRAVITY_MAGNITUDE_SIGMA_M_S2, start_state
+from hybridlio.core.start_state import start_state
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.record.record import Record
 from hybridlio.simulation.drive.path import SmoothPath
-from hybridlio.simulation.rig import GRAVITY_M_S2
+from hybridlio.simulation.rig import GRAVITY_WORLD_M_S2
 from hybridlio.simulation.sensors.imu import ideal_imu
-
-Array = NDArray[np.float64]
 
 START_NS = 1_700_000_000_000_000_000
 NOISE = ImuNoise()
@@ -151,7 +151,7 @@ def _inertial(
     # gravity's magnitude differs from place to place, as the start-up's prior says
     gravity = np.array([0.0, 0.0, -9.81 + GRAVITY_MAGNITUDE_SIGMA_M_S2 * rng.standard_normal()])
     R_imu = path.motion(times).poses[:, :3, :3]
-    accel = accel + np.einsum("nji,j->ni", R_imu, GRAVITY_M_S2 - gravity)
+    accel = accel + np.einsum("nji,j->ni", R_imu, GRAVITY_WORLD_M_S2 - gravity)
     stamps = START_NS + np.round(times * NS_PER_S).astype(np.int64)
     return ImuSamples(stamps, gyro, accel), gyro_bias, accel_bias, gravity
 

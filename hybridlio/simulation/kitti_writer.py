@@ -12,17 +12,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.files import write_whole
-from hybridlio.core.geodesy import GeodeticPoint
+from hybridlio.core.geodesy import EARTH_RADIUS_M, GeodeticPoint
 from hybridlio.core.sensors import Scan
 from hybridlio.simulation.drive.path import Motion
 from hybridlio.simulation.rig import T_CAMERA_LIDAR, T_LIDAR_IMU
 
-Array = NDArray[np.float64]
-
 DATE = "2026_01_01"
 START_NS = int(datetime.datetime(2026, 1, 1, 12, tzinfo=datetime.UTC).timestamp()) * 1_000_000_000
-_EARTH_RADIUS_M = 6378137.0
 FIRST_PLACE = GeodeticPoint(49.0, 8.4, 110.0)  # of the first row
 
 
@@ -83,7 +81,7 @@ def oxts_rows(motion: Motion, origin_m: Array, gyro_rad_s: Array, accel_m_s2: Ar
     R = motion.poses[:, :3, :3]
     yaw, pitch, roll = Rotation.from_matrix(R).as_euler("ZYX").T
     east, north, up = (motion.poses[:, :3, 3] - origin_m).T
-    scale = _EARTH_RADIUS_M * np.cos(np.radians(FIRST_PLACE.latitude_deg))
+    scale = EARTH_RADIUS_M * np.cos(np.radians(FIRST_PLACE.latitude_deg))
     mercator = np.log(np.tan(np.pi / 4 + np.radians(FIRST_PLACE.latitude_deg) / 2)) + north / scale
     latitude = np.degrees(2 * np.arctan(np.exp(mercator)) - np.pi / 2)
     longitude = FIRST_PLACE.longitude_deg + np.degrees(east / scale)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
+from hybridlio.core.arrays import Array
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.drive.path import SmoothPath
 from hybridlio.simulation.drive.pose_files import path_along, read_lidar_poses
@@ -21,8 +21,6 @@ from hybridlio.simulation.world.ground import CAMBER, Ground, Height, land_along
 from hybridlio.simulation.world.layout import lay_out
 from hybridlio.simulation.world.roads import LANE_OFFSET_M, MANNERS, STEP_M, Road, drive, generate_centreline
 from hybridlio.simulation.world.world import World
-
-Array = NDArray[np.float64]
 
 DEFAULT_SECONDS = 60.0
 _MARGIN_S = 1.0

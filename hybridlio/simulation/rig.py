@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
+from hybridlio.core.motion_limits import GRAVITY_M_S2
 
-Array = NDArray[np.float64]
-
-GRAVITY_M_S2: Final = np.array([0.0, 0.0, -9.81])
+GRAVITY_WORLD_M_S2: Final = np.array([0.0, 0.0, -GRAVITY_M_S2])
 """Gravity in the world frame (x east, y north, z up)."""
 
 IMU_RATE_HZ: Final = 100

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.files import write_whole
 from hybridlio.core.geodesy import GeodeticPoint, geodetic_from_enu
@@ -25,7 +25,6 @@ from hybridlio.smoothing.gps_alignment import MAX_SHIFT_S, FixAlignment, align_f
 if TYPE_CHECKING:
     from hybridlio.record.record import Record
 
-Array = NDArray[np.float64]
 
 POSES_ENU, TABLE, MAP = "poses_enu_tum.txt", "georeferenced.csv", "georeferenced.geojson"
 _LEVEL_SIGMA_RAD, _GRAVITY_SIGMA_RAD = 0.1, 0.01

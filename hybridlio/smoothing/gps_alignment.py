@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import EstimationError
 from hybridlio.core.pose_interpolation import PosePath
 from hybridlio.core.sensors import NS_PER_S, GpsFix
-
-Array = NDArray[np.float64]
 
 MAX_SHIFT_S = 2.0
 _LEAST_FIXES = 3

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridlio.core.arrays import Array
 from hybridlio.core.setting_checks import expect, from_0
 from hybridlio.smoothing.gps_alignment import MAX_SHIFT_S
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,15 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridlio.core import se3
-from hybridlio.core.estimates import Array
+from hybridlio.core.arrays import Array, Index
 from hybridlio.core.setting_checks import above_0, from_0, shares
 from hybridlio.smoothing.place_recognition import DescriptorSettings, compare, describe, ring_key, spectrum
 from hybridlio.smoothing.step_uncertainty import OdometryChain
-
-Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array, Index
 from hybridlio.core.errors import DataError
-from hybridlio.core.estimates import Array, RelativePose
+from hybridlio.core.estimates import RelativePose
 from hybridlio.record.keyframes import Keyframes
 from hybridlio.record.record import Record
 from hybridlio.smoothing.loop_candidates import Candidate, CandidateFinder, CandidateSettings
@@ -29,7 +30,7 @@ from hybridlio.smoothing.loop_consistency import (
     witnessed,
 )
 from hybridlio.smoothing.loop_verification import Verdict, VerificationSettings, Verifier
-from hybridlio.smoothing.step_uncertainty import Index, OdometryChain
+from hybridlio.smoothing.step_uncertainty import OdometryChain
 
 Progress = Callable[[str, int, int], None]
 

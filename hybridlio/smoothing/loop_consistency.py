@@ -10,15 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
 from hybridlio.core import se3
-from hybridlio.core.estimates import Array
+from hybridlio.core.arrays import Array, Index, Mask
 from hybridlio.core.setting_checks import above_0, expect, from_0
-from hybridlio.smoothing.step_uncertainty import Index, OdometryChain
-
-Flags = NDArray[np.bool_]
+from hybridlio.smoothing.step_uncertainty import OdometryChain
 
 
 @dataclass(frozen=True)
@@ -105,7 +102,7 @@ def _chi2(errors: Array, covariances: Array) -> Array:
     return np.asarray(np.einsum("ni,ni->n", errors, np.linalg.solve(covariances, errors[..., None])[..., 0]))
 
 
-def witnessed(loops: MeasuredLoops, agree: Flags, travelled_m: Array, settings: ConsistencySettings) -> Flags:
+def witnessed(loops: MeasuredLoops, agree: Mask, travelled_m: Array, settings: ConsistencySettings) -> Mask:
     """``(M,)``: which loops have another one nearby that agrees with them."""
     gaps = [np.abs(np.subtract.outer(travelled_m[rows], travelled_m[rows])) for rows in (loops.earlier, loops.later)]
     farther = np.maximum(*gaps)
@@ -113,7 +110,7 @@ def witnessed(loops: MeasuredLoops, agree: Flags, travelled_m: Array, settings: 
     return np.asarray((near & agree).any(axis=1))
 
 
-def largest_agreeing(agree: Flags) -> Flags:
+def largest_agreeing(agree: Mask) -> Mask:
     """``(M,)``: loops which all agree with one another: the largest of the sets grown from the likeliest ones."""
     agree = agree & ~np.eye(len(agree), dtype=bool)
     best = np.zeros(len(agree), bool)
@@ -123,7 +120,7 @@ def largest_agreeing(agree: Flags) -> Flags:
     return best
 
 
-def _grow(agree: Flags, start: int) -> Flags:
+def _grow(agree: Mask, start: int) -> Mask:
     """Add, while there is any, the loop that agrees with all so far and with most of the others that do."""
     taken = np.zeros(len(agree), bool)
     taken[start] = True

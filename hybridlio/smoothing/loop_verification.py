@@ -18,13 +18,13 @@ import small_gicp
 from hybridlio.cloud.plane_fitting import LEAST_NEIGHBOURS
 from hybridlio.cloud.voxel import voxel_average, voxel_pick
 from hybridlio.core import se3
-from hybridlio.core.estimates import Array
+from hybridlio.core.arrays import Array, Index
 from hybridlio.core.setting_checks import above_0, expect, from_0, shares
 from hybridlio.record.keyframes import Keyframes
 from hybridlio.registration.icp import Registration, RegistrationSettings, fit_at, register
 from hybridlio.registration.information import NORMAL_NOISE, covariance_of, degenerate_directions
 from hybridlio.registration.surface import Surface
-from hybridlio.smoothing.step_uncertainty import Index, OdometryChain
+from hybridlio.smoothing.step_uncertainty import OdometryChain
 
 
 def _registration() -> RegistrationSettings:

@@ -13,10 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlio.core.estimates import Array
+from hybridlio.core.arrays import Array, Floats
 from hybridlio.core.setting_checks import above_0, expect
-
-Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

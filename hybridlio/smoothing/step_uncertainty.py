@@ -7,13 +7,11 @@ sum up to one scan less that up to another is the uncertainty between them, what
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridlio.core import se3
-from hybridlio.core.estimates import Array, RelativePose
+from hybridlio.core.arrays import Array, Index
+from hybridlio.core.estimates import RelativePose
 from hybridlio.record.record import Record
-
-Index = NDArray[np.int64]
 
 
 class OdometryChain:

@@ -14,10 +14,10 @@ from dataclasses import replace
 import numpy as np
 
 from hybridlio.core import se3
-from hybridlio.core.estimates import Array, RelativePose, State
+from hybridlio.core.arrays import Array
+from hybridlio.core.estimates import RelativePose, State
+from hybridlio.core.motion_limits import ACCELERATION_SIGMA_M_S2
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame
-
-_ACCELERATION_SIGMA_M_S2 = 2.0  # what a road vehicle does: the speed at a step's end is not its mean speed
 
 
 class DeadReckoning:
@@ -75,7 +75,7 @@ class DeadReckoning:
         by_path[6:, :3] = -R_world_imu @ step[:3, :3].T @ se3.hat(step[:3, 3]) / dt_s
         by_step[6:, 3:] = R_world_imu / dt_s
         total = by_path @ path @ by_path.T + by_step @ (along + beside) @ by_step.T
-        total[6:, 6:] += by_step[6:] @ before @ by_step[6:].T + np.eye(3) * (_ACCELERATION_SIGMA_M_S2 * dt_s / 2) ** 2
+        total[6:, 6:] += by_step[6:] @ before @ by_step[6:].T + np.eye(3) * (ACCELERATION_SIGMA_M_S2 * dt_s / 2) ** 2
         return np.asarray((total + total.T) / 2)
 
 

@@ -13,7 +13,9 @@ from typing import Literal
 import numpy as np
 
 from hybridlio.core import se3
-from hybridlio.core.estimates import Array, RelativePose
+from hybridlio.core.arrays import Array
+from hybridlio.core.estimates import RelativePose
+from hybridlio.core.motion_limits import UNKNOWN_TRANSLATION_SIGMA_M
 
 Verdict = Literal["untested", "agrees", "down-weighted", "rejected", "relocated", "trusted again"]
 
@@ -21,7 +23,6 @@ GATE = 27.86  # χ², six degrees of freedom: one in ten thousand lies above
 GROSS = 10 * GATE  # no covariance that is only somewhat too small explains this
 MOST_REJECTED = 5  # in a row; then it may be the IMU that is wrong
 START_STEPS = 10  # speed, tilt and biases are still being found from the scans
-_UNSURE_TRANSLATION_M = 0.5  # an IMU of unknown speed is no witness
 
 
 @dataclass(frozen=True)
@@ -123,4 +124,4 @@ class Witness:
 def _comparable(measured: RelativePose, predicted: RelativePose | None) -> bool:
     if predicted is None or not predicted.ok or not measured.ok or measured.from_imu:
         return False
-    return predicted.translation_sigma_m <= _UNSURE_TRANSLATION_M
+    return predicted.translation_sigma_m <= UNKNOWN_TRANSLATION_SIGMA_M

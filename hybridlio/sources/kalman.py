@@ -7,13 +7,20 @@ from filterpy.kalman import KalmanFilter
 
 from hybridlio.core import se3
 from hybridlio.core.estimates import RelativePose, State
+from hybridlio.core.motion_limits import (
+    ACCELERATION_SIGMA_M_S2,
+    ANGULAR_ACCELERATION_SIGMA_RAD_S2,
+    JERK_SIGMA_M_S3,
+    UNKNOWN_RATE_SIGMA_RAD_S,
+    UNKNOWN_SPEED_SIGMA_M_S,
+)
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise
 
 # State, lidar frame: velocity, acceleration, angular velocity, gyroscope bias; three numbers each.
 _V, _A, _W, _B = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
-_START_SIGMAS = np.r_[np.full(3, 20.0), np.full(3, 2.0), np.full(3, 0.3)]  # m/s, m/s², rad/s
-_JERK_M_S3 = 5.0
-_ANGULAR_ACCELERATION_RAD_S2 = 0.5
+_START_SIGMAS = np.r_[
+    np.full(3, UNKNOWN_SPEED_SIGMA_M_S), np.full(3, ACCELERATION_SIGMA_M_S2), np.full(3, UNKNOWN_RATE_SIGMA_RAD_S)
+]
 
 
 class Kalman:
@@ -34,8 +41,8 @@ class Kalman:
         self._stamp_ns = state.stamp_ns
         F, Q = np.eye(12), np.zeros((12, 12))
         F[_V, _A] = np.eye(3) * dt_s
-        Q[_A, _A] = np.eye(3) * (_JERK_M_S3 * dt_s) ** 2
-        Q[_W, _W] = np.eye(3) * (_ANGULAR_ACCELERATION_RAD_S2 * dt_s) ** 2
+        Q[_A, _A] = np.eye(3) * (JERK_SIGMA_M_S3 * dt_s) ** 2
+        Q[_W, _W] = np.eye(3) * (ANGULAR_ACCELERATION_SIGMA_RAD_S2 * dt_s) ** 2
         Q[_B, _B] = np.eye(3) * self._noise.gyro_walk_rad_s2_sqrt_hz**2 * dt_s
         self._filter.predict(F=F, Q=Q)
         if len(frame.imu):

@@ -12,12 +12,14 @@ from typing import Any, Protocol
 import numpy as np
 
 from hybridlio.core import se3
-from hybridlio.core.estimates import Array, KeyframePose, RelativePose, ResidualSource, TakesBack
+from hybridlio.core.arrays import Array
+from hybridlio.core.estimates import KeyframePose, RelativePose, ResidualSource, TakesBack
+from hybridlio.core.motion_limits import PREDICTION_FLOOR_SIGMAS
 from hybridlio.core.sensors import Frame
 from hybridlio.core.setting_checks import above_0, expect, from_0
 from hybridlio.sources.innovation_gate import GATE, chi2_of
 
-_FLOOR = np.diag(np.r_[np.full(3, 1e-4), np.full(3, 1e-3)] ** 2)  # no way is known better
+_FLOOR = np.diag(PREDICTION_FLOOR_SIGMAS**2)  # no way is known better
 
 
 @dataclass(frozen=True)

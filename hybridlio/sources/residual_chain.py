@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Protocol
 
-from hybridlio.core.estimates import Array, RelativePose, ResidualSource, TakesBack
+from hybridlio.core.arrays import Array
+from hybridlio.core.estimates import RelativePose, ResidualSource, TakesBack
+from hybridlio.core.motion_limits import VAGUE_TRANSLATION_SIGMA_M
 from hybridlio.core.sensors import Frame
-
-_UNSURE_M = 0.1
 
 
 class Proposer(ResidualSource, Protocol):
@@ -88,4 +88,17 @@ class ResidualChain:
 
 
 def _is_unsure(pose: RelativePose) -> bool:
-    return pose.translation_sigma_m > _UNSURE_M
+    return pose.translation_sigma_m > VAGUE_TRANSLATION_SIGMA_M
+
+
+class NoResidual:
+    """Leaves the initial pose as it is: a run on the initial poses alone, to compare with."""
+
+    name = "none"
+
+    def start(self, frame: Frame) -> None:
+        """Nothing to keep."""
+
+    def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:  # noqa: ARG002
+        """The initial pose itself."""
+        return initial

@@ -8,29 +8,32 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlio.cloud.voxel import Floats, voxel_average, voxel_pick
+from hybridlio.cloud.voxel import voxel_average, voxel_pick
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array, Floats
 from hybridlio.core.errors import DataError
-from hybridlio.core.estimates import Array, RelativePose
+from hybridlio.core.estimates import RelativePose
+from hybridlio.core.motion_limits import (
+    MEASUREMENT_FLOOR_SIGMAS,
+    UNKNOWN_TRANSLATION_SIGMA_M,
+    VAGUE_TRANSLATION_SIGMA_M,
+)
 from hybridlio.core.sensors import NS_PER_S, Frame, Scan
 from hybridlio.registration.degeneracy import Observed, observe
 from hybridlio.registration.icp import Registration
-from hybridlio.registration.information import FLOOR_SIGMAS
 from hybridlio.registration.local_map import LocalMap, LocalMapSettings
 from hybridlio.registration.motion_search import COARSE_KERNEL_M, best_start, lies_better, motions
 from hybridlio.registration.surface import Surface
 from hybridlio.sources.scan_matching_settings import ScanMatchingSettings
 
-_UNSURE_TRANSLATION_M = 0.5
 _UNSURE_ROTATION_RAD = 0.02
-_VAGUE_M = 0.1  # as far as ground's rings are seen to pull
 _LEVER_M = 10.0  # half of the points are nearer: what an unsure rotation moves them by
 _LOST_COST = 0.6  # of the points' cost between 0 and 1: well above any that lie where they should
 _SHARE_OF_SAME_MAP = 1e-3
 _FINER = 0.7  # voxel, where few points are measured
 _NEVER_FEW = 4  # times what is needed: of a scan of so many points at least a quarter is always registered
 _YOUNG_MAP = 5.0  # a map of one keyframe has ground only along that scan's rings, and guesses what lies between
-_FLOOR_COVARIANCE = np.diag(FLOOR_SIGMAS**2)
+_FLOOR_COVARIANCE = np.diag(MEASUREMENT_FLOOR_SIGMAS**2)
 
 
 @dataclass(eq=False)
@@ -221,7 +224,7 @@ class ScanMatching:
         sideways_m = _LEVER_M * float(np.sqrt(initial.covariance[:3, :3].trace()))
         kernel_start_m = min(max(settings.kernel_m, sigma_m, sideways_m), 1.0)
         start = self._path.T_map_lidar @ initial.pose
-        if sigma_m > _UNSURE_TRANSLATION_M:
+        if sigma_m > UNKNOWN_TRANSLATION_SIGMA_M:
             # who guesses no motion leaves it to this source to know the last one
             if (observed := self._going_on(self._path, seen, dt_s)) is not None:
                 return observed
@@ -273,7 +276,7 @@ class ScanMatching:
 
 def _is_vague(pose: RelativePose) -> bool:
     """So that a map by such poses would show everything several times."""
-    return pose.translation_sigma_m > _VAGUE_M
+    return pose.translation_sigma_m > VAGUE_TRANSLATION_SIGMA_M
 
 
 def _details(found: Registration, points: int) -> dict[str, float]:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from hybridlio.core.arrays import Floats
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import NS_PER_S, ImuSamples
-
-Floats = NDArray[np.float32]
 
 
 def imu_rows(samples: ImuSamples, count: int, T_imu_lidar: ArrayLike | None = None) -> Floats:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hybridlio.cloud.voxel import voxel_average
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.learned.source_settings import NetworkResidualSettings
 from hybridlio.registration.icp import robust_cost
 from hybridlio.registration.information import (
@@ -25,7 +26,6 @@ from hybridlio.registration.information import (
 )
 from hybridlio.registration.surface import Neighbours, Surface
 
-Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
 CHI2_99, _CHI2_90 = 16.8, 10.6  # of six degrees of freedom

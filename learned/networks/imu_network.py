@@ -9,10 +9,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from hybridlio.core.motion_limits import GRAVITY_M_S2
 from hybridlio.learned.networks import torch_se3 as se3
 from hybridlio.learned.settings import NetworkSettings
 
-_GRAVITY_M_S2 = 9.81
 _RATE_RAD_S = 0.5  # what a road vehicle turns at
 
 
@@ -47,7 +47,7 @@ class ImuNetwork(nn.Module):
             imu: ``(B, S, 6)``, angular velocity (rad/s) and specific force (m/s²).
             velocity_m_s: ``(B, 3)`` at the last scan, in its axes; only looked at with ``velocity``.
         """
-        accel, gyro = imu[..., 3:] / _GRAVITY_M_S2, imu[..., :3] / _RATE_RAD_S
+        accel, gyro = imu[..., 3:] / GRAVITY_M_S2, imu[..., :3] / _RATE_RAD_S
         if self.settings.velocity and velocity_m_s is not None:
             accel = torch.cat([accel, (velocity_m_s / 10.0)[:, None].expand_as(accel)], dim=-1)
         return self.accel_lstm(accel)[0][:, -1], self.gyro_lstm(gyro)[0][:, -1]

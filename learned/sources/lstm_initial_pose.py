@@ -9,22 +9,20 @@ import torch
 from numpy.typing import NDArray
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.estimates import RelativePose, State
+from hybridlio.core.motion_limits import PREDICTION_FLOOR_SIGMAS, unknown_motion_covariance
 from hybridlio.core.sensors import NS_PER_S, Frame, ImuSamples
 from hybridlio.learned.data.imu_rows import imu_rows
 from hybridlio.learned.networks.devices import at_run_time, pick_device
 from hybridlio.learned.networks.weights import load_weights, weights_path
 from hybridlio.learned.settings import NetworkSettings
 from hybridlio.learned.source_settings import LstmSettings
-from hybridlio.sources.constant_velocity import unknown_motion_covariance
-
-Array = NDArray[np.float64]
 
 _STEP_S = 0.1  # what the LSTMs are trained on: scans at 10 Hz; they do not see how long a step is
 _FORGETTING = 0.05  # share of the newest step in what is known of the LSTMs' errors
 _FIRST_SIGMAS = np.r_[np.full(3, 0.01), np.full(3, 0.3)]  # rad, m in a step
-_FLOOR_SIGMAS = np.r_[np.full(3, 1e-4), np.full(3, 1e-3)]
 
 
 class LstmInitialPose:
@@ -81,7 +79,9 @@ class LstmInitialPose:
         pose, dt_s, informed = self._predicted
         if informed:
             error = se3.log(se3.between(pose, estimate.pose)) * _STEP_S / dt_s
-            self._variances = (1 - _FORGETTING) * self._variances + _FORGETTING * (error**2 + _FLOOR_SIGMAS**2)
+            self._variances = (1 - _FORGETTING) * self._variances + _FORGETTING * (
+                error**2 + PREDICTION_FLOOR_SIGMAS**2
+            )
         self._step = (estimate.pose, dt_s)
 
     def _chained(self, frame: Frame, dt_s: float) -> Array:

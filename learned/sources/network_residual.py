@@ -14,8 +14,10 @@ from torch import Tensor
 
 from hybridlio.cloud.projection import MapGeometry
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.estimates import RelativePose
+from hybridlio.core.motion_limits import UNKNOWN_TRANSLATION_SIGMA_M
 from hybridlio.core.sensors import NS_PER_S, Frame, Scan
 from hybridlio.learned.data.preparing import Mapped
 from hybridlio.learned.losses.loss_judge import CHI2_99, Judged, JudgedScan, LossJudge
@@ -29,11 +31,9 @@ from hybridlio.learned.sources.lstm_initial_pose import inertial
 
 _log = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.float32] | NDArray[np.float64]
 Prepare = Callable[[Scan], Mapped]
 
-_UNSURE_TRANSLATION_M = 0.5
 _LONG_WAY_M = 0.15  # longer than what the network was trained to go
 _RISE = 1.02  # the loss has changed by less when only which points match has
 
@@ -221,7 +221,7 @@ class NetworkResidual:
 
     def _starts(self, initial: RelativePose, dt_s: float) -> list[Array]:
         """The initial pose, or that and others ahead of it where it is unsure of the translation."""
-        sure = initial.translation_sigma_m <= _UNSURE_TRANSLATION_M
+        sure = initial.translation_sigma_m <= UNKNOWN_TRANSLATION_SIGMA_M
         shifts = [0.0] if sure else [speed * dt_s for speed in self._settings.start_speeds_m_s]
         return [initial.pose @ se3.exp(np.array([0, 0, 0, shift, 0, 0])) for shift in shifts]
 

@@ -7,17 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.evaluation.drift import kitti_drift, lengths_for
 from hybridlio.learned.data.pairs import Pairs
 from hybridlio.learned.data.shards import Shard
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

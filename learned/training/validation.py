@@ -7,16 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.learned.data.pairs import Pairs, shaken
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
 from hybridlio.learned.settings import Recipe
 from hybridlio.learned.training.driving import drift_of
 from hybridlio.learned.training.objective import objective
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -5,17 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.core.trajectory_files import is_tum_file, read_trajectory
 from hybridlio.simulation.drive.path import SmoothPath
 from hybridlio.simulation.rig import SCAN_RATE_HZ, T_CAMERA_LIDAR, T_LIDAR_IMU
-
-Array = NDArray[np.float64]
 
 KNOT_S = 0.3
 MARGIN_STEPS = 10

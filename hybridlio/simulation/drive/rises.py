@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-Array = NDArray[np.float64]
+from hybridlio.core.arrays import Array
 
 _STEP_M = 2.0
 _IMPOSSIBLE, _DOUBTFUL = 0.15, 0.05  # slope that the path has over what the vehicle's pitch says

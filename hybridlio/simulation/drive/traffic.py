@@ -6,17 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.simulation.world import street
 from hybridlio.simulation.world.ground import Ground
 from hybridlio.simulation.world.roads import LANE_OFFSET_M, Road
 from hybridlio.simulation.world.shapes import Mesh
 from hybridlio.simulation.world.world import RayScene
-
-Array = NDArray[np.float64]
 
 _CLEARANCE_M = 3.0
 _REACH_M = 90.0

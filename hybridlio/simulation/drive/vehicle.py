@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import cont2discrete, lfilter, lfilter_zi
 from scipy.spatial.transform import Rotation
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.simulation.drive.path import SmoothPath
 from hybridlio.simulation.rig import T_VEHICLE_IMU
 from hybridlio.simulation.world.ground import Ground
 from hybridlio.simulation.world.roads import LANE_OFFSET_M, STEP_M, Road
-
-Array = NDArray[np.float64]
 
 KNOT_S = 0.05
 FINE_S = 0.01

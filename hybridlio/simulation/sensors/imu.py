@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from hybridlio.core.arrays import Array
 from hybridlio.core.sensors import ImuNoise
 from hybridlio.simulation.drive.path import SmoothPath
-from hybridlio.simulation.rig import GRAVITY_M_S2
-
-Array = NDArray[np.float64]
+from hybridlio.simulation.rig import GRAVITY_WORLD_M_S2
 
 
 def ideal_imu(path: SmoothPath, times_s: ArrayLike) -> tuple[Array, Array]:
@@ -18,7 +17,7 @@ def ideal_imu(path: SmoothPath, times_s: ArrayLike) -> tuple[Array, Array]:
     ``path`` is the IMU's own, so both are instantaneous values in the IMU frame, without noise.
     """
     motion = path.motion(times_s)
-    force_world = motion.acceleration_m_s2 - GRAVITY_M_S2
+    force_world = motion.acceleration_m_s2 - GRAVITY_WORLD_M_S2
     force = np.einsum("nji,nj->ni", motion.poses[:, :3, :3], force_world)
     return motion.angular_velocity_rad_s, force
 

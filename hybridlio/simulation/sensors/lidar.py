@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.sensors import NS_PER_S, LidarModel, Scan
 from hybridlio.simulation.drive.traffic import CAR_RADIUS_M, MovingCar, in_reach
 from hybridlio.simulation.world.world import Hits, RayScene
-
-Array = NDArray[np.float64]
 
 # a return is seen where reflectance · cos(incidence) / range² is above this, give or take the spread of its logarithm:
 # asphalt is then lost beyond 60 m or so, and a dark car beyond 90 m

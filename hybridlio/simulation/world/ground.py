@@ -6,13 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial import cKDTree
 
+from hybridlio.core.arrays import Array
 from hybridlio.simulation.world.shapes import Mesh
 
-Array = NDArray[np.float64]
 Height = Callable[[Array], Array]
 
 CURB_OFFSET_M = 5.5

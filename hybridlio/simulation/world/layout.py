@@ -7,16 +7,15 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from hybridlio.core.arrays import Array
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.world import street
 from hybridlio.simulation.world.ground import CURB_OFFSET_M, SIDEWALK_END_M
 from hybridlio.simulation.world.roads import Road
 from hybridlio.simulation.world.shapes import Mesh
 
-Array = NDArray[np.float64]
 Build = Callable[[np.random.Generator], Mesh]
 
 _ALREADY_DRESSED_M = 6.0

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
+from hybridlio.core.arrays import Array
 from hybridlio.simulation.config import Driving, Scene
-
-Array = NDArray[np.float64]
 
 STEP_M = 0.5
 LANE_OFFSET_M = 1.75

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hybridlio.core.arrays import Array
 from hybridlio.simulation.world.shapes import Mesh, boxes, cylinder, facets, merge, prism
-
-Array = NDArray[np.float64]
 
 _FOUNDATION_M = 2.0  # everything reaches so far below its ground, which is uneven
 

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridlio.core.arrays import Array
 from hybridlio.simulation.world.ground import SIDEWALK_END_M, Ground
 from hybridlio.simulation.world.layout import Item
 from hybridlio.simulation.world.shapes import Mesh, merge
-
-Array = NDArray[np.float64]
 
 TILE_M = 32.0
 FINE_CELL_M, COARSE_CELL_M = 0.5, 2.0

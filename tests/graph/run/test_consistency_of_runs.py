@@ -10,11 +10,11 @@ import pytest
 
 from hybridlio.core import se3
 from hybridlio.core.estimates import RelativePose, State
+from hybridlio.core.motion_limits import unknown_motion_covariance
 from hybridlio.core.sensors import Frame
 from hybridlio.evaluation.consistency import pose_consistency
 from hybridlio.graph.run.smooth import smooth
 from hybridlio.odometry.odometry import Odometry
-from hybridlio.sources.constant_velocity import unknown_motion_covariance
 
 
 class Standstill:

@@ -3,8 +3,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hybridlio.core.errors import DataError
+from hybridlio.core.motion_limits import GRAVITY_M_S2
 from hybridlio.core.sensors import ImuNoise, ImuSamples
-from hybridlio.core.start_state import GRAVITY_M_S2, start_state
+from hybridlio.core.start_state import start_state
 
 NOISE = ImuNoise()
 

@@ -16,7 +16,7 @@ from hybridlio.graph.run.smooth import smooth
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.odometry import Estimate, Odometry
 from hybridlio.record.record import Record
-from hybridlio.sources.constant_velocity import NoResidual
+from hybridlio.sources.residual_chain import NoResidual
 
 
 @pytest.fixture(scope="module")

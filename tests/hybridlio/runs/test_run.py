@@ -19,8 +19,8 @@ from hybridlio.record.record import Record
 from hybridlio.record.recorder import RecordMaker
 from hybridlio.runs.run import Run, run_odometry
 from hybridlio.runs.write import notes, write_run
-from hybridlio.sources.constant_velocity import NoResidual
 from hybridlio.sources.innovation_gate import Agreement
+from hybridlio.sources.residual_chain import NoResidual
 
 
 @pytest.fixture(scope="module")

@@ -2,15 +2,11 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.estimates import RelativePose, State
+from hybridlio.core.motion_limits import changed_motion_covariance, unknown_motion_covariance
 from hybridlio.core.sensors import Frame, ImuNoise, ImuSamples, Scan
 from hybridlio.core.start_state import start_state
-from hybridlio.sources.constant_velocity import (
-    ConstantVelocity,
-    Identity,
-    NoResidual,
-    changed_motion_covariance,
-    unknown_motion_covariance,
-)
+from hybridlio.sources.constant_velocity import ConstantVelocity, Identity
+from hybridlio.sources.residual_chain import NoResidual
 
 TWIST = np.array([0.01, -0.02, 0.3, 10.0, 0.5, -0.1])  # per second
 

@@ -8,9 +8,9 @@ import pytest
 from hybridlio.core import se3
 from hybridlio.core.errors import DataError
 from hybridlio.core.estimates import RelativePose
+from hybridlio.core.motion_limits import unknown_motion_covariance
 from hybridlio.core.sensors import Frame, Scan
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.sources.constant_velocity import unknown_motion_covariance
 from hybridlio.sources.scan_matching import ScanMatching
 from hybridlio.sources.scan_matching_settings import ScanMatchingSettings
 

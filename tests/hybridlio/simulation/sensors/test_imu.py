@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from hybridlio.core.sensors import ImuNoise
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.plan import plan
-from hybridlio.simulation.rig import GRAVITY_M_S2
+from hybridlio.simulation.rig import GRAVITY_WORLD_M_S2
 from hybridlio.simulation.sensors.imu import add_noise, ideal_imu
 
 SILENT = ImuNoise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -25,7 +25,7 @@ def integrate(times: np.ndarray, gyro: np.ndarray, accel: np.ndarray, R0: Rotati
     for turn in turns:
         attitude.append(attitude[-1] * Rotation.from_rotvec(turn))
     rotations = Rotation.concatenate(attitude)
-    velocity = CubicSpline(times, rotations.apply(accel) + GRAVITY_M_S2).antiderivative()
+    velocity = CubicSpline(times, rotations.apply(accel) + GRAVITY_WORLD_M_S2).antiderivative()
     position = p0 + v0 * (times - times[0])[:, None] + velocity.antiderivative()(times)
     return rotations, position
 

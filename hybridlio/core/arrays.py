@@ -1,0 +1,13 @@
+"""Names of the array types that signatures use; shapes stand in docstrings."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array: TypeAlias = NDArray[np.float64]  # poses, covariances, everything that is estimated
+Floats: TypeAlias = NDArray[np.float32]  # points and maps as sensors and networks have them
+Mask: TypeAlias = NDArray[np.bool_]
+Index: TypeAlias = NDArray[np.int64]  # positions in another array
