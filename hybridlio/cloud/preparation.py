@@ -131,8 +131,8 @@ def prepare(scan: Scan, options: PreparationOptions | None = None, motion: Traje
     Args:
         scan: as the sensor delivered it. A scan without points is prepared as well; it is not ``usable``.
         options: ranges, cells and sizes.
-        motion: lidar poses around the sweep, see :func:`hybridlio.cloud.deskew.deskew`; only looked at where points carry
-            times. Without it such a scan stays as measured.
+        motion: lidar poses around the sweep, see :func:`hybridlio.cloud.deskew.deskew`; only looked at where
+            points carry times. Without it such a scan stays as measured.
 
     Raises:
         DataError: the motion has fewer than two poses.

@@ -9,8 +9,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from hybridlio.cloud.deskew import constant_twist, deskew
-from hybridlio.cloud.sweep import compensation_noise, sweep_motion
+from hybridlio.cloud.deskew import compensation_noise, constant_twist, deskew, sweep_motion
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError, DataError, EstimationError

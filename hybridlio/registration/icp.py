@@ -113,8 +113,8 @@ def register(
 ) -> Registration:
     """Find the pose that lays ``source`` on ``surface``.
 
-    Directions that the points constrain little stay as in ``initial``; :func:`hybridlio.registration.degeneracy.observe` finds
-    out which of them the points see nevertheless.
+    Directions that the points constrain little stay as in ``initial``;
+    :func:`hybridlio.registration.degeneracy.observe` finds out which of them the points see nevertheless.
 
     Args:
         surface: points with normals.
@@ -122,7 +122,8 @@ def register(
         initial: ``(4, 4)`` pose to start from.
         settings: kernel, distances, limits.
         kernel_start_m: a wider kernel to begin with, halved at every step; for an uncertain ``initial``.
-        held: ``(6, D)`` directions that stay, of :func:`hybridlio.registration.information.newton_step`, instead of the weak ones.
+        held: ``(6, D)`` directions that stay, of :func:`hybridlio.registration.information.newton_step`,
+            instead of the weak ones.
         thick_as_points: bring scan points to the surface's where those make no plane, see
             :mod:`hybridlio.registration.point_to_point`.
     """

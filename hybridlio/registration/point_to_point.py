@@ -55,7 +55,7 @@ class MixedMatches:
         return lever_arms(np.concatenate([self.planes.source, self.source]))
 
     def system(self, kernel_m: float, xi: Array | None = None) -> System:
-        """The step's equations, as of :meth:`hybridlio.registration.surface.Matches.system`; the thick may be off by more."""
+        """The step's equations, as of :meth:`Matches.system`; the thick may be off by more."""
         flat = self.planes.system(kernel_m, xi)
         off = self.rows[6] if xi is None else self.rows[6] + np.tensordot(xi, self.rows[:6], 1)
         squares = np.einsum("ij,ij->j", off, off)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybridlio.cloud.deskew import constant_twist
-from hybridlio.cloud.sweep import compensation_noise, sweep_motion
+from hybridlio.cloud.deskew import compensation_noise, constant_twist, sweep_motion
 from hybridlio.core import se3
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.sensors import Calibration, Frame, ImuNoise, ImuSamples, Scan

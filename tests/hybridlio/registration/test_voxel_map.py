@@ -1,6 +1,6 @@
 import numpy as np
 
-from hybridlio.registration.cell_table import CellTable, cells_of
+from hybridlio.registration.voxel_map import CellTable, cells_of
 
 
 def test_a_cell_has_one_key_whatever_else_is_seen(rng: np.random.Generator):
