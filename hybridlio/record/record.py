@@ -10,17 +10,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.files import UNREADABLE_NPZ, writing_whole
 from hybridlio.core.geodesy import GeodeticPoint
-from hybridlio.core.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
+from hybridlio.core.sensors import NS_PER_S, Calibration, GpsFix, ImuNoise, ImuSamples
+from hybridlio.core.start_state import start_state
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.record.keyframes import Keyframes
+from hybridlio.record.odometry_noise import odometry_noise
 from hybridlio.record.step_arrays import keyframe_arrays, relative_arrays, relatives, with_keyframes
 
 FORMAT_VERSION = 2
-_READABLE = (1, 2)  # the first had no poses relative to keyframes
+_READABLE = (1, 2)  # version 1 has no poses relative to map keyframes
+_SOURCE = "odometry"  # `source` of the steps of an odometry that is not ours
+_FIRST_POSE_VARIANCE = 1e-12  # rad², m²; the first pose is the origin, but a covariance must be positive definite
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +80,25 @@ class Record:
         Raises:
             DataError: fewer than two poses, or covariances that do not fit or are none.
         """
-        from hybridlio.record.foreign_odometry import record_from_odometry
-
-        return record_from_odometry(trajectory, imu, gps, calibration, imu_noise, covariances)
+        if len(trajectory) < 2:
+            raise DataError(f"a record needs at least two poses, got {len(trajectory)}")
+        trajectory, imu = trajectory.from_first(), imu or ImuSamples.empty()
+        calibration, imu_noise = calibration or Calibration(), imu_noise or ImuNoise()
+        steps = _steps_of(trajectory, imu, calibration, covariances)
+        start_ns, end_ns = (int(stamp) for stamp in trajectory.stamps_ns[[0, -1]])
+        inside = imu.between(start_ns, end_ns)
+        first = inside.stamps_ns <= inside.stamps_ns[0] + NS_PER_S if len(inside) else np.zeros(0, bool)
+        beginning = ImuSamples(inside.stamps_ns[first], inside.gyro_rad_s[first], inside.accel_m_s2[first])
+        return cls(
+            online=Trajectory(trajectory.stamps_ns, trajectory.poses, _accumulated(steps)),
+            initial=steps,
+            relative=steps,
+            imu=inside,
+            gps=tuple(sorted(gps or (), key=lambda fix: fix.stamp_ns)),
+            start=start_state(start_ns, beginning, imu_noise),
+            calibration=calibration,
+            imu_noise=imu_noise,
+        )
 
     @property
     def origin(self) -> GeodeticPoint | None:
@@ -117,6 +139,39 @@ class Record:
                 return _from_arrays({name: file[name] for name in file.files})
         except UNREADABLE_NPZ as error:
             raise DataError(f"{path}: not a record of a run ({error}); run `hybridlio odometry` again") from error
+
+
+def _steps_of(
+    trajectory: Trajectory, imu: ImuSamples, calibration: Calibration, covariances: ArrayLike | None
+) -> tuple[RelativePose, ...]:
+    """Return the relative poses between consecutive poses, with given covariances or those found from the IMU."""
+    poses = se3.between(trajectory.poses[:-1], trajectory.poses[1:])
+    if covariances is not None:
+        given = _each(covariances, len(poses))
+        return tuple(RelativePose(T, c, _SOURCE) for T, c in zip(poses, given, strict=True))
+    noise = odometry_noise(trajectory, imu, calibration)
+    columns = zip(poses, noise.covariances, noise.drifts, strict=True)
+    return tuple(RelativePose(T, covariance, _SOURCE, drift=drift) for T, covariance, drift in columns)
+
+
+def _each(covariances: ArrayLike, steps: int) -> Array:
+    """Return the steps' covariances ``(steps, 6, 6)`` from one ``(6, 6)`` for all, or one for each."""
+    given = np.asarray(covariances, dtype=np.float64)
+    given = np.broadcast_to(given, (steps, 6, 6)) if given.shape == (6, 6) else given
+    if given.shape != (steps, 6, 6):
+        raise DataError(
+            f"step covariances: expected shape (6, 6), or ({steps}, 6, 6) for {steps + 1} poses, got {given.shape}"
+        )
+    return given
+
+
+def _accumulated(steps: tuple[RelativePose, ...]) -> Array:
+    """Return the covariances ``(N, 6, 6)`` of the poses: the steps' drift added up from the first pose on."""
+    out = [np.eye(6) * _FIRST_POSE_VARIANCE]
+    for step in steps:
+        added = step.covariance if step.drift is None else step.drift
+        out.append(se3.compose_covariance(out[-1], step.pose, added))
+    return np.array(out)
 
 
 def _to_arrays(record: Record) -> dict[str, Any]:
