@@ -15,6 +15,7 @@ from typing import Any, Literal, TypeVar
 
 from hybridlio.cloud.projection import MAP_GEOMETRIES, MapGeometry
 from hybridlio.core.errors import ConfigError
+from hybridlio.core.setting_checks import check_positive
 
 _S = TypeVar("_S")
 
@@ -88,7 +89,7 @@ class NetworkSettings:
     def __post_init__(self) -> None:
         _check_choices(self)
         positive = ("imu_samples", "imu_hidden", "imu_layers", "stem", "blocks", "features", "pooled_columns")
-        _check_positive(self, *positive, "iterations", "vertex_scale_m", "residual_scale", "output_scale")
+        check_positive(self, *positive, "iterations", "vertex_scale_m", "residual_scale", "output_scale")
         if (
             min(self.projective_steps, self.weight_channels) < 0
             or len(self.stem_stride) != 2
@@ -145,7 +146,7 @@ class LossSettings:
 
     def __post_init__(self) -> None:
         _check_choices(self)
-        _check_positive(self, "kernel_m", "max_distance_m")
+        check_positive(self, "kernel_m", "max_distance_m")
         if (
             min(self.alpha, self.lambda_, self.initial_weight, self.target_weight, self.target_steps) < 0
             or self.alpha + self.lambda_ == 0
@@ -192,7 +193,7 @@ class OptimiserSettings:
 
     def __post_init__(self) -> None:
         _check_choices(self)
-        _check_positive(self, "epochs", "batch", "learning_rate", "step_epochs", "step_factor")
+        check_positive(self, "epochs", "batch", "learning_rate", "step_epochs", "step_factor")
         if len(self.betas) != 2 or not all(0 <= beta < 1 for beta in self.betas):
             raise ConfigError(f"optimiser: betas are two numbers from 0 to below 1, got {self.betas}")
         noises = (self.initial_noise_rad, self.initial_noise_m, self.velocity_noise_m_s)
@@ -271,9 +272,3 @@ def _check_choices(settings: Any) -> None:
         if typing.get_origin(hint) is Literal and getattr(settings, name) not in typing.get_args(hint):
             choices = ", ".join(typing.get_args(hint))
             raise ConfigError(f"{name} is one of {choices}, not {getattr(settings, name)!r}")
-
-
-def _check_positive(settings: Any, *names: str) -> None:
-    for name in names:
-        if not getattr(settings, name) > 0:
-            raise ConfigError(f"{name} must be positive, got {getattr(settings, name)}")

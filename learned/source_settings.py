@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hybridlio.core.setting_checks import above_0, expect, from_0, shares
+from hybridlio.core.setting_checks import check_fraction, check_not_negative, check_positive, check_setting
 
 SHIPPED = "shipped"
 """In place of a path: the weights that come with the package."""
@@ -57,7 +57,7 @@ class NetworkResidualSettings:
     start_speeds_m_s: tuple[float, ...] = (0.0, -5.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0)
 
     def __post_init__(self) -> None:
-        above_0(self, "min_cells", "covariance_scale", "kernel_m", "max_distance_m")
-        from_0(self, "refine_steps")
-        shares(self, "min_matched")
-        expect(self, "start_speeds_m_s", len(self.start_speeds_m_s) > 0, "one number at least")
+        check_positive(self, "min_cells", "covariance_scale", "kernel_m", "max_distance_m")
+        check_not_negative(self, "refine_steps")
+        check_fraction(self, "min_matched")
+        check_setting(self, "start_speeds_m_s", len(self.start_speeds_m_s) > 0, "one number at least")

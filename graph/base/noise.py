@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 
 from hybridlio.core.arrays import Array
-from hybridlio.core.estimates import check_covariance
+from hybridlio.core.covariance import check_covariance
 
 
 def gaussian(covariance: Array, name: str) -> gtsam.noiseModel.Base:

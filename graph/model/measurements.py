@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 from scipy.special import gammaincinv
 
 from hybridlio.core.arrays import Array
+from hybridlio.core.covariance import check_covariance
 from hybridlio.core.errors import ConfigError, DataError, GraphError
-from hybridlio.core.estimates import check_covariance
 from hybridlio.core.sensors import ImuSamples
 from hybridlio.graph.model.keys import Key
 

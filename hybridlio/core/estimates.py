@@ -14,28 +14,8 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.errors import DataError
+from hybridlio.core.covariance import check_covariance
 from hybridlio.core.sensors import Frame
-
-
-def check_covariance(covariance: Array, name: str, size: int = 6) -> Array:
-    """The covariance as a symmetric float64 ``(size, size)`` matrix.
-
-    Raises:
-        DataError: wrong shape, not finite, not symmetric or not positive definite; the message carries ``name``.
-    """
-    covariance = np.asarray(covariance, dtype=np.float64)
-    if covariance.shape != (size, size) or not np.isfinite(covariance).all():
-        raise DataError(f"{name}: expected a finite ({size}, {size}) covariance, got shape {covariance.shape}")
-    uneven, largest = np.abs(covariance - covariance.T), np.abs(covariance)
-    if (uneven > 1e-6 * largest + 1e-12 * largest.max()).any():
-        raise DataError(f"{name}: covariance is not symmetric")
-    covariance = (covariance + covariance.T) / 2
-    try:
-        np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError:
-        raise DataError(f"{name}: covariance is not positive definite") from None
-    return covariance
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,9 +1,9 @@
-"""How a vehicle moves between measurements: accelerations, rates and speeds that every part assumes.
+"""How a vehicle moves between measurements: accelerations, rates and speeds that all rooms assume.
 
-One place for these numbers, so that parts agree and another kind of vehicle changes one file. All are one standard
-deviation unless their name says ``LARGEST``. They describe a road vehicle: full braking on a dry road is 7 to 9 m/s²,
-braking and cornering in ordinary traffic is below 3 m/s² nine times in ten, and a yaw rate of 0.6 rad/s is a right-angle
-bend in three seconds.
+These numbers describe a road vehicle; another kind of vehicle changes this one file. Each is one standard deviation
+unless its name says ``LARGEST``. Where they come from: full braking on a dry road reaches 7 to 9 m/s²; braking and
+cornering in ordinary traffic stay below 3 m/s² nine times in ten; a yaw rate of 0.6 rad/s is a right-angle bend in
+three seconds.
 """
 
 from __future__ import annotations

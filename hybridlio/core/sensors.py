@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.core import se3
+from hybridlio.core.covariance import check_covariance
 from hybridlio.core.errors import DataError
 from hybridlio.core.geodesy import GeodeticPoint
-from hybridlio.core.setting_checks import expect
+from hybridlio.core.setting_checks import check_setting
 
 NS_PER_S = 1_000_000_000
 FARTHEST_M = 1e4  # no lidar sees farther; what is there is broken data
@@ -157,7 +158,7 @@ class ImuNoise:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            expect(self, name, 0 <= value < np.inf, "finite and 0 or more")
+            check_setting(self, name, 0 <= value < np.inf, "finite and 0 or more")
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,14 +181,12 @@ class GpsFix:
     origin: GeodeticPoint | None = None
 
     def __post_init__(self) -> None:
-        position, covariance = (np.asarray(a, dtype=np.float64) for a in (self.position_m, self.covariance_m2))
+        name = f"GPS fix at {self.stamp_ns} ns"
+        position = np.asarray(self.position_m, dtype=np.float64)
         if position.shape != (3,) or not np.isfinite(position).all():
-            raise DataError(f"GPS fix at {self.stamp_ns} ns: expected three finite metres, got {position.tolist()}")
-        known = covariance.shape == (3, 3) and np.isfinite(covariance).all()
-        if not known or np.linalg.eigvalsh(covariance)[0] <= 0:
-            raise DataError(f"GPS fix at {self.stamp_ns} ns: its covariance must be (3, 3) and positive definite")
+            raise DataError(f"{name}: expected three finite metres, got {position.tolist()}")
         object.__setattr__(self, "position_m", position)
-        object.__setattr__(self, "covariance_m2", covariance)
+        object.__setattr__(self, "covariance_m2", check_covariance(self.covariance_m2, name, 3))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What settings may be: each checks itself, so that an error says the same from Python and from a file."""
+"""Range checks that settings classes run on construction, so that Python and YAML users see the same error."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from hybridlio.core.errors import ConfigError
 
 
 class SettingError(ConfigError, ValueError):
-    """A setting's value is not one that it can have. A ValueError too, for pydantic to add where in a file it stands.
+    """A setting has a value that is out of range.
+
+    It is also a ``ValueError``, because pydantic wraps only those and adds the setting's path in the file.
 
     Args:
-        owner: name of the settings' type.
-        name: of the setting.
-        complaint: what is wrong with it.
+        owner: name of the settings class.
+        name: name of the setting.
+        complaint: what is wrong, such as "must be above 0, got -1".
     """
 
     def __init__(self, owner: str, name: str, complaint: str) -> None:
@@ -24,35 +26,51 @@ class SettingError(ConfigError, ValueError):
         return "{}.{}: {}".format(*self.args)
 
 
-def above_0(settings: object, *names: str) -> None:
-    """Check that some of the settings' numbers are above 0; NaN is not.
+def check_positive(settings: object, *names: str) -> None:
+    """Check that the named settings are above 0; NaN is not.
 
     Raises:
-        SettingError: names the first that is not.
+        SettingError: names the first setting that is not.
     """
-    _each(settings, names, lambda value: value > 0, "above 0")
+    _check_each(settings, names, lambda value: value > 0, "above 0")
 
 
-def from_0(settings: object, *names: str) -> None:
-    """Check that some of the settings' numbers are 0 or more, as :func:`above_0` does."""
-    _each(settings, names, lambda value: value >= 0, "0 or more")
-
-
-def shares(settings: object, *names: str) -> None:
-    """Check that some of the settings' numbers are within 0 and 1, as :func:`above_0` does."""
-    _each(settings, names, lambda value: 0 <= value <= 1, "within 0 and 1")
-
-
-def expect(settings: object, name: str, holds: bool, wanted: str) -> None:
-    """Check one of the settings against what is known of it; ``wanted`` goes behind "must be".
+def check_not_negative(settings: object, *names: str) -> None:
+    """Check that the named settings are 0 or more; NaN is not.
 
     Raises:
-        SettingError: it does not hold.
+        SettingError: names the first setting that is not.
+    """
+    _check_each(settings, names, lambda value: value >= 0, "0 or more")
+
+
+def check_fraction(settings: object, *names: str) -> None:
+    """Check that the named settings are between 0 and 1, both included.
+
+    Raises:
+        SettingError: names the first setting that is not.
+    """
+    _check_each(settings, names, lambda value: 0 <= value <= 1, "between 0 and 1")
+
+
+def check_setting(settings: object, name: str, holds: bool, requirement: str) -> None:
+    """Raise an error unless a condition on one setting holds.
+
+    Args:
+        settings: the settings object.
+        name: name of the setting.
+        holds: whether its value is allowed.
+        requirement: continues "must be" in the message, such as "above 0".
+
+    Raises:
+        SettingError: the condition does not hold.
     """
     if not holds:
-        raise SettingError(type(settings).__name__, name, f"must be {wanted}, got {getattr(settings, name)}")
+        raise SettingError(type(settings).__name__, name, f"must be {requirement}, got {getattr(settings, name)}")
 
 
-def _each(settings: object, names: tuple[str, ...], holds: Callable[[float], bool], wanted: str) -> None:
+def _check_each(
+    settings: object, names: tuple[str, ...], is_allowed: Callable[[float], bool], requirement: str
+) -> None:
     for name in names:
-        expect(settings, name, holds(getattr(settings, name)), wanted)
+        check_setting(settings, name, is_allowed(getattr(settings, name)), requirement)

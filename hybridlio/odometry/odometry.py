@@ -15,7 +15,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError, DataError, EstimationError
 from hybridlio.core.estimates import Backend, InitialPoseSource, RelativePose, ResidualSource, State, TakesBack
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples
-from hybridlio.core.setting_checks import above_0
+from hybridlio.core.setting_checks import check_positive
 from hybridlio.core.start_state import start_state
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.late_imu import take_up_imu
@@ -235,7 +235,7 @@ class Odometry:
 
 def _setup(config: Config, frame: Frame) -> Setup:
     noise = config.imu_noise or frame.imu_noise or ImuNoise()
-    above_0(noise, *(field.name for field in fields(noise)))  # an IMU without noise is a simulator's only
+    check_positive(noise, *(field.name for field in fields(noise)))  # an IMU without noise is a simulator's only
     return Setup(config, frame.calibration or Calibration(), noise)
 
 

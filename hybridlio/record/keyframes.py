@@ -18,7 +18,7 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.files import UNREADABLE_NPZ, writing_whole
 from hybridlio.core.packed_arrays import PackedCloud
 from hybridlio.core.sensors import Scan
-from hybridlio.core.setting_checks import above_0, expect
+from hybridlio.core.setting_checks import check_positive, check_setting
 
 FORMAT_VERSION = 1
 RESOLUTION_M = 0.005
@@ -49,9 +49,9 @@ class KeyframeSettings:
     max_points: int = 5000
 
     def __post_init__(self) -> None:
-        above_0(self, "spacing_m", "voxel_m", "max_points")
+        check_positive(self, "spacing_m", "voxel_m", "max_points")
         within = 0 < self.max_range_m < _FARTHEST_M
-        expect(self, "max_range_m", within, f"above 0 and below {_FARTHEST_M:.0f}")
+        check_setting(self, "max_range_m", within, f"above 0 and below {_FARTHEST_M:.0f}")
 
 
 @dataclass(frozen=True, eq=False)

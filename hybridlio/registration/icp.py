@@ -16,7 +16,7 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.setting_checks import above_0
+from hybridlio.core.setting_checks import check_positive
 from hybridlio.registration.information import newton_step
 from hybridlio.registration.point_to_point import MixedMatches, MixedNeighbours
 from hybridlio.registration.surface import Matches, Neighbours, Surface, System
@@ -51,7 +51,7 @@ class RegistrationSettings:
     threads: int = 2
 
     def __post_init__(self) -> None:
-        above_0(self, "kernel_m", "max_distance_m", "max_iterations", "threads")
+        check_positive(self, "kernel_m", "max_distance_m", "max_iterations", "threads")
 
 
 class Fit(NamedTuple):

@@ -9,7 +9,7 @@ import numpy as np
 from hybridlio.cloud.plane_fitting import LEAST_NEIGHBOURS
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.setting_checks import above_0, expect
+from hybridlio.core.setting_checks import check_positive, check_setting
 from hybridlio.registration.surface import Surface
 from hybridlio.registration.voxel_map import MapCells
 
@@ -46,8 +46,10 @@ class LocalMapSettings:
     threads: int = 2
 
     def __post_init__(self) -> None:
-        above_0(self, "keyframe_m", "keyframe_deg", "voxel_m", "horizon_keyframes", "radius_m", "threads")
-        expect(self, "neighbours", self.neighbours >= LEAST_NEIGHBOURS, f"{LEAST_NEIGHBOURS} or more, as a plane needs")
+        check_positive(self, "keyframe_m", "keyframe_deg", "voxel_m", "horizon_keyframes", "radius_m", "threads")
+        check_setting(
+            self, "neighbours", self.neighbours >= LEAST_NEIGHBOURS, f"{LEAST_NEIGHBOURS} or more, as a plane needs"
+        )
 
 
 class LocalMap:

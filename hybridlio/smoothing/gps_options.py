@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.core.arrays import Array
-from hybridlio.core.setting_checks import expect, from_0
+from hybridlio.core.setting_checks import check_not_negative, check_setting
 from hybridlio.smoothing.gps_alignment import MAX_SHIFT_S
 
 
@@ -35,9 +35,9 @@ class GpsOptions:
 
     def __post_init__(self) -> None:
         where = np.zeros(3) if self.antenna_m is None else np.asarray(self.antenna_m)
-        expect(self, "antenna_m", where.shape == (3,) and bool(np.isfinite(where).all()), "three finite numbers")
-        from_0(self, "max_shift_s")
-        expect(self, "outages", all(a <= b for a, b in self.outages), "pairs of start and end, in this order")
+        check_setting(self, "antenna_m", where.shape == (3,) and bool(np.isfinite(where).all()), "three finite numbers")
+        check_not_negative(self, "max_shift_s")
+        check_setting(self, "outages", all(a <= b for a, b in self.outages), "pairs of start and end, in this order")
 
 
 @dataclass(frozen=True, eq=False)

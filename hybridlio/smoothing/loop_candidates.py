@@ -9,7 +9,7 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Index
-from hybridlio.core.setting_checks import above_0, from_0, shares
+from hybridlio.core.setting_checks import check_fraction, check_not_negative, check_positive
 from hybridlio.smoothing.place_recognition import DescriptorSettings, compare, describe, ring_key, spectrum
 from hybridlio.smoothing.step_uncertainty import OdometryChain
 
@@ -43,9 +43,9 @@ class CandidateSettings:
     descriptor: DescriptorSettings = field(default_factory=DescriptorSettings)
 
     def __post_init__(self) -> None:
-        above_0(self, "odometry_sigmas", "odometry_scale", "per_keyframe", "compared")
-        from_0(self, "min_path_m", "reach_m", "apart_m")
-        shares(self, "max_distance")
+        check_positive(self, "odometry_sigmas", "odometry_scale", "per_keyframe", "compared")
+        check_not_negative(self, "min_path_m", "reach_m", "apart_m")
+        check_fraction(self, "max_distance")
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from scipy.special import gammaincinv
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Index, Mask
-from hybridlio.core.setting_checks import above_0, expect, from_0
+from hybridlio.core.setting_checks import check_not_negative, check_positive, check_setting
 from hybridlio.smoothing.step_uncertainty import OdometryChain
 
 
@@ -38,9 +38,9 @@ class ConsistencySettings:
     least_apart_m: float = 1.0
 
     def __post_init__(self) -> None:
-        expect(self, "inlier_share", 0 < self.inlier_share < 1, "above 0 and below 1")
-        above_0(self, "odometry_scale")
-        from_0(self, "witness_m", "least_apart_m")
+        check_setting(self, "inlier_share", 0 < self.inlier_share < 1, "above 0 and below 1")
+        check_positive(self, "odometry_scale")
+        check_not_negative(self, "witness_m", "least_apart_m")
 
 
 _STARTS = 32  # sets that are grown, from the loops which agree with most others

@@ -19,7 +19,7 @@ from hybridlio.cloud.plane_fitting import LEAST_NEIGHBOURS
 from hybridlio.cloud.voxel import voxel_average, voxel_pick
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Index
-from hybridlio.core.setting_checks import above_0, expect, from_0, shares
+from hybridlio.core.setting_checks import check_fraction, check_not_negative, check_positive, check_setting
 from hybridlio.record.keyframes import Keyframes
 from hybridlio.registration.icp import Registration, RegistrationSettings, fit_at, register
 from hybridlio.registration.information import NORMAL_NOISE, covariance_of, degenerate_directions
@@ -63,10 +63,14 @@ class VerificationSettings:
     registration: RegistrationSettings = field(default_factory=_registration)
 
     def __post_init__(self) -> None:
-        above_0(self, "surface_voxel_m", "source_voxel_m", "max_difference_m", "max_difference_deg", "covariance_scale")
-        from_0(self, "reach_m", "min_standing")
-        shares(self, "min_matched", "max_cost")
-        expect(self, "neighbours", self.neighbours >= LEAST_NEIGHBOURS, f"{LEAST_NEIGHBOURS} or more, as a plane needs")
+        check_positive(
+            self, "surface_voxel_m", "source_voxel_m", "max_difference_m", "max_difference_deg", "covariance_scale"
+        )
+        check_not_negative(self, "reach_m", "min_standing")
+        check_fraction(self, "min_matched", "max_cost")
+        check_setting(
+            self, "neighbours", self.neighbours >= LEAST_NEIGHBOURS, f"{LEAST_NEIGHBOURS} or more, as a plane needs"
+        )
 
 
 @dataclass(frozen=True, eq=False)

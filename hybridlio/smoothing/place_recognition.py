@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.core.arrays import Array, Floats
-from hybridlio.core.setting_checks import above_0, expect
+from hybridlio.core.setting_checks import check_positive, check_setting
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class DescriptorSettings:
     beside_m: tuple[float, ...] = (0.0, 3.5, -3.5)
 
     def __post_init__(self) -> None:
-        above_0(self, "rings", "sectors", "range_m", "height_m")
-        expect(self, "beside_m", len(self.beside_m) > 0, "one position at least")
+        check_positive(self, "rings", "sectors", "range_m", "height_m")
+        check_setting(self, "beside_m", len(self.beside_m) > 0, "one position at least")
 
 
 def describe(points: Array, settings: DescriptorSettings) -> Floats:

@@ -16,7 +16,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import KeyframePose, RelativePose, ResidualSource, TakesBack
 from hybridlio.core.motion_limits import PREDICTION_FLOOR_SIGMAS
 from hybridlio.core.sensors import Frame
-from hybridlio.core.setting_checks import above_0, expect, from_0
+from hybridlio.core.setting_checks import check_not_negative, check_positive, check_setting
 from hybridlio.sources.innovation_gate import GATE, chi2_of
 
 _FLOOR = np.diag(PREDICTION_FLOOR_SIGMAS**2)  # no way is known better
@@ -44,9 +44,9 @@ class RecentScansSettings:
     shared: float = 0.75
 
     def __post_init__(self) -> None:
-        from_0(self, "count")
-        above_0(self, "distance_m", "angle_deg")
-        expect(self, "shared", 0 <= self.shared < 1, "from 0 to below 1")
+        check_not_negative(self, "count")
+        check_positive(self, "distance_m", "angle_deg")
+        check_setting(self, "shared", 0 <= self.shared < 1, "from 0 to below 1")
 
 
 class PairSource(ResidualSource, Protocol):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from hybridlio.core.setting_checks import above_0, expect, from_0, shares
+from hybridlio.core.setting_checks import check_fraction, check_not_negative, check_positive, check_setting
 from hybridlio.registration.icp import RegistrationSettings
 from hybridlio.registration.local_map import LocalMapSettings
 
@@ -51,10 +51,12 @@ class ScanMatchingSettings:
     local_map: LocalMapSettings = field(default_factory=LocalMapSettings)
 
     def __post_init__(self) -> None:
-        expect(self, "target", self.target in ("local-map", "last-scan"), "local-map or last-scan")
-        above_0(self, "map_voxel_m", "source_voxel_m", "covariance_scale")
-        from_0(self, "min_range_m", "min_points", "least_measured")
-        shares(self, "min_matched", "drift_share")
-        expect(self, "max_range_m", self.max_range_m > self.min_range_m, f"above min_range_m, {self.min_range_m}")
+        check_setting(self, "target", self.target in ("local-map", "last-scan"), "local-map or last-scan")
+        check_positive(self, "map_voxel_m", "source_voxel_m", "covariance_scale")
+        check_not_negative(self, "min_range_m", "min_points", "least_measured")
+        check_fraction(self, "min_matched", "drift_share")
+        check_setting(
+            self, "max_range_m", self.max_range_m > self.min_range_m, f"above min_range_m, {self.min_range_m}"
+        )
         for name in ("start_speeds_m_s", "start_rates_deg_s"):
-            expect(self, name, len(getattr(self, name)) > 0, "one number at least")
+            check_setting(self, name, len(getattr(self, name)) > 0, "one number at least")

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from hybridlio.core import se3
+from hybridlio.core.covariance import check_covariance
 from hybridlio.core.errors import DataError
-from hybridlio.core.estimates import RelativePose, check_covariance
+from hybridlio.core.estimates import RelativePose
 
 STEP = se3.exp(np.array([0.01, -0.02, 0.1, 1.0, 0.2, -0.1]))
 

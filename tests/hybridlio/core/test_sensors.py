@@ -141,9 +141,9 @@ def test_calibration_takes_rounded_extrinsics_and_refuses_what_is_not_rigid() ->
     [
         ([0.0, np.nan, 0.0], np.eye(3), "three finite metres"),
         ([0.0, 0.0], np.eye(3), "three finite metres"),
-        ([0.0, 0.0, 0.0], np.eye(2), "positive definite"),
-        ([0.0, 0.0, 0.0], np.diag([1.0, 1.0, 0.0]), "positive definite"),
-        ([0.0, 0.0, 0.0], np.full((3, 3), np.inf), "positive definite"),
+        ([0.0, 0.0, 0.0], np.eye(2), "covariance"),
+        ([0.0, 0.0, 0.0], np.diag([1.0, 1.0, 0.0]), "covariance"),
+        ([0.0, 0.0, 0.0], np.full((3, 3), np.inf), "covariance"),
     ],
 )
 def test_a_fix_that_says_nothing_of_a_place_is_refused_with_its_stamp(position, covariance, says) -> None:

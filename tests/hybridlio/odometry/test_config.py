@@ -186,7 +186,7 @@ def test_no_number_may_be_negative_or_none_and_its_path_is_given(path: str, valu
     ("changed", "wanted"),
     [
         ({"scan_matching": {"min_range_m": 50.0, "max_range_m": 40.0}}, "scan_matching.max_range_m: must be above min"),
-        ({"scan_matching": {"min_matched": 1.1}}, "scan_matching.min_matched: must be within 0 and 1, got 1.1"),
+        ({"scan_matching": {"min_matched": 1.1}}, "scan_matching.min_matched: must be between 0 and 1, got 1.1"),
         ({"scan_matching": {"start_speeds_m_s": []}}, "scan_matching.start_speeds_m_s: must be one number at least"),
         ({"network": {"start_speeds_m_s": []}}, "network.start_speeds_m_s: must be one number at least"),
         ({"keyframes": {"max_range_m": 1e6}}, "keyframes.max_range_m: must be above 0 and below 164"),
@@ -212,7 +212,7 @@ def test_numbers_out_of_range_are_refused_and_all_of_them_named(changed: dict, w
         (lambda: LocalMapSettings(radius_m=float("nan")), "LocalMapSettings.radius_m: must be above 0, got nan"),
         (lambda: VerificationSettings(neighbours=4), "VerificationSettings.neighbours: must be 5 or more"),
         (lambda: LocalMapSettings(neighbours=4), "LocalMapSettings.neighbours: must be 5 or more"),
-        (lambda: VerificationSettings(max_cost=1.5), "VerificationSettings.max_cost: must be within 0 and 1, got 1.5"),
+        (lambda: VerificationSettings(max_cost=1.5), "VerificationSettings.max_cost: must be between 0 and 1, got 1.5"),
         (lambda: CandidateSettings(compared=0), "CandidateSettings.compared: must be above 0, got 0"),
         (lambda: ConsistencySettings(inlier_share=1.0), "ConsistencySettings.inlier_share: must be above 0 and below"),
         (lambda: DescriptorSettings(beside_m=()), "DescriptorSettings.beside_m: must be one position at least"),
