@@ -27,7 +27,7 @@ from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.evaluation.ate_rpe import associate
 from hybridlio.evaluation.consistency import pose_consistency
-from hybridlio.record.keyframes import KeyframeMaker, Keyframes, KeyframeSettings
+from hybridlio.record.loop_keyframes import LoopKeyframes, LoopKeyframeSelector, LoopKeyframeSettings
 from hybridlio.record.record import Record
 from hybridlio.runs.folder import KEYFRAMES, RECORD, is_run_folder, read_run
 from hybridlio.runs.run import run_odometry
@@ -49,7 +49,7 @@ class Case:
 
 def of_recording(path: Path) -> Case:
     if is_run_folder(path):
-        record = replace(Record.load(path / RECORD), keyframes=Keyframes.load(path / KEYFRAMES))
+        record = replace(Record.load(path / RECORD), keyframes=LoopKeyframes.load(path / KEYFRAMES))
         stored = read_run(path)
         assert stored.reference is not None, f"{path}: its recording has no reference"
         return Case(path.name, record, stored.reference)
@@ -62,16 +62,16 @@ def of_recording(path: Path) -> Case:
 
 
 def of_seed(config: hl.SimulationConfig) -> Case:
-    """Keyframes of a simulated drive, and exact odometry; noise is added by :func:`drifted`."""
+    """Loop keyframes of a simulated drive, and exact odometry; noise is added by :func:`drifted`."""
     from hybridlio.simulation.plan import plan
     from hybridlio.simulation.rig import T_IMU_LIDAR
     from hybridlio.simulation.sensors.lidar import ray_pattern
     from hybridlio.simulation.simulate import scan_at
 
-    drive, pattern, settings = plan(config), ray_pattern(config.lidar_model), KeyframeSettings()
+    drive, pattern, settings = plan(config), ray_pattern(config.lidar_model), LoopKeyframeSettings()
     poses = drive.path.poses(drive.scan_times_s) @ T_IMU_LIDAR
     poses = se3.between(poses[0], poses)
-    maker, last = KeyframeMaker(settings), None
+    maker, last = LoopKeyframeSelector(settings), None
     for k in range(1, len(poses)):
         if last is not None and np.linalg.norm(poses[k, :3, 3] - last) < settings.spacing_m:
             continue

@@ -47,7 +47,7 @@ def smooth(
     _verbose: Verbose = 0,
 ) -> None:
     """Optimise all poses of a finished run at once, and leave the better trajectory with a report of its own."""
-    from hybridlio.record.keyframes import Keyframes
+    from hybridlio.record.loop_keyframes import LoopKeyframes
     from hybridlio.record.record import Record
     from hybridlio.runs.folder import KEYFRAMES, RECORD, SMOOTHED, new_run_folder, read_run
     from hybridlio.runs.write import write_smoothed
@@ -60,7 +60,7 @@ def smooth(
         raise ConfigError(f"{folder} is the run itself; choose another folder with -o")
     record = Record.load(run / RECORD)
     if loops:
-        record = replace(record, keyframes=Keyframes.load(run / KEYFRAMES))
+        record = replace(record, keyframes=LoopKeyframes.load(run / KEYFRAMES))
     start_ns = int(record.online.stamps_ns[0])
     options = gps and gps_options(antenna, max_shift, outage, start_ns)
     if out is not None:

@@ -15,7 +15,7 @@ from hybridlio.core.files import read_yaml
 from hybridlio.core.sensors import ImuNoise
 from hybridlio.core.setting_checks import SettingError
 from hybridlio.learned.source_settings import LstmSettings, NetworkResidualSettings
-from hybridlio.record.keyframes import KeyframeSettings
+from hybridlio.record.loop_keyframes import LoopKeyframeSettings
 from hybridlio.sources.recent_scans import RecentScansSettings
 from hybridlio.sources.scan_matching_settings import ScanMatchingSettings
 
@@ -49,7 +49,7 @@ class Config(BaseModel):
     recent_scans: RecentScansSettings = Field(default_factory=RecentScansSettings)
     lstm: LstmSettings = Field(default_factory=LstmSettings)
     network: NetworkResidualSettings = Field(default_factory=NetworkResidualSettings)
-    keyframes: KeyframeSettings = Field(default_factory=KeyframeSettings)
+    keyframes: LoopKeyframeSettings = Field(default_factory=LoopKeyframeSettings)
 
 
 def config_to_yaml(config: Config) -> str:

@@ -20,9 +20,9 @@ from hybridlio.core.start_state import start_state
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.late_imu import take_up_imu
 from hybridlio.odometry.registry import Setup, check_names, make_chosen
-from hybridlio.record.keyframes import KeyframeMaker
+from hybridlio.record.loop_keyframes import LoopKeyframeSelector
 from hybridlio.record.record import Record
-from hybridlio.record.recorder import RecordMaker, joined
+from hybridlio.record.recorder import Recorder, concatenate_imu
 from hybridlio.sources.innovation_gate import UNTESTED, Agreement, Witness
 
 _STARTS_WITHOUT_IMU = 3  # then the first step changes no more
@@ -89,8 +89,8 @@ class Odometry:
         check_names(*self._chosen)
         self._state: State | None = None
         self._first: Frame | None = None
-        self._made = RecordMaker()
-        self._keyframes = KeyframeMaker(config.keyframes)
+        self._made = Recorder()
+        self._keyframes = LoopKeyframeSelector(config.keyframes)
 
     def step(self, frame: Frame) -> Estimate:
         """Estimate the frame's pose.
@@ -171,7 +171,7 @@ class Odometry:
         near = ImuSamples.empty() if not len(first.imu) else first.imu.between(
             first.scan.stamp_ns - 10**9, first.scan.stamp_ns
         )  # fmt: skip
-        self._start_state = start_state(first.scan.stamp_ns, joined([near, frame.imu]), self._setup.imu_noise)
+        self._start_state = start_state(first.scan.stamp_ns, concatenate_imu([near, frame.imu]), self._setup.imu_noise)
         self._backend.start(self._start_state)
         return self._start_state
 

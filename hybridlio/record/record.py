@@ -19,7 +19,7 @@ from hybridlio.core.geodesy import GeodeticPoint
 from hybridlio.core.sensors import NS_PER_S, Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.core.start_state import start_state
 from hybridlio.core.trajectory import Trajectory
-from hybridlio.record.keyframes import Keyframes
+from hybridlio.record.loop_keyframes import LoopKeyframes
 from hybridlio.record.odometry_noise import odometry_noise
 from hybridlio.record.step_arrays import keyframe_arrays, relative_arrays, relatives, with_keyframes
 
@@ -53,7 +53,7 @@ class Record:
     start: State
     calibration: Calibration
     imu_noise: ImuNoise
-    keyframes: Keyframes | None = None
+    keyframes: LoopKeyframes | None = None
 
     @classmethod
     def from_odometry(

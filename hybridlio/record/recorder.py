@@ -12,14 +12,14 @@ from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.packed_arrays import PackedArray, packed, unpacked
 from hybridlio.core.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.core.trajectory import Trajectory
-from hybridlio.record.keyframes import Keyframes
+from hybridlio.record.loop_keyframes import LoopKeyframes
 from hybridlio.record.record import Record
 from hybridlio.record.step_arrays import keyframe_arrays, relative_arrays, relatives, with_keyframes
 
 _AT_ONCE = 50  # so many scans are packed together: as objects they take five times the memory
 
 
-class RecordMaker:
+class Recorder:
     """Takes in a run's estimates, samples and fixes."""
 
     def __init__(self) -> None:
@@ -61,7 +61,12 @@ class RecordMaker:
         self._recent.append(_Kept(stamp_ns, pose, covariance, step))  # last: with it the scan is there
 
     def record(
-        self, start: State, calibration: Calibration, noise: ImuNoise, keyframes: Keyframes, scans: int | None = None
+        self,
+        start: State,
+        calibration: Calibration,
+        noise: ImuNoise,
+        keyframes: LoopKeyframes,
+        scans: int | None = None,
     ) -> Record:
         """All so far, or the first ``scans`` of it."""
         parts = [*map(unpacked, self._packed), *([_arrays(self._recent)] if self._recent else [])]
@@ -76,7 +81,7 @@ class RecordMaker:
             initial=tuple(initial for initial, _ in steps),
             relative=tuple(relative for _, relative in steps),
             # an interrupt may have left more
-            imu=joined(self._imu).between(start.stamp_ns, last_ns),
+            imu=concatenate_imu(self._imu).between(start.stamp_ns, last_ns),
             gps=tuple(fix for fix in self._gps if fix.stamp_ns <= last_ns),
             start=start,
             calibration=calibration,
@@ -110,7 +115,7 @@ def _steps(arrays: dict[str, Any]) -> Iterator[tuple[RelativePose, RelativePose]
     return zip(relatives("initial", arrays), with_keyframes(relatives("relative", arrays), arrays), strict=True)
 
 
-def joined(parts: list[ImuSamples]) -> ImuSamples:
+def concatenate_imu(parts: list[ImuSamples]) -> ImuSamples:
     """Samples of consecutive intervals as one; those on a common border once."""
     parts = [part for part in parts if len(part)]
     if not parts:

@@ -17,7 +17,7 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Index
 from hybridlio.core.errors import DataError
 from hybridlio.core.estimates import RelativePose
-from hybridlio.record.keyframes import Keyframes
+from hybridlio.record.loop_keyframes import LoopKeyframes
 from hybridlio.record.record import Record
 from hybridlio.smoothing.loop_candidates import Candidate, CandidateFinder, CandidateSettings
 from hybridlio.smoothing.loop_consistency import (
@@ -162,7 +162,7 @@ def consistent(
     return tuple(one for one, is_kept in zip(left, kept, strict=True) if is_kept), tuple(rejected)
 
 
-def _keyframes_of(record: Record) -> Keyframes:
+def _keyframes_of(record: Record) -> LoopKeyframes:
     keyframes = record.keyframes
     if keyframes is None:
         raise DataError("the record has no keyframes, which loop closure needs; run the odometry again")

@@ -20,7 +20,7 @@ from hybridlio.cloud.voxel import voxel_average, voxel_pick
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Index
 from hybridlio.core.setting_checks import check_fraction, check_not_negative, check_positive, check_setting
-from hybridlio.record.keyframes import Keyframes
+from hybridlio.record.loop_keyframes import LoopKeyframes
 from hybridlio.registration.icp import Registration, RegistrationSettings, fit_at, register
 from hybridlio.registration.information import NORMAL_NOISE, covariance_of, degenerate_directions
 from hybridlio.registration.surface import Surface
@@ -127,7 +127,7 @@ class Verifier:
         settings: limits.
     """
 
-    def __init__(self, keyframes: Keyframes, chain: OdometryChain, settings: VerificationSettings) -> None:
+    def __init__(self, keyframes: LoopKeyframes, chain: OdometryChain, settings: VerificationSettings) -> None:
         self._keyframes, self._chain, self._settings = keyframes, chain, settings
         self._surface = lru_cache(_SURFACES_KEPT)(self._make_surface)
         self._source = lru_cache(_SURFACES_KEPT)(self._make_source)

@@ -10,7 +10,7 @@ import pytest
 from command_line import ok, refused, run
 
 from hybridlio.core.trajectory_files import read_tum
-from hybridlio.record.keyframes import Keyframes
+from hybridlio.record.loop_keyframes import LoopKeyframes
 from hybridlio.runs.folder import FILES
 
 pytestmark = pytest.mark.usefixtures("plain_logging")
@@ -156,7 +156,7 @@ def test_the_vertical_angle_can_be_set(tiny_drive, tmp_path, without_pages):
     heights = []
     for name, angle in (("as-is", 0), ("raised", 1)):
         ok("odometry", tiny_drive, "--vertical-angle", angle, "--frames", ":3", "-o", tmp_path / name)
-        heights.append(float(Keyframes.load(tmp_path / name / "keyframes.npz").points(0)[:, 2].mean()))
+        heights.append(float(LoopKeyframes.load(tmp_path / name / "keyframes.npz").points(0)[:, 2].mean()))
     assert heights[1] > heights[0] + 0.05
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from hybridlio.core.packed_arrays import PackedArray, PackedCloud, PackedList, packed, unpacked
-from hybridlio.record.keyframes import KeyframeSettings, compact
+from hybridlio.record.loop_keyframes import LoopKeyframeSettings, compress
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,7 @@ def test_a_cloud_comes_back_as_it_was_to_the_farthest_that_it_can_hold(rng: np.r
 def test_a_keyframes_cloud_takes_less_memory(rng: np.random.Generator):
     ground = rng.uniform([-40, -40, -1.72], [40, 40, -1.68], (30_000, 3))
     walls = rng.uniform([-40, 9.98, -1.7], [40, 10.02, 6], (10_000, 3))
-    cloud = compact(np.concatenate([ground, walls]).astype(np.float32), KeyframeSettings(max_points=100_000))
+    cloud = compress(np.concatenate([ground, walls]).astype(np.float32), LoopKeyframeSettings(max_points=100_000))
     packed_cloud = PackedCloud.of(cloud, 140)
     assert len(packed_cloud.cells) + len(packed_cloud.inside) < 0.6 * cloud.nbytes
 

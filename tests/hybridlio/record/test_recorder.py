@@ -7,9 +7,9 @@ from hybridlio.core import se3
 from hybridlio.core.estimates import KeyframePose, RelativePose
 from hybridlio.core.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.core.start_state import start_state
-from hybridlio.record.keyframes import KeyframeMaker, Keyframes, KeyframeSettings
+from hybridlio.record.loop_keyframes import LoopKeyframes, LoopKeyframeSelector, LoopKeyframeSettings
 from hybridlio.record.record import Record
-from hybridlio.record.recorder import RecordMaker, joined
+from hybridlio.record.recorder import Recorder, concatenate_imu
 
 STEP_NS = 10**8
 
@@ -36,7 +36,7 @@ def random_step(rng: np.random.Generator, k: int) -> RelativePose:
 
 
 def test_steps_that_have_become_arrays_are_as_they_were(rng: np.random.Generator):
-    made, steps = RecordMaker(), [(random_step(rng, k), random_step(rng, k + 1)) for k in range(250)]
+    made, steps = Recorder(), [(random_step(rng, k), random_step(rng, k + 1)) for k in range(250)]
     made.add(0, np.eye(4), np.eye(6))
     for k, step in enumerate(steps):
         made.add((k + 1) * STEP_NS, se3.exp(np.full(6, k / 1000)), random_covariance(rng), step)
@@ -44,7 +44,7 @@ def test_steps_that_have_become_arrays_are_as_they_were(rng: np.random.Generator
         start_state(0, ImuSamples.empty(), ImuNoise()),
         Calibration(),
         ImuNoise(),
-        KeyframeMaker(KeyframeSettings()).keyframes(),
+        LoopKeyframeSelector(LoopKeyframeSettings()).keyframes(),
     )
     assert len(made) == len(record.online) == 251
     assert made.last_ns == record.online.stamps_ns[-1] == 250 * STEP_NS
@@ -67,8 +67,8 @@ def test_steps_that_have_become_arrays_are_as_they_were(rng: np.random.Generator
             np.testing.assert_array_equal(b.covariance, a.covariance)
 
 
-def five_scans() -> RecordMaker:
-    made = RecordMaker()
+def five_scans() -> Recorder:
+    made = Recorder()
     for k in range(5):
         stamps = np.arange(max(k - 1, 0) * STEP_NS, k * STEP_NS + 1, STEP_NS // 10)
         samples = ImuSamples(stamps, np.zeros((len(stamps), 3)), np.zeros((len(stamps), 3)))
@@ -78,14 +78,14 @@ def five_scans() -> RecordMaker:
     return made
 
 
-def record_of(made: RecordMaker, keyframes: Keyframes, scans: int | None = None) -> Record:
+def record_of(made: Recorder, keyframes: LoopKeyframes, scans: int | None = None) -> Record:
     return made.record(start_state(0, ImuSamples.empty(), ImuNoise()), Calibration(), ImuNoise(), keyframes, scans)
 
 
-def three_keyframes() -> Keyframes:
+def three_keyframes() -> LoopKeyframes:
     """Of scans 1, 3 and 4."""
     rows = np.array([1, 3, 4])
-    return Keyframes(rows, rows * STEP_NS, tuple(np.full((1, 3), row, np.int16) for row in rows))
+    return LoopKeyframes(rows, rows * STEP_NS, tuple(np.full((1, 3), row, np.int16) for row in rows))
 
 
 def test_the_first_scans_of_a_record_bring_what_belongs_to_them_and_no_more():
@@ -104,13 +104,13 @@ def test_an_interrupt_while_a_scan_is_taken_in_leaves_the_scans_before(monkeypat
     """At any line of it, as a signal may come between any two."""
     step = RelativePose(np.eye(4), np.eye(6), "here")
     for line in range(1, 12):
-        made = RecordMaker()
+        made = Recorder()
         for k in range(scans):
             made.add(k * STEP_NS, np.eye(4), np.eye(6), (step, step) if k else None)
         lines = iter(range(1, 100))
 
         def tracer(frame, event, _arg, lines=lines, stop=line):
-            if frame.f_code is not RecordMaker.add.__code__:
+            if frame.f_code is not Recorder.add.__code__:
                 return None
             if event == "line" and next(lines) == stop:
                 raise KeyboardInterrupt
@@ -124,7 +124,7 @@ def test_an_interrupt_while_a_scan_is_taken_in_leaves_the_scans_before(monkeypat
             assert made.last_ns == (scans - 1) * STEP_NS
         finally:
             sys.settrace(None)
-        record = record_of(made, KeyframeMaker(KeyframeSettings()).keyframes())
+        record = record_of(made, LoopKeyframeSelector(LoopKeyframeSettings()).keyframes())
         assert record.online.stamps_ns.tolist() == [k * STEP_NS for k in range(len(made))]
         assert len(record.relative) == len(made) - 1
 
@@ -132,7 +132,7 @@ def test_an_interrupt_while_a_scan_is_taken_in_leaves_the_scans_before(monkeypat
 def test_samples_on_a_common_border_are_taken_once():
     stamps = np.arange(11) * 10**7
     whole = ImuSamples(stamps, np.arange(33.0).reshape(11, 3), np.arange(33.0).reshape(11, 3))
-    again = joined([whole.between(0, 5 * 10**7), ImuSamples.empty(), whole.between(5 * 10**7, 10**8)])
+    again = concatenate_imu([whole.between(0, 5 * 10**7), ImuSamples.empty(), whole.between(5 * 10**7, 10**8)])
     np.testing.assert_array_equal(again.stamps_ns, stamps)
     np.testing.assert_array_equal(again.gyro_rad_s, whole.gyro_rad_s)
-    assert len(joined([])) == 0
+    assert len(concatenate_imu([])) == 0

@@ -14,9 +14,9 @@ from hybridlio.graph import PoseGraph
 from hybridlio.graph.run.smooth import smooth
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.odometry import Odometry
-from hybridlio.record.keyframes import KeyframeMaker, KeyframeSettings
+from hybridlio.record.loop_keyframes import LoopKeyframeSelector, LoopKeyframeSettings
 from hybridlio.record.record import Record
-from hybridlio.record.recorder import RecordMaker
+from hybridlio.record.recorder import Recorder
 from hybridlio.runs.run import Run, run_odometry
 from hybridlio.runs.write import notes, write_run
 from hybridlio.sources.innovation_gate import Agreement
@@ -122,7 +122,7 @@ def test_an_interrupt_keeps_what_was_estimated(whole, sequence):
     assert len(run.record.online) == 9
 
 
-@pytest.mark.parametrize("within", [KeyframeMaker.offer, PackedCloud.of, RecordMaker.add, Odometry.step])
+@pytest.mark.parametrize("within", [LoopKeyframeSelector.offer, PackedCloud.of, Recorder.add, Odometry.step])
 def test_an_interrupt_at_the_end_of_any_bookkeeping_leaves_a_run_that_can_be_smoothed(within, sequence, tmp_path):
     """When a call returns for the seventh time, its work done, and its caller's not."""
     returned = iter(range(1, 100))
@@ -134,7 +134,7 @@ def test_an_interrupt_at_the_end_of_any_bookkeeping_leaves_a_run_that_can_be_smo
             raise KeyboardInterrupt
         return tracer
 
-    config = Config(residual="none", keyframes=KeyframeSettings(spacing_m=1e-6))
+    config = Config(residual="none", keyframes=LoopKeyframeSettings(spacing_m=1e-6))
     sys.settrace(tracer)
     try:
         run = run_odometry(sequence, Odometry(config=config))

@@ -14,7 +14,7 @@ from hybridlio.core.estimates import RelativePose
 from hybridlio.core.sensors import Calibration, ImuNoise, ImuSamples, Scan
 from hybridlio.core.start_state import start_state
 from hybridlio.core.trajectory import Trajectory
-from hybridlio.record.keyframes import KeyframeMaker, KeyframeSettings
+from hybridlio.record.loop_keyframes import LoopKeyframeSelector, LoopKeyframeSettings
 from hybridlio.record.record import Record
 from hybridlio.smoothing.loop_closure import Loop, LoopSearch, find_loops
 
@@ -82,7 +82,7 @@ def make_loop_drive(
     poses = _way(corners)
     town = _town(rng, poses[:, :2, 3]) if clouds else None
     stamps = 10**18 + np.arange(len(poses)) * 10**8
-    maker = KeyframeMaker(KeyframeSettings(spacing_m=3.5))
+    maker = LoopKeyframeSelector(LoopKeyframeSettings(spacing_m=3.5))
     for k, pose in enumerate(poses):
         if town is not None and k % 4 == 0:
             near = town[np.linalg.norm(town[:, :2] - pose[:2, 3], axis=1) < 45.0]

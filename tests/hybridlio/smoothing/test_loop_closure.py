@@ -9,7 +9,7 @@ import pytest
 from hybridlio.core import se3
 from hybridlio.core.errors import DataError
 from hybridlio.evaluation.consistency import pose_consistency
-from hybridlio.record.keyframes import Keyframes
+from hybridlio.record.loop_keyframes import LoopKeyframes
 from hybridlio.smoothing.loop_closure import Loop, LoopSearch, consistent, find_loops
 from hybridlio.smoothing.loop_consistency import ConsistencySettings
 from hybridlio.smoothing.step_uncertainty import OdometryChain
@@ -100,8 +100,8 @@ def test_a_record_without_keyframes_is_told_what_to_do(round_trip: Any):
 
 def test_keyframes_of_another_run_are_refused(round_trip: Any):
     keyframes = round_trip.record.keyframes
-    moved = Keyframes(keyframes.rows, keyframes.stamps_ns + 1, keyframes.clouds)
-    late = Keyframes(keyframes.rows + 1000, keyframes.stamps_ns, keyframes.clouds)
+    moved = LoopKeyframes(keyframes.rows, keyframes.stamps_ns + 1, keyframes.clouds)
+    late = LoopKeyframes(keyframes.rows + 1000, keyframes.stamps_ns, keyframes.clouds)
     for other in (moved, late):
         with pytest.raises(DataError, match="another run"):
             find_loops(replace(round_trip.record, keyframes=other))

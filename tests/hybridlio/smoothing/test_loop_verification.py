@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hybridlio.core import se3
-from hybridlio.record.keyframes import RESOLUTION_M, Keyframes
+from hybridlio.record.loop_keyframes import RESOLUTION_M, LoopKeyframes
 from hybridlio.smoothing.loop_verification import VerificationSettings, Verifier
 from hybridlio.smoothing.step_uncertainty import OdometryChain
 
@@ -61,7 +61,7 @@ def test_bare_ground_holds_too_little(round_trip: Any, rng: np.random.Generator)
     flat = np.column_stack([rng.uniform(-40, 40, (4000, 2)), rng.normal(-1.8, 0.01, 4000)])
     clouds = tuple(np.round(flat / RESOLUTION_M).astype(np.int16) for _ in rows)
     chain = OdometryChain(round_trip.record)
-    verdict = Verifier(Keyframes(rows, stamps, clouds), chain, VerificationSettings()).verify(3, 70, [np.eye(4)])
+    verdict = Verifier(LoopKeyframes(rows, stamps, clouds), chain, VerificationSettings()).verify(3, 70, [np.eye(4)])
     assert verdict.reason == "hardly anything stands out of the ground"
 
 
@@ -73,7 +73,7 @@ def test_one_wall_alone_leaves_the_way_along_it_open(round_trip: Any, rng: np.ra
     cloud = np.concatenate([flat, wall]) + rng.normal(0.0, 0.01, (5000, 3))
     clouds = tuple(np.round(cloud / RESOLUTION_M).astype(np.int16) for _ in rows)
     chain = OdometryChain(replace(round_trip.record, online=straight))
-    verdict = Verifier(Keyframes(rows, stamps, clouds), chain, VerificationSettings()).verify(3, 70, [np.eye(4)])
+    verdict = Verifier(LoopKeyframes(rows, stamps, clouds), chain, VerificationSettings()).verify(3, 70, [np.eye(4)])
     assert verdict.reason == "a direction is not held"
 
 

@@ -16,7 +16,7 @@ from hybridlio.core.errors import DataError
 from hybridlio.graph import PoseGraph
 from hybridlio.graph.run.loop_factors import ClosedLoops, LoopClosures
 from hybridlio.graph.run.smooth import Smoothed
-from hybridlio.record.keyframes import Keyframes
+from hybridlio.record.loop_keyframes import LoopKeyframes
 from hybridlio.runs import folder as run_folder
 from hybridlio.runs.folder import StoredRun
 from hybridlio.runs.write import write_smoothed
@@ -104,7 +104,7 @@ def test_a_finished_run_is_smoothed_with_loops_on_the_command_line(tiny_drive: P
     run = tmp_path / "run"
     done = CliRunner().invoke(app, ["odometry", str(tiny_drive), "-o", str(run)])
     assert done.exit_code == 0, done.output
-    assert len(Keyframes.load(run / run_folder.KEYFRAMES)) >= 4
+    assert len(LoopKeyframes.load(run / run_folder.KEYFRAMES)) >= 4
     done = CliRunner().invoke(app, ["smooth", str(run), "--loops"])
     assert done.exit_code == 0, done.output
     assert "loops: 0 candidates, 0 verified, 0 consistent, 0 kept" in done.output

@@ -8,15 +8,21 @@ import pytest
 from hybridlio.core import se3
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.sensors import Scan
-from hybridlio.record.keyframes import RESOLUTION_M, KeyframeMaker, Keyframes, KeyframeSettings, compact
+from hybridlio.record.loop_keyframes import (
+    RESOLUTION_M,
+    LoopKeyframes,
+    LoopKeyframeSelector,
+    LoopKeyframeSettings,
+    compress,
+)
 
 
 def scan(rng: np.random.Generator, stamp_ns: int = 10**18, points: int = 40_000, reach_m: float = 100.0) -> Scan:
     return Scan(stamp_ns, rng.uniform(-reach_m, reach_m, (points, 3)).astype(np.float32))
 
 
-def driven(rng: np.random.Generator, steps: int, step_m: float, settings: KeyframeSettings) -> Keyframes:
-    maker = KeyframeMaker(settings)
+def driven(rng: np.random.Generator, steps: int, step_m: float, settings: LoopKeyframeSettings) -> LoopKeyframes:
+    maker = LoopKeyframeSelector(settings)
     for k in range(steps):
         pose = se3.make(np.eye(3), (k * step_m, 0.0, 0.0))
         maker.offer(k, scan(rng, 10**18 + k * 10**8, points=500, reach_m=40.0), pose)
@@ -24,17 +30,17 @@ def driven(rng: np.random.Generator, steps: int, step_m: float, settings: Keyfra
 
 
 def test_a_keyframe_is_kept_each_time_the_way_from_the_last_one_is_long_enough(rng: np.random.Generator):
-    keyframes = driven(rng, 30, 0.9, KeyframeSettings(spacing_m=2.5))
+    keyframes = driven(rng, 30, 0.9, LoopKeyframeSettings(spacing_m=2.5))
     assert keyframes.rows.tolist() == list(range(0, 30, 3))
     assert keyframes.stamps_ns.tolist() == [10**18 + k * 10**8 for k in range(0, 30, 3)]
 
 
 def test_a_vehicle_that_stands_leaves_one_keyframe(rng: np.random.Generator):
-    assert len(driven(rng, 30, 0.0, KeyframeSettings())) == 1
+    assert len(driven(rng, 30, 0.0, LoopKeyframeSettings())) == 1
 
 
 def test_a_scan_of_few_points_is_passed_over_for_the_next(rng: np.random.Generator):
-    maker = KeyframeMaker(KeyframeSettings())
+    maker = LoopKeyframeSelector(LoopKeyframeSettings())
     assert not maker.offer(0, Scan(1, np.empty((0, 3), np.float32)), np.eye(4))
     assert not maker.offer(1, scan(rng, 2, points=100), np.eye(4))
     assert maker.offer(2, scan(rng, 3), np.eye(4))
@@ -42,8 +48,8 @@ def test_a_scan_of_few_points_is_passed_over_for_the_next(rng: np.random.Generat
 
 
 def test_a_kilometre_takes_no_more_than_is_said(rng: np.random.Generator):
-    settings = KeyframeSettings()
-    clouds = [compact(scan(rng, reach_m=60.0).points, settings) for _ in range(3)]
+    settings = LoopKeyframeSettings()
+    clouds = [compress(scan(rng, reach_m=60.0).points, settings) for _ in range(3)]
     assert {len(cloud) for cloud in clouds} == {settings.max_points}
     bytes_a_km = 1000 / settings.spacing_m * max(cloud.nbytes for cloud in clouds)
     assert bytes_a_km <= 7.5e6
@@ -51,8 +57,8 @@ def test_a_kilometre_takes_no_more_than_is_said(rng: np.random.Generator):
 
 def test_points_are_where_they_were_to_half_the_resolution(rng: np.random.Generator):
     points = rng.uniform(-40, 40, (300, 3)).astype(np.float32)
-    cloud = compact(points, KeyframeSettings(voxel_m=0.01))
-    maker = KeyframeMaker(KeyframeSettings(voxel_m=0.01))
+    cloud = compress(points, LoopKeyframeSettings(voxel_m=0.01))
+    maker = LoopKeyframeSelector(LoopKeyframeSettings(voxel_m=0.01))
     maker.offer(0, Scan(1, points), np.eye(4))
     back = maker.keyframes().points(0)
     np.testing.assert_array_equal(back, cloud * RESOLUTION_M)
@@ -61,14 +67,14 @@ def test_points_are_where_they_were_to_half_the_resolution(rng: np.random.Genera
 
 
 def test_points_out_of_range_are_left_out(rng: np.random.Generator):
-    cloud = compact(scan(rng).points, KeyframeSettings(max_range_m=30.0))
+    cloud = compress(scan(rng).points, LoopKeyframeSettings(max_range_m=30.0))
     assert np.linalg.norm(cloud * RESOLUTION_M, axis=1).max() < 30.1
 
 
 def test_keyframes_come_back_as_they_were_saved(rng: np.random.Generator, tmp_path: Path):
-    keyframes = driven(rng, 20, 1.0, KeyframeSettings(spacing_m=3.0))
+    keyframes = driven(rng, 20, 1.0, LoopKeyframeSettings(spacing_m=3.0))
     keyframes.save(tmp_path / "keyframes.npz")
-    loaded = Keyframes.load(tmp_path / "keyframes.npz")
+    loaded = LoopKeyframes.load(tmp_path / "keyframes.npz")
     np.testing.assert_array_equal(loaded.rows, keyframes.rows)
     np.testing.assert_array_equal(loaded.stamps_ns, keyframes.stamps_ns)
     assert len(loaded.clouds) == len(keyframes.clouds)
@@ -77,8 +83,8 @@ def test_keyframes_come_back_as_they_were_saved(rng: np.random.Generator, tmp_pa
 
 
 def test_a_run_without_keyframes_has_a_file_too(tmp_path: Path):
-    KeyframeMaker(KeyframeSettings()).keyframes().save(tmp_path / "keyframes.npz")
-    assert len(Keyframes.load(tmp_path / "keyframes.npz")) == 0
+    LoopKeyframeSelector(LoopKeyframeSettings()).keyframes().save(tmp_path / "keyframes.npz")
+    assert len(LoopKeyframes.load(tmp_path / "keyframes.npz")) == 0
 
 
 def _cut(path: Path) -> None:
@@ -123,19 +129,19 @@ def test_a_damaged_file_is_one_clear_error_that_says_what_to_do(
     rng: np.random.Generator, tmp_path: Path, damage: Callable[[Path], None]
 ):
     path = tmp_path / "keyframes.npz"
-    driven(rng, 20, 1.0, KeyframeSettings()).save(path)
+    driven(rng, 20, 1.0, LoopKeyframeSettings()).save(path)
     damage(path)
     with pytest.raises(DataError, match=r"keyframes.npz: .*hybridlio odometry"):
-        Keyframes.load(path)
+        LoopKeyframes.load(path)
 
 
 def test_a_run_folder_of_before_keyframes_is_told_what_to_do(tmp_path: Path):
     with pytest.raises(DataError, match=r"no keyframes.*run `hybridlio odometry` again"):
-        Keyframes.load(tmp_path / "keyframes.npz")
+        LoopKeyframes.load(tmp_path / "keyframes.npz")
 
 
 def test_the_file_holds_plain_arrays_alone(rng: np.random.Generator, tmp_path: Path):
-    driven(rng, 20, 1.0, KeyframeSettings()).save(tmp_path / "keyframes.npz")
+    driven(rng, 20, 1.0, LoopKeyframeSettings()).save(tmp_path / "keyframes.npz")
     with zipfile.ZipFile(tmp_path / "keyframes.npz") as file:
         assert all(name.endswith(".npy") for name in file.namelist())
     assert [path.name for path in tmp_path.iterdir()] == ["keyframes.npz"]
@@ -143,14 +149,14 @@ def test_the_file_holds_plain_arrays_alone(rng: np.random.Generator, tmp_path: P
 
 @pytest.mark.parametrize("wrong", [{"spacing_m": 0.0}, {"voxel_m": -1.0}, {"max_range_m": 200.0}, {"max_points": 0}])
 def test_settings_that_mean_nothing_are_refused(wrong: dict[str, float]):
-    with pytest.raises(ConfigError, match="KeyframeSettings"):
-        KeyframeSettings(**wrong)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="LoopKeyframeSettings"):
+        LoopKeyframeSettings(**wrong)  # type: ignore[arg-type]
 
 
 def test_clouds_come_out_of_a_run_as_they_went_in(rng: np.random.Generator):
-    made, settings = KeyframeMaker(KeyframeSettings()), KeyframeSettings()
+    made, settings = LoopKeyframeSelector(LoopKeyframeSettings()), LoopKeyframeSettings()
     scans = [Scan(k, rng.uniform(-79, 79, (4000, 3)).astype(np.float32)) for k in range(3)]
     for k, scan in enumerate(scans):
         assert made.offer(k, scan, se3.make(np.eye(3), [10.0 * k, 0, 0]))
     for scan, cloud in zip(scans, made.keyframes().clouds, strict=True):
-        np.testing.assert_array_equal(cloud, compact(scan.points, settings))
+        np.testing.assert_array_equal(cloud, compress(scan.points, settings))

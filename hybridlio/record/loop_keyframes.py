@@ -1,4 +1,4 @@
-"""Keyframes: a compact cloud every few metres, kept beside a run's record so that loops can be closed afterwards.
+"""LoopKeyframes: a compress cloud every few metres, kept beside a run's record so that loops can be closed afterwards.
 
 A cloud takes six bytes a point, so a kilometre takes at most ``1000 / spacing_m · max_points · 6`` bytes: 7.5 MB with
 the default settings. During a run, packed, it takes five ninths of that in memory; the file is about half of it.
@@ -28,7 +28,7 @@ _MIN_POINTS = 200
 
 
 @dataclass(frozen=True)
-class KeyframeSettings:
+class LoopKeyframeSettings:
     """Which clouds are kept.
 
     Attributes:
@@ -55,7 +55,7 @@ class KeyframeSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Keyframes:
+class LoopKeyframes:
     """The keyframes of a run.
 
     Attributes:
@@ -82,10 +82,10 @@ class Keyframes:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def until(self, row: int) -> Keyframes:
+    def until(self, row: int) -> LoopKeyframes:
         """Those of the estimates before ``row``."""
         count = int(np.searchsorted(self.rows, row))
-        return Keyframes(self.rows[:count], self.stamps_ns[:count], self.clouds[:count])
+        return LoopKeyframes(self.rows[:count], self.stamps_ns[:count], self.clouds[:count])
 
     def points(self, k: int) -> Array:
         """Points ``(n, 3)`` of keyframe ``k`` in metres."""
@@ -102,7 +102,7 @@ class Keyframes:
             )  # fmt: skip
 
     @classmethod
-    def load(cls, path: Path) -> Keyframes:
+    def load(cls, path: Path) -> LoopKeyframes:
         """Read keyframes written by :meth:`save`; never executes anything in the file.
 
         Raises:
@@ -125,10 +125,10 @@ class Keyframes:
             raise DataError(f"{path}: not the keyframes of a run ({error}); run `hybridlio odometry` again") from error
 
 
-class KeyframeMaker:
+class LoopKeyframeSelector:
     """Takes the scans of a run in order, from the second on, and keeps one every few metres."""
 
-    def __init__(self, settings: KeyframeSettings) -> None:
+    def __init__(self, settings: LoopKeyframeSettings) -> None:
         self._settings = settings
         self._position: Array | None = None
         self._kept: list[tuple[int, int, PackedCloud]] = []  # row, stamp, points
@@ -145,20 +145,20 @@ class KeyframeMaker:
         position = pose[:3, 3]
         if self._position is not None and np.linalg.norm(position - self._position) < self._settings.spacing_m:
             return False
-        cloud = compact(scan.points, self._settings)
+        cloud = compress(scan.points, self._settings)
         if len(cloud) < _MIN_POINTS:
             return False
         self._kept.append((row, scan.stamp_ns, PackedCloud.of(cloud, self._step)))
         self._position = position.copy()
         return True
 
-    def keyframes(self) -> Keyframes:
+    def keyframes(self) -> LoopKeyframes:
         """All so far."""
         rows, stamps = (np.array([kept[i] for kept in self._kept], np.int64) for i in (0, 1))
-        return Keyframes(rows, stamps, tuple(cloud.cloud() for _, _, cloud in self._kept))
+        return LoopKeyframes(rows, stamps, tuple(cloud.cloud() for _, _, cloud in self._kept))
 
 
-def compact(points: NDArray[np.float32], settings: KeyframeSettings) -> NDArray[np.int16]:
+def compress(points: NDArray[np.float32], settings: LoopKeyframeSettings) -> NDArray[np.int16]:
     """The points ``(N, 3)`` within range, one a voxel, as ``(n, 3)`` int16 in units of :data:`RESOLUTION_M`."""
     some = points[:: max(1, len(points) // _ENOUGH_POINTS)]
     some = some[np.einsum("ij,ij->i", some, some) < np.float32(settings.max_range_m) ** 2]
