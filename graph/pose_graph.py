@@ -254,7 +254,10 @@ class PoseGraph(GraphData):
         """
         from hybridlio.graph.formats.files import load
 
-        return load(path)
+        data = load(path)
+        graph = cls(data.dimension)
+        vars(graph).update(vars(data))
+        return graph
 
     def save(self, path: str | os.PathLike[str], solution: Solution | None = None) -> None:
         """Write ``.npz`` (everything), ``.g2o`` or TORO's ``.graph``, by the name's ending.

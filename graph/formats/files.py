@@ -4,25 +4,20 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from hybridlio.core.errors import DataError
 from hybridlio.graph.formats.npz import read_npz, write_npz
 from hybridlio.graph.formats.text_reader import read_text
 from hybridlio.graph.formats.text_writer import write_text
-from hybridlio.graph.model.graph_data import GraphData
-
-if TYPE_CHECKING:
-    from hybridlio.graph.pose_graph import PoseGraph
-    from hybridlio.graph.solve.solution import Solution
+from hybridlio.graph.model.graph_data import GraphData, PosesByKey
 
 
-def load(path: str | os.PathLike[str]) -> PoseGraph:
+def load(path: str | os.PathLike[str]) -> GraphData:
     """Read a pose graph: ``.npz`` is ours, anything else text."""
     return read_npz(path) if Path(path).suffix == ".npz" else read_text(path)
 
 
-def save(data: GraphData, path: str | os.PathLike[str], solution: Solution | None) -> None:
+def save(data: GraphData, path: str | os.PathLike[str], solution: PosesByKey | None) -> None:
     """Write a pose graph, with a solution's poses as initial values if one is given."""
     if solution is not None:
         data = data.without()

@@ -18,7 +18,6 @@ from hybridlio.graph.model.edge_table import FORMS
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, check_key
 from hybridlio.graph.model.measurements import Factor, Kind, Noise, Robust, check_vector, make_noise, make_robust
-from hybridlio.graph.pose_graph import PoseGraph
 
 _FORMAT = "hybridlio pose graph 1"
 _NO_ROBOT = -1
@@ -94,7 +93,7 @@ def _columns(numbered: dict[int, Factor]) -> dict[str, Any]:
     return columns
 
 
-def read_npz(path: str | os.PathLike[str]) -> PoseGraph:
+def read_npz(path: str | os.PathLike[str]) -> GraphData:
     """Read what :func:`write_npz` wrote.
 
     Raises:
@@ -113,8 +112,8 @@ def read_npz(path: str | os.PathLike[str]) -> PoseGraph:
         raise DataError(f"{path}: no pose graph, or a damaged one: {error}") from error
 
 
-def _assemble(arrays: dict[str, Any]) -> PoseGraph:
-    graph = PoseGraph(int(arrays["dimension"]))  # type: ignore[arg-type]
+def _assemble(arrays: dict[str, Any]) -> GraphData:
+    graph = GraphData(int(arrays["dimension"]))  # type: ignore[arg-type]
     if "origin" in arrays:
         graph.set_origin(*arrays["origin"].tolist())
     size = len(co.IDENTITY[graph.dimension])

@@ -15,9 +15,9 @@ from hybridlio.core.errors import DataError, GraphError, HybridLioError
 from hybridlio.graph.formats.g2o import OTHER, ROWS
 from hybridlio.graph.formats.text_rows import Rows, Table, checked_ids, read_rows
 from hybridlio.graph.model import coordinates as co
+from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, from_integer, to_integer
 from hybridlio.graph.model.measurements import Factor, Noise, Robust, make_robust
-from hybridlio.graph.pose_graph import PoseGraph
 
 _LOG = logging.getLogger(__name__)
 _OFFSET = "PARAMS_SE3OFFSET"
@@ -32,7 +32,7 @@ class _Parsed:
     fixed: list[int]
 
 
-def read_text(path: str | os.PathLike[str]) -> PoseGraph:
+def read_text(path: str | os.PathLike[str]) -> GraphData:
     """A pose graph from g2o's or TORO's text.
 
     Rows of landmarks are left out, with a warning. A file with neither FIX nor prior has its pose of lowest number
@@ -51,7 +51,7 @@ def read_text(path: str | os.PathLike[str]) -> PoseGraph:
     if len(dimensions) != 1:
         found = "poses in the plane and in space" if dimensions else "no poses"
         raise DataError(f"{path}: the file holds {found}; expected VERTEX_ and EDGE_ rows of one kind")
-    graph = PoseGraph(dimensions.pop())
+    graph = GraphData(dimensions.pop())
     try:
         rows = [read_rows(path, tag, table) for tag, table in parsed.tables.items()]
         _add_vertices(graph, path, [part for part in rows if ROWS[part.tag].what == "vertex"])
@@ -111,7 +111,7 @@ def _check_offset(path: Path, number: int, words: list[str]) -> None:
         raise DataError(f"{path}, row {number}: priors with an offset are not known here; apply it before")
 
 
-def _add_vertices(graph: PoseGraph, path: Path, parts: list[Rows]) -> None:
+def _add_vertices(graph: GraphData, path: Path, parts: list[Rows]) -> None:
     for part in parts:
         keys = [key for (key,) in part.keys]
         if len(set(keys)) < len(keys) or any(key in graph for key in keys):
@@ -123,7 +123,7 @@ def _add_vertices(graph: PoseGraph, path: Path, parts: list[Rows]) -> None:
         graph.put_poses(keys, part.coordinates)
 
 
-def _add_factors(graph: PoseGraph, path: Path, parts: list[Rows]) -> None:
+def _add_factors(graph: GraphData, path: Path, parts: list[Rows]) -> None:
     """All edges and priors in the file's order; their poses must be there if any is."""
     rows = sorted((line, keys) for part in parts for line, keys in zip(part.lines, part.keys, strict=True))
     ids = {line: number for number, (line, _) in enumerate(rows)}
@@ -142,14 +142,14 @@ def _add_factors(graph: PoseGraph, path: Path, parts: list[Rows]) -> None:
             _add_priors(graph, part, ids)
 
 
-def _add_priors(graph: PoseGraph, part: Rows, ids: dict[int, int]) -> None:
+def _add_priors(graph: GraphData, part: Rows, ids: dict[int, int]) -> None:
     columns = zip(part.lines, part.keys, part.coordinates, part.information, strict=True)
     for k, (line, keys, pose, information) in enumerate(columns):
         factor = Factor("prior", keys, pose, Noise("information", information), part.kernels.get(k))
         graph.put_factor(factor, ids[line])
 
 
-def _check_keys(graph: PoseGraph, path: Path, rows: list[tuple[int, tuple[Key, ...]]]) -> None:
+def _check_keys(graph: GraphData, path: Path, rows: list[tuple[int, tuple[Key, ...]]]) -> None:
     """Raise where an edge joins a pose to itself or leads nowhere; in a file without vertices, add the poses."""
     for line, keys in rows:
         if len(keys) == 2 and keys[0] == keys[1]:
@@ -163,7 +163,7 @@ def _check_keys(graph: PoseGraph, path: Path, rows: list[tuple[int, tuple[Key, .
         raise DataError(f"{path}, row {line}: there is no vertex {key}")
 
 
-def _fix(graph: PoseGraph, fixed: list[int]) -> None:
+def _fix(graph: GraphData, fixed: list[int]) -> None:
     anchored = any(factor.kind == "prior" for factor in graph.others.values())
     lowest = [] if anchored else [min(map(to_integer, graph.keys))]
     for number in fixed or lowest:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,8 +25,19 @@ from hybridlio.graph.model.measurements import (
     make_robust,
 )
 
-if TYPE_CHECKING:
-    from hybridlio.graph.solve.solution import Solution
+
+class PosesByKey(Protocol):
+    """Poses that a graph can start from: a solution, or anything else with keys and coordinates."""
+
+    @property
+    def keys(self) -> list[Key]:
+        """Keys of the poses."""
+        ...
+
+    @property
+    def coordinates(self) -> Array:
+        """One row per key: ``(N, 7)`` x y z qx qy qz qw, in the plane ``(N, 3)`` x y θ."""
+        ...
 
 
 class FactorView(Mapping[int, Factor]):
@@ -150,7 +161,7 @@ class GraphData:
             )
         self.origin = point
 
-    def start_from(self, solution: Solution) -> None:
+    def start_from(self, solution: PosesByKey) -> None:
         """Take a solution's poses as initial values."""
         for key, pose in zip(solution.keys, solution.coordinates, strict=True):
             if key in self._places:

@@ -30,6 +30,11 @@ _ABSOLUTE_TOLERANCE = 1e-9
 _INERTIAL_ROUNDS = 2  # samples are summed up again around the biases that the first round found
 
 
+def silent(stage: str, iteration: int, error: float) -> None:
+    """Report to nobody."""
+    del stage, iteration, error
+
+
 @dataclass(frozen=True, eq=False)
 class Solved:
     """What the solver leaves.

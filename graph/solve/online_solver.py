@@ -20,9 +20,9 @@ from hybridlio.graph.model.keys import Key, check_key, named
 from hybridlio.graph.solve.build import Builder
 from hybridlio.graph.solve.changes import News, Reader
 from hybridlio.graph.solve.engines import Engine, FixedLag, Incremental
-from hybridlio.graph.solve.levenberg import Descent, biases_of, poses_of
+from hybridlio.graph.solve.levenberg import Descent, biases_of, poses_of, silent
 from hybridlio.graph.solve.online_start import Guess, is_reached
-from hybridlio.graph.solve.optimise import choose_start, silent
+from hybridlio.graph.solve.starts import choose_start
 
 ONLINE = ("incremental", "fixed-lag")
 _FIRST_ITERATIONS = 100

@@ -11,15 +11,17 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError, GraphError
 from hybridlio.graph.model import coordinates as co
-from hybridlio.graph.model.checks import groups
+from hybridlio.graph.model.checks import groups, labels
 from hybridlio.graph.model.edge_arrays import Edges, edges_of
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, named
+from hybridlio.graph.model.measurements import Factor
 from hybridlio.graph.solve.chordal import chordal
 
 Method: TypeAlias = Literal["odometry", "spanning-tree", "chordal"]
 METHODS = ("odometry", "spanning-tree", "chordal")
 _FIXES_TO_ALIGN = 3
+_FITS = 2.0  # times the degrees of freedom
 
 
 def find(data: GraphData, method: str, edges: Edges | None = None) -> Array:
@@ -128,3 +130,68 @@ def _rigid_fit(points: Array, onto: Array) -> Array:
     U, _, Vt = np.linalg.svd(b.T @ a)
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
     return se3.make(R, onto.mean(axis=0) - R @ points.mean(axis=0))
+
+
+def choose_start(data: GraphData, initial: str) -> Array:
+    """Where to start from: ``given`` initial values, those found in one way, or (``auto``) the best of several.
+
+    These are the given values, chordal ones, and chordal ones without the factors that have a robust kernel.
+    Given values that fit about as well as they ever can are taken as they are.
+
+    Raises:
+        GraphError: values are missing and cannot be found.
+    """
+    if initial in METHODS:
+        return find(data, initial)
+    start = data.initial_coordinates()
+    if initial == "given":
+        if start is None:
+            missing = [key for key in data.keys if data.coordinates(key) is None]
+            raise GraphError(f"pose {named(missing)} has no initial value; give one, or choose initial='auto'")
+        return start
+    edges = edges_of(data)
+    if start is not None and misfit(data, start, edges) <= _FITS * freedom(data):
+        return start
+    starts = [] if start is None else [start]
+    for part in _parts_to_start_from(data):
+        try:
+            starts.append(find(part, "chordal", edges if part is data else None))
+        except GraphError:  # parts that inertial factors or given values place
+            if start is None:
+                raise
+    return starts[0] if len(starts) == 1 else min(starts, key=lambda poses: misfit(data, poses, edges))
+
+
+def _parts_to_start_from(data: GraphData) -> list[GraphData]:
+    """The whole graph, and the graph without robust edges where those that are left join the same poses."""
+    if not data.edges.robust:
+        return [data]
+    sure = data.without(data.edges.robust)
+    return [data, sure] if labels(sure, ("between",))[0] == labels(data, ("between",))[0] else [data]
+
+
+def freedom(data: GraphData) -> int:
+    """Measured numbers about poses less those to be found: what the misfit is when all is as it should be."""
+    size = co.TANGENT_SIZE[data.dimension]
+    others = sum(len(f.noise.values) for f in data.others.values() if f.noise and f.kind in ("prior", "gps"))
+    return max(size * (len(data.edges) - len(data)) + others, 1)
+
+
+def misfit(data: GraphData, coordinates: Array, edges: Edges) -> float:
+    """Twice the error of between-factors, priors and GPS: enough to tell a good start from a bad one."""
+    poses = co.to_matrices(coordinates)
+    total = edges.loss(poses, data.edges.robust)
+    for factor in data.others.values():
+        if factor.kind in ("prior", "gps") and factor.noise is not None:
+            residual = _absolute(factor, poses[data.places[factor.keys[0]]])
+            squared = float(residual @ factor.noise.information @ residual)
+            total += factor.robust.loss(squared) if factor.robust else squared
+    return float(total)
+
+
+def _absolute(factor: Factor, pose: Array) -> Array:
+    """Residual of a prior or of GPS at a pose ``(4, 4)``."""
+    if factor.kind == "gps":
+        return np.asarray(se3.transform(pose, factor.measured[None, 3:])[0] - factor.measured[:3])
+    step = se3.log(se3.between(co.to_matrices(factor.measured[None])[0], pose))
+    return step if len(factor.measured) == 7 else step[2:5]
