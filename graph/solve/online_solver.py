@@ -132,7 +132,7 @@ class OnlineSolver:
         return np.array(bias.accelerometer()), np.array(bias.gyroscope())
 
     def covariance(self, key: Key) -> Array:
-        """Covariance ``(6, 6)`` of a pose in the lag; see :meth:`~hybridlio.graph.solve.solution.Solution.covariance`."""
+        """Covariance ``(6, 6)`` of a pose in the lag; as :meth:`hybridlio.graph.solve.solution.Solution.covariance`."""
         place = self._inside(key)
         covariance = self._engine.solver.marginalCovariance(X(place))
         return co.our_order((covariance + covariance.T) / 2, self._graph.dimension)
