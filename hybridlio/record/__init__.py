@@ -1,1 +1,1 @@
-"""What a run leaves behind for smoothing, packed while the run goes on."""
+"""The record of a run: everything that smoothing needs, packed while the run goes on."""

@@ -1,7 +1,9 @@
-"""LoopKeyframes: a compress cloud every few metres, kept beside a run's record so that loops can be closed afterwards.
+"""Loop keyframes: a thinned cloud every few metres, stored beside a run's record for loop closure after the run.
 
-A cloud takes six bytes a point, so a kilometre takes at most ``1000 / spacing_m · max_points · 6`` bytes: 7.5 MB with
-the default settings. During a run, packed, it takes five ninths of that in memory; the file is about half of it.
+They are independent of the keyframes of the local map, which registration uses during the run.
+
+A point takes six bytes, so a kilometre takes at most ``1000 / spacing_m · max_points · 6`` bytes: 7.5 MB with the
+default settings. Packed in memory during a run it takes five ninths of that; the file takes about half.
 """
 
 from __future__ import annotations
@@ -21,21 +23,25 @@ from hybridlio.core.sensors import Scan
 from hybridlio.core.setting_checks import check_positive, check_setting
 
 FORMAT_VERSION = 1
-RESOLUTION_M = 0.005
-_FARTHEST_M = RESOLUTION_M * np.iinfo(np.int16).max
-_ENOUGH_POINTS = 30_000  # averaging more of a scan's points takes longer and moves the means by millimetres
-_MIN_POINTS = 200
+RESOLUTION_M = 0.005  # a quarter of a lidar's range noise; int16 then reaches 164 m
+_LARGEST_RANGE_M = RESOLUTION_M * np.iinfo(np.int16).max
+_AVERAGED_POINTS = 30_000  # more points per scan take longer and move the voxel means only by millimetres
+_MIN_POINTS = 200  # fewer voxels, as of a blocked lidar, cannot be registered
+_MAX_PACKING_STEP = 256  # a position within a cell must fit a byte
 
 
 @dataclass(frozen=True)
 class LoopKeyframeSettings:
-    """Which clouds are kept.
+    """Which scans are kept, and how they are thinned.
+
+    The defaults trade size for detail: voxels of 0.7 m keep walls and trunks, an HDL-64E has few returns beyond 80 m,
+    and clouds 4 m apart overlap almost completely.
 
     Attributes:
-        spacing_m: a scan this far from the last keyframe becomes one.
-        voxel_m: side of the voxels that thin it.
-        max_range_m: points farther away are left out.
-        max_points: with more points left, they are thinned evenly to so many.
+        spacing_m: distance from the last keyframe at which a scan becomes the next.
+        voxel_m: side of the voxels in which points are averaged.
+        max_range_m: points farther from the lidar are left out.
+        max_points: a cloud with more points is thinned evenly to this number.
 
     Raises:
         SettingError: a value is out of range.
@@ -50,18 +56,21 @@ class LoopKeyframeSettings:
 
     def __post_init__(self) -> None:
         check_positive(self, "spacing_m", "voxel_m", "max_points")
-        within = 0 < self.max_range_m < _FARTHEST_M
-        check_setting(self, "max_range_m", within, f"above 0 and below {_FARTHEST_M:.0f}")
+        within = 0 < self.max_range_m < _LARGEST_RANGE_M
+        check_setting(self, "max_range_m", within, f"above 0 and below {_LARGEST_RANGE_M:.0f}")
 
 
 @dataclass(frozen=True, eq=False)
 class LoopKeyframes:
-    """The keyframes of a run.
+    """The loop keyframes of a run.
 
     Attributes:
-        rows: ``(K,)`` int64, ascending; which of the run's estimates each one is.
+        rows: ``(K,)`` int64, ascending; index of each keyframe among the run's estimates.
         stamps_ns: ``(K,)`` int64.
         clouds: ``K`` arrays ``(n, 3)`` int16, lidar frame at the stamp, in units of :data:`RESOLUTION_M`.
+
+    Raises:
+        DataError: lengths differ, rows do not ascend, or a cloud has another shape or type.
     """
 
     rows: NDArray[np.int64]
@@ -71,11 +80,13 @@ class LoopKeyframes:
     def __post_init__(self) -> None:
         rows, stamps = np.asarray(self.rows, np.int64), np.asarray(self.stamps_ns, np.int64)
         if not rows.shape == stamps.shape == (len(self.clouds),):
-            raise DataError(f"keyframes: {len(self.clouds)} clouds, {rows.shape} rows and {stamps.shape} stamps")
+            raise DataError(
+                f"loop keyframes: {len(self.clouds)} clouds do not match rows {rows.shape} and stamps {stamps.shape}"
+            )
         if (np.diff(rows) <= 0).any() or (len(rows) and rows[0] < 0):
-            raise DataError("keyframes: their rows do not ascend")
+            raise DataError("loop keyframes: rows must ascend from 0 or more")
         if any(cloud.dtype != np.int16 or cloud.ndim != 2 or cloud.shape[1] != 3 for cloud in self.clouds):
-            raise DataError("keyframes: clouds must be (n, 3) int16")
+            raise DataError("loop keyframes: clouds must be (n, 3) int16")
         object.__setattr__(self, "rows", rows)
         object.__setattr__(self, "stamps_ns", stamps)
 
@@ -83,16 +94,16 @@ class LoopKeyframes:
         return len(self.rows)
 
     def until(self, row: int) -> LoopKeyframes:
-        """Those of the estimates before ``row``."""
+        """Return the keyframes among the estimates before ``row``."""
         count = int(np.searchsorted(self.rows, row))
         return LoopKeyframes(self.rows[:count], self.stamps_ns[:count], self.clouds[:count])
 
     def points(self, k: int) -> Array:
-        """Points ``(n, 3)`` of keyframe ``k`` in metres."""
+        """Return the points ``(n, 3)`` of keyframe ``k`` in metres, lidar frame."""
         return self.clouds[k].astype(np.float64) * RESOLUTION_M
 
     def save(self, path: Path) -> None:
-        """Write them to one ``.npz`` file of plain arrays."""
+        """Write the keyframes to one ``.npz`` file of plain arrays."""
         counts = np.array([len(cloud) for cloud in self.clouds], dtype=np.int64)
         points = np.concatenate([np.empty((0, 3), np.int16), *self.clouds])
         with writing_whole(path) as part, part.open("wb") as file:
@@ -106,10 +117,10 @@ class LoopKeyframes:
         """Read keyframes written by :meth:`save`; never executes anything in the file.
 
         Raises:
-            DataError: no such file, not keyframes, or of another format version.
+            DataError: the file is missing, holds no loop keyframes, or has another format version.
         """
         if not path.is_file():
-            raise DataError(f"{path}: no keyframes, which loop closure needs; run `hybridlio odometry` again")
+            raise DataError(f"{path}: the run has no keyframes for loop closure; run `hybridlio odometry` again")
         try:
             with np.load(path, allow_pickle=False) as file:
                 version, resolution_m = int(file["version"]), float(file["resolution_m"])
@@ -117,30 +128,35 @@ class LoopKeyframes:
                     raise ValueError(f"format version {version}, this release reads {FORMAT_VERSION}")
                 counts, points = file["counts"], file["points"]
                 if counts.ndim != 1 or (counts < 0).any() or counts.sum() != len(points):
-                    raise ValueError(f"clouds of {int(counts.sum())} points, but {len(points)} points")
+                    raise ValueError(f"counts add up to {int(counts.sum())}, but there are {len(points)} points")
                 ends = np.cumsum(counts)
                 clouds = tuple(points[end - count : end] for end, count in zip(ends, counts, strict=True))
                 return cls(file["rows"], file["stamps_ns"], clouds)
         except UNREADABLE_NPZ as error:
-            raise DataError(f"{path}: not the keyframes of a run ({error}); run `hybridlio odometry` again") from error
+            raise DataError(
+                f"{path}: not the loop keyframes of a run ({error}); run `hybridlio odometry` again"
+            ) from error
 
 
 class LoopKeyframeSelector:
-    """Takes the scans of a run in order, from the second on, and keeps one every few metres."""
+    """Selects loop keyframes: is offered the scans of a run in order, and keeps one every few metres."""
 
     def __init__(self, settings: LoopKeyframeSettings) -> None:
         self._settings = settings
         self._position: Array | None = None
         self._kept: list[tuple[int, int, PackedCloud]] = []  # row, stamp, points
-        self._step = min(max(round(settings.voxel_m / RESOLUTION_M), 1), 256)
+        self._step = min(max(round(settings.voxel_m / RESOLUTION_M), 1), _MAX_PACKING_STEP)
 
     def offer(self, row: int, scan: Scan, pose: Array) -> bool:
-        """Keep the scan if it is far enough from the last one kept, and of enough points.
+        """Keep the scan if it is far enough from the last one kept and has enough points.
 
         Args:
-            row: which of the run's estimates it is.
-            scan: compensated for motion.
-            pose: ``(4, 4)`` of the lidar, by which distance is judged.
+            row: the scan's index among the run's estimates.
+            scan: the scan after motion compensation.
+            pose: ``(4, 4)`` ``T_world_lidar``, from which the distance is computed.
+
+        Returns:
+            Whether the scan was kept.
         """
         position = pose[:3, 3]
         if self._position is not None and np.linalg.norm(position - self._position) < self._settings.spacing_m:
@@ -153,14 +169,14 @@ class LoopKeyframeSelector:
         return True
 
     def keyframes(self) -> LoopKeyframes:
-        """All so far."""
+        """Return all keyframes kept so far."""
         rows, stamps = (np.array([kept[i] for kept in self._kept], np.int64) for i in (0, 1))
         return LoopKeyframes(rows, stamps, tuple(cloud.cloud() for _, _, cloud in self._kept))
 
 
 def compress(points: NDArray[np.float32], settings: LoopKeyframeSettings) -> NDArray[np.int16]:
-    """The points ``(N, 3)`` within range, one a voxel, as ``(n, 3)`` int16 in units of :data:`RESOLUTION_M`."""
-    some = points[:: max(1, len(points) // _ENOUGH_POINTS)]
+    """Average the points ``(N, 3)`` within range by voxel; ``(n, 3)`` int16 in units of :data:`RESOLUTION_M`."""
+    some = points[:: max(1, len(points) // _AVERAGED_POINTS)]
     some = some[np.einsum("ij,ij->i", some, some) < np.float32(settings.max_range_m) ** 2]
     thinned = voxel_average(some, None, settings.voxel_m)[0]
     if len(thinned) > settings.max_points:

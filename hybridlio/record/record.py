@@ -1,4 +1,8 @@
-"""What a run leaves for smoothing: every step's relative poses, inertial samples and fixes, and where it started."""
+"""The record of a run for smoothing: relative poses of every step, inertial samples, GPS fixes and the initial state.
+
+A record comes from a run of :class:`~hybridlio.odometry.odometry.Odometry`, from a file, or from the poses of another
+odometry (:meth:`Record.from_odometry`).
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,7 @@ from hybridlio.core.start_state import start_state
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.record.loop_keyframes import LoopKeyframes
 from hybridlio.record.odometry_noise import odometry_noise
-from hybridlio.record.step_arrays import keyframe_arrays, relative_arrays, relatives, with_keyframes
+from hybridlio.record.step_arrays import keyframe_arrays, relative_arrays, relative_poses, with_keyframes
 
 FORMAT_VERSION = 2
 _READABLE = (1, 2)  # version 1 has no poses relative to map keyframes
@@ -35,14 +39,14 @@ class Record:
 
     Attributes:
         online: the backend's estimate at each of ``N`` scans, with covariances.
-        initial: ``N-1`` initial relative poses.
-        relative: ``N-1`` relative poses after the residual source.
-        imu: all samples from the first scan to the last; empty where there were none.
-        gps: the fixes in that time.
+        initial: ``N-1`` initial relative poses ``T_k_k1``, lidar frames.
+        relative: ``N-1`` relative poses ``T_k_k1`` after the residual source, lidar frames.
+        imu: all samples from the first scan to the last; empty without an IMU.
+        gps: the fixes from the first scan to the last, in order of time.
         start: the prior state at the first scan.
         calibration: the extrinsics.
-        imu_noise: what the IMU was taken to be worth.
-        keyframes: clouds for closing loops, or None; they have a file of their own.
+        imu_noise: the noise densities that the run assumed.
+        keyframes: clouds for loop closure, or None; they are stored in a file of their own.
     """
 
     online: Trajectory
@@ -65,20 +69,20 @@ class Record:
         imu_noise: ImuNoise | None = None,
         covariances: ArrayLike | None = None,
     ) -> Record:
-        """A record of an odometry that is not ours, to be smoothed with what else was recorded.
+        """Make a record from the poses of another odometry, to smooth them together with IMU samples and GPS fixes.
 
         Args:
-            trajectory: ``N`` lidar poses, two or more, in any frame.
+            trajectory: ``N`` lidar poses, at least two, in any world frame.
             imu: samples on the same clock.
             gps: fixes; their clock may differ by a constant.
-            calibration: where the sensors sit; by default the IMU at the lidar.
-            imu_noise: what the IMU is worth.
-            covariances: ``(N-1, 6, 6)`` of the steps between consecutive poses, or ``(6, 6)`` of each, rad² and m²,
-                rotation first, errors of different steps independent. By default they are found from how the poses
-                agree with the IMU (:func:`hybridlio.record.odometry_noise.odometry_noise`).
+            calibration: the extrinsics; by default the IMU frame is the lidar frame.
+            imu_noise: the IMU's noise densities; by default those of an industrial MEMS unit.
+            covariances: ``(N-1, 6, 6)`` of the steps between consecutive poses, or one ``(6, 6)`` for all, rad² and m²,
+                rotation first. Errors of different steps must be independent. By default they are estimated from the
+                differences between poses and IMU (:func:`hybridlio.record.odometry_noise.odometry_noise`).
 
         Raises:
-            DataError: fewer than two poses, or covariances that do not fit or are none.
+            DataError: fewer than two poses, or covariances of another shape or not positive definite.
         """
         if len(trajectory) < 2:
             raise DataError(f"a record needs at least two poses, got {len(trajectory)}")
@@ -102,15 +106,15 @@ class Record:
 
     @property
     def origin(self) -> GeodeticPoint | None:
-        """Where on Earth the fixes' frame has its origin; None without fixes, or where it is not known."""
+        """Geodetic position of the origin of the fixes' frame; None without fixes, or when they do not give it."""
         return self.gps[0].origin if self.gps else None
 
     @property
     def edges(self) -> list[tuple[int, int, RelativePose]]:
-        """Every relative pose measured, from the scan and to the scan by number, with all of its covariance.
+        """Every measured relative pose as ``(i, j, T_i_j)``, scans by number, with its full covariance.
 
-        As edges of a pose graph they are taken for independent of each other; :func:`hybridlio.graph.run.smooth.smooth`
-        knows better.
+        A plain pose graph takes these edges for independent. They are not: poses of one scan relative to several
+        others share that scan's scatter. :func:`hybridlio.graph.run.smooth.smooth` models this.
         """
         number = {int(stamp): k for k, stamp in enumerate(self.online.stamps_ns)}
         out = []
@@ -123,7 +127,7 @@ class Record:
         return out
 
     def save(self, path: Path) -> None:
-        """Write everything but the keyframes to one ``.npz`` file of plain arrays."""
+        """Write everything except ``keyframes`` to one ``.npz`` file of plain arrays."""
         with writing_whole(path) as part, part.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **_to_arrays(self))
 
@@ -132,19 +136,19 @@ class Record:
         """Read a record written by :meth:`save`; never executes anything in the file.
 
         Raises:
-            DataError: no such file, not a record, or of another format version.
+            DataError: the file is missing, is not a record, or has a newer format version.
         """
         try:
             with np.load(path, allow_pickle=False) as file:
                 return _from_arrays({name: file[name] for name in file.files})
         except UNREADABLE_NPZ as error:
-            raise DataError(f"{path}: not a record of a run ({error}); run `hybridlio odometry` again") from error
+            raise DataError(f"{path}: not the record of a run ({error}); run `hybridlio odometry` again") from error
 
 
 def _steps_of(
     trajectory: Trajectory, imu: ImuSamples, calibration: Calibration, covariances: ArrayLike | None
 ) -> tuple[RelativePose, ...]:
-    """Return the relative poses between consecutive poses, with given covariances or those found from the IMU."""
+    """Return the relative poses between consecutive poses, with the given covariances or those found from the IMU."""
     poses = se3.between(trajectory.poses[:-1], trajectory.poses[1:])
     if covariances is not None:
         given = _each(covariances, len(poses))
@@ -209,8 +213,8 @@ def _from_arrays(arrays: Mapping[str, Any]) -> Record:
     gps = zip(arrays["gps_stamps_ns"], arrays["gps_positions_m"], arrays["gps_covariances_m2"], strict=True)
     return Record(
         online=Trajectory(arrays["stamps_ns"], arrays["online_poses"], arrays["online_covariances"]),
-        initial=relatives("initial", arrays),
-        relative=with_keyframes(relatives("relative", arrays), arrays),
+        initial=relative_poses("initial", arrays),
+        relative=with_keyframes(relative_poses("relative", arrays), arrays),
         imu=ImuSamples(arrays["imu_stamps_ns"], arrays["gyro_rad_s"], arrays["accel_m_s2"]),
         gps=tuple(GpsFix(int(stamp), position, covariance, origin) for stamp, position, covariance in gps),
         start=State(**start),

@@ -1,4 +1,4 @@
-"""Makes the record of a run while it goes on: a kilobyte or two a step, most of it packed."""
+"""Collects the record of a run while it goes on; a step takes one or two kilobytes of memory."""
 
 from __future__ import annotations
 
@@ -14,26 +14,28 @@ from hybridlio.core.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.record.loop_keyframes import LoopKeyframes
 from hybridlio.record.record import Record
-from hybridlio.record.step_arrays import keyframe_arrays, relative_arrays, relatives, with_keyframes
+from hybridlio.record.step_arrays import keyframe_arrays, relative_arrays, relative_poses, with_keyframes
 
-_AT_ONCE = 50  # so many scans are packed together: as objects they take five times the memory
+# Scans that are packed together. As objects they take five times the memory, so few should wait; packing more at once
+# only makes the step longer in which it happens.
+_PACKED_TOGETHER = 50
 
 
 class Recorder:
-    """Takes in a run's estimates, samples and fixes."""
+    """Collects a run's estimates, IMU samples and GPS fixes, scan by scan."""
 
     def __init__(self) -> None:
-        self._recent: list[_Kept] = []
+        self._recent: list[_ScanEstimate] = []
         self._packed: list[dict[str, PackedArray]] = []
         self._imu: list[ImuSamples] = []
         self._gps: list[GpsFix] = []
 
     def __len__(self) -> int:
-        return _AT_ONCE * len(self._packed) + len(self._recent)
+        return _PACKED_TOGETHER * len(self._packed) + len(self._recent)
 
     @property
     def last_ns(self) -> int:
-        """The last scan's stamp; 0 before the first."""
+        """Stamp of the last scan; 0 before the first."""
         return self._recent[-1].stamp_ns if self._recent else 0
 
     def add(
@@ -45,20 +47,21 @@ class Recorder:
         imu: ImuSamples | None = None,
         gps: tuple[GpsFix, ...] = (),
     ) -> None:
-        """Take in a scan's estimate, or where that is interrupted nothing that :meth:`record` would tell.
+        """Add a scan. After an interrupt (``KeyboardInterrupt``) at any line, the record holds it wholly or not at all.
 
         Args:
             stamp_ns: the scan's stamp.
-            pose, covariance: of the scan.
-            step: the initial and the refined relative pose; the first scan has none.
-            imu, gps: samples and fixes since the scan before.
+            pose: ``(4, 4)`` ``T_world_lidar``.
+            covariance: ``(6, 6)`` of the pose.
+            step: the initial and the refined relative pose; None for the first scan.
+            imu, gps: samples and fixes since the previous scan.
         """
-        if len(self._recent) > _AT_ONCE:
+        if len(self._recent) > _PACKED_TOGETHER:
             together = packed(_arrays(self._recent[:-1]))
             self._packed, self._recent = [*self._packed, together], self._recent[-1:]
         self._imu.append(imu or ImuSamples.empty())
         self._gps.extend(gps)
-        self._recent.append(_Kept(stamp_ns, pose, covariance, step))  # last: with it the scan is there
+        self._recent.append(_ScanEstimate(stamp_ns, pose, covariance, step))  # last, because this completes the scan
 
     def record(
         self,
@@ -68,7 +71,7 @@ class Recorder:
         keyframes: LoopKeyframes,
         scans: int | None = None,
     ) -> Record:
-        """All so far, or the first ``scans`` of it."""
+        """Return the record of all scans so far, or of the first ``scans``."""
         parts = [*map(unpacked, self._packed), *([_arrays(self._recent)] if self._recent else [])]
         steps = [step for arrays in parts for step in _steps(arrays)]
         stamps, poses, covariances = (
@@ -80,7 +83,7 @@ class Recorder:
             online=Trajectory(stamps, poses, covariances),
             initial=tuple(initial for initial, _ in steps),
             relative=tuple(relative for _, relative in steps),
-            # an interrupt may have left more
+            # an interrupted `add` may have left samples and fixes of the scan after the last
             imu=concatenate_imu(self._imu).between(start.stamp_ns, last_ns),
             gps=tuple(fix for fix in self._gps if fix.stamp_ns <= last_ns),
             start=start,
@@ -90,8 +93,8 @@ class Recorder:
         )
 
 
-class _Kept(NamedTuple):
-    """A scan's estimate, and its initial and refined relative poses but for the first."""
+class _ScanEstimate(NamedTuple):
+    """A scan's pose, and the initial and refined relative pose of its step; the first scan has no step."""
 
     stamp_ns: int
     pose: Array
@@ -99,7 +102,7 @@ class _Kept(NamedTuple):
     step: tuple[RelativePose, RelativePose] | None
 
 
-def _arrays(scans: list[_Kept]) -> dict[str, Any]:
+def _arrays(scans: list[_ScanEstimate]) -> dict[str, Any]:
     initial, relative = (tuple(scan.step[i] for scan in scans if scan.step is not None) for i in (0, 1))
     online = {
         "online_ns": np.array([scan.stamp_ns for scan in scans], np.int64),
@@ -112,11 +115,13 @@ def _arrays(scans: list[_Kept]) -> dict[str, Any]:
 
 
 def _steps(arrays: dict[str, Any]) -> Iterator[tuple[RelativePose, RelativePose]]:
-    return zip(relatives("initial", arrays), with_keyframes(relatives("relative", arrays), arrays), strict=True)
+    return zip(
+        relative_poses("initial", arrays), with_keyframes(relative_poses("relative", arrays), arrays), strict=True
+    )
 
 
 def concatenate_imu(parts: list[ImuSamples]) -> ImuSamples:
-    """Samples of consecutive intervals as one; those on a common border once."""
+    """Concatenate samples of consecutive intervals; a sample on a common border is kept once."""
     parts = [part for part in parts if len(part)]
     if not parts:
         return ImuSamples.empty()

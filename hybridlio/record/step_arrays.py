@@ -1,4 +1,7 @@
-"""Relative poses of many steps as plain arrays, for files and for memory: as objects they take five times as much."""
+"""Relative poses of many steps as plain arrays, for files and for memory.
+
+As objects they take five times the memory.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,11 @@ from hybridlio.core.estimates import KeyframePose, RelativePose
 
 
 def relative_arrays(prefix: str, steps: tuple[RelativePose, ...]) -> dict[str, Any]:
-    """Steps as plain arrays, all but their details and keyframes; the arrays' names begin with ``prefix``."""
+    """Convert steps to plain arrays; names start with ``prefix``.
+
+    Leaves out ``details`` and ``proposed``, which smoothing does not use, and ``keyframes``, which
+    :func:`keyframe_arrays` converts. A step without drift has NaN as its drift.
+    """
     return {
         f"{prefix}_poses": np.array([s.pose for s in steps]).reshape(-1, 4, 4),
         f"{prefix}_covariances": np.array([s.covariance for s in steps]).reshape(-1, 6, 6),
@@ -30,7 +37,7 @@ def relative_arrays(prefix: str, steps: tuple[RelativePose, ...]) -> dict[str, A
 
 
 def keyframe_arrays(steps: tuple[RelativePose, ...]) -> dict[str, Any]:
-    """The steps' poses relative to keyframes as plain arrays."""
+    """Convert the steps' poses relative to map keyframes to plain arrays, one row per pose."""
     found = [(row, keyframe) for row, step in enumerate(steps) for keyframe in step.keyframes]
     return {
         "keyframe_step": np.array([row for row, _ in found], dtype=np.int64),
@@ -41,8 +48,8 @@ def keyframe_arrays(steps: tuple[RelativePose, ...]) -> dict[str, Any]:
 
 
 def with_keyframes(steps: tuple[RelativePose, ...], arrays: Mapping[str, Any]) -> tuple[RelativePose, ...]:
-    """The steps with what :func:`keyframe_arrays` holds, if anything."""
-    if "keyframe_step" not in arrays:  # the first version of records had none
+    """Return the steps with their poses relative to map keyframes: the inverse of :func:`keyframe_arrays`."""
+    if "keyframe_step" not in arrays:  # version 1 of the format
         return steps
     columns = (arrays[f"keyframe_{name}"] for name in ("step", "stamps_ns", "poses", "covariances"))
     found: dict[int, list[KeyframePose]] = {}
@@ -51,8 +58,8 @@ def with_keyframes(steps: tuple[RelativePose, ...], arrays: Mapping[str, Any]) -
     return tuple(replace(step, keyframes=tuple(found.get(row, ()))) for row, step in enumerate(steps))
 
 
-def relatives(prefix: str, arrays: Mapping[str, Any]) -> tuple[RelativePose, ...]:
-    """The steps of :func:`relative_arrays`."""
+def relative_poses(prefix: str, arrays: Mapping[str, Any]) -> tuple[RelativePose, ...]:
+    """Return the steps in arrays whose names start with ``prefix``: the inverse of :func:`relative_arrays`."""
     at, directions = arrays[f"{prefix}_degenerate_step"], arrays[f"{prefix}_degenerate"]
     columns = (arrays[f"{prefix}_{name}"] for name in ("poses", "covariances", "sources", "ok", "from_imu", "drifts"))
     return tuple(

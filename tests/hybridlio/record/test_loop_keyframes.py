@@ -1,3 +1,5 @@
+"""Loop keyframes: which scans are kept, how they are thinned, and their file."""
+
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -22,32 +24,32 @@ def scan(rng: np.random.Generator, stamp_ns: int = 10**18, points: int = 40_000,
 
 
 def driven(rng: np.random.Generator, steps: int, step_m: float, settings: LoopKeyframeSettings) -> LoopKeyframes:
-    maker = LoopKeyframeSelector(settings)
+    selector = LoopKeyframeSelector(settings)
     for k in range(steps):
         pose = se3.make(np.eye(3), (k * step_m, 0.0, 0.0))
-        maker.offer(k, scan(rng, 10**18 + k * 10**8, points=500, reach_m=40.0), pose)
-    return maker.keyframes()
+        selector.offer(k, scan(rng, 10**18 + k * 10**8, points=500, reach_m=40.0), pose)
+    return selector.keyframes()
 
 
-def test_a_keyframe_is_kept_each_time_the_way_from_the_last_one_is_long_enough(rng: np.random.Generator):
+def test_a_scan_is_kept_once_the_distance_from_the_last_keyframe_reaches_the_spacing(rng: np.random.Generator):
     keyframes = driven(rng, 30, 0.9, LoopKeyframeSettings(spacing_m=2.5))
     assert keyframes.rows.tolist() == list(range(0, 30, 3))
     assert keyframes.stamps_ns.tolist() == [10**18 + k * 10**8 for k in range(0, 30, 3)]
 
 
-def test_a_vehicle_that_stands_leaves_one_keyframe(rng: np.random.Generator):
+def test_a_standing_vehicle_keeps_one_keyframe(rng: np.random.Generator):
     assert len(driven(rng, 30, 0.0, LoopKeyframeSettings())) == 1
 
 
-def test_a_scan_of_few_points_is_passed_over_for_the_next(rng: np.random.Generator):
-    maker = LoopKeyframeSelector(LoopKeyframeSettings())
-    assert not maker.offer(0, Scan(1, np.empty((0, 3), np.float32)), np.eye(4))
-    assert not maker.offer(1, scan(rng, 2, points=100), np.eye(4))
-    assert maker.offer(2, scan(rng, 3), np.eye(4))
-    assert maker.keyframes().rows.tolist() == [2]
+def test_a_scan_with_few_points_is_skipped(rng: np.random.Generator):
+    selector = LoopKeyframeSelector(LoopKeyframeSettings())
+    assert not selector.offer(0, Scan(1, np.empty((0, 3), np.float32)), np.eye(4))
+    assert not selector.offer(1, scan(rng, 2, points=100), np.eye(4))
+    assert selector.offer(2, scan(rng, 3), np.eye(4))
+    assert selector.keyframes().rows.tolist() == [2]
 
 
-def test_a_kilometre_takes_no_more_than_is_said(rng: np.random.Generator):
+def test_a_kilometre_takes_at_most_7_5_megabytes(rng: np.random.Generator):
     settings = LoopKeyframeSettings()
     clouds = [compress(scan(rng, reach_m=60.0).points, settings) for _ in range(3)]
     assert {len(cloud) for cloud in clouds} == {settings.max_points}
@@ -55,34 +57,34 @@ def test_a_kilometre_takes_no_more_than_is_said(rng: np.random.Generator):
     assert bytes_a_km <= 7.5e6
 
 
-def test_points_are_where_they_were_to_half_the_resolution(rng: np.random.Generator):
+def test_points_are_rounded_to_the_resolution(rng: np.random.Generator):
     points = rng.uniform(-40, 40, (300, 3)).astype(np.float32)
     cloud = compress(points, LoopKeyframeSettings(voxel_m=0.01))
-    maker = LoopKeyframeSelector(LoopKeyframeSettings(voxel_m=0.01))
-    maker.offer(0, Scan(1, points), np.eye(4))
-    back = maker.keyframes().points(0)
+    selector = LoopKeyframeSelector(LoopKeyframeSettings(voxel_m=0.01))
+    selector.offer(0, Scan(1, points), np.eye(4))
+    back = selector.keyframes().points(0)
     np.testing.assert_array_equal(back, cloud * RESOLUTION_M)
     nearest = np.linalg.norm(points[:, None] - back[None], axis=-1).min(axis=1)
     assert nearest.max() <= np.sqrt(3) * RESOLUTION_M / 2 + 1e-5
 
 
-def test_points_out_of_range_are_left_out(rng: np.random.Generator):
+def test_points_beyond_the_maximum_range_are_left_out(rng: np.random.Generator):
     cloud = compress(scan(rng).points, LoopKeyframeSettings(max_range_m=30.0))
     assert np.linalg.norm(cloud * RESOLUTION_M, axis=1).max() < 30.1
 
 
-def test_keyframes_come_back_as_they_were_saved(rng: np.random.Generator, tmp_path: Path):
+def test_saved_keyframes_load_unchanged(rng: np.random.Generator, tmp_path: Path):
     keyframes = driven(rng, 20, 1.0, LoopKeyframeSettings(spacing_m=3.0))
     keyframes.save(tmp_path / "keyframes.npz")
     loaded = LoopKeyframes.load(tmp_path / "keyframes.npz")
     np.testing.assert_array_equal(loaded.rows, keyframes.rows)
     np.testing.assert_array_equal(loaded.stamps_ns, keyframes.stamps_ns)
     assert len(loaded.clouds) == len(keyframes.clouds)
-    for mine, theirs in zip(keyframes.clouds, loaded.clouds, strict=True):
-        np.testing.assert_array_equal(theirs, mine, strict=True)
+    for saved, read in zip(keyframes.clouds, loaded.clouds, strict=True):
+        np.testing.assert_array_equal(read, saved, strict=True)
 
 
-def test_a_run_without_keyframes_has_a_file_too(tmp_path: Path):
+def test_a_run_without_keyframes_writes_a_file_of_none(tmp_path: Path):
     LoopKeyframeSelector(LoopKeyframeSettings()).keyframes().save(tmp_path / "keyframes.npz")
     assert len(LoopKeyframes.load(tmp_path / "keyframes.npz")) == 0
 
@@ -125,7 +127,7 @@ def _rewrite(path: Path, **changed: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("damage", [_cut, _text, _other_version, _lost_points, _unordered, _lost_array, _pickled])
-def test_a_damaged_file_is_one_clear_error_that_says_what_to_do(
+def test_a_damaged_file_raises_an_error_that_names_the_command_to_run(
     rng: np.random.Generator, tmp_path: Path, damage: Callable[[Path], None]
 ):
     path = tmp_path / "keyframes.npz"
@@ -135,12 +137,12 @@ def test_a_damaged_file_is_one_clear_error_that_says_what_to_do(
         LoopKeyframes.load(path)
 
 
-def test_a_run_folder_of_before_keyframes_is_told_what_to_do(tmp_path: Path):
+def test_a_missing_file_raises_an_error_that_names_the_command_to_run(tmp_path: Path):
     with pytest.raises(DataError, match=r"no keyframes.*run `hybridlio odometry` again"):
         LoopKeyframes.load(tmp_path / "keyframes.npz")
 
 
-def test_the_file_holds_plain_arrays_alone(rng: np.random.Generator, tmp_path: Path):
+def test_the_file_holds_only_plain_arrays(rng: np.random.Generator, tmp_path: Path):
     driven(rng, 20, 1.0, LoopKeyframeSettings()).save(tmp_path / "keyframes.npz")
     with zipfile.ZipFile(tmp_path / "keyframes.npz") as file:
         assert all(name.endswith(".npy") for name in file.namelist())
@@ -148,15 +150,15 @@ def test_the_file_holds_plain_arrays_alone(rng: np.random.Generator, tmp_path: P
 
 
 @pytest.mark.parametrize("wrong", [{"spacing_m": 0.0}, {"voxel_m": -1.0}, {"max_range_m": 200.0}, {"max_points": 0}])
-def test_settings_that_mean_nothing_are_refused(wrong: dict[str, float]):
+def test_settings_out_of_range_are_rejected(wrong: dict[str, float]):
     with pytest.raises(ConfigError, match="LoopKeyframeSettings"):
         LoopKeyframeSettings(**wrong)  # type: ignore[arg-type]
 
 
-def test_clouds_come_out_of_a_run_as_they_went_in(rng: np.random.Generator):
-    made, settings = LoopKeyframeSelector(LoopKeyframeSettings()), LoopKeyframeSettings()
+def test_packing_during_a_run_changes_no_cloud(rng: np.random.Generator):
+    selector, settings = LoopKeyframeSelector(LoopKeyframeSettings()), LoopKeyframeSettings()
     scans = [Scan(k, rng.uniform(-79, 79, (4000, 3)).astype(np.float32)) for k in range(3)]
     for k, scan in enumerate(scans):
-        assert made.offer(k, scan, se3.make(np.eye(3), [10.0 * k, 0, 0]))
-    for scan, cloud in zip(scans, made.keyframes().clouds, strict=True):
+        assert selector.offer(k, scan, se3.make(np.eye(3), [10.0 * k, 0, 0]))
+    for scan, cloud in zip(scans, selector.keyframes().clouds, strict=True):
         np.testing.assert_array_equal(cloud, compress(scan.points, settings))

@@ -1,3 +1,5 @@
+"""Records: saving and loading, versions of the format, and damaged files."""
+
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +30,7 @@ def step(rng: np.random.Generator, k: int, source: str) -> RelativePose:
 
 
 def with_keyframes(relative: tuple[RelativePose, ...], stamps: np.ndarray) -> tuple[RelativePose, ...]:
-    """The steps, the third and fifth with poses relative to earlier scans."""
+    """Add poses relative to earlier scans to the third and fifth step."""
     near = {
         2: (KeyframePose(int(stamps[0]), se3.exp(np.full(6, 0.1)), 2 * np.eye(6)),),
         4: tuple(KeyframePose(int(stamps[k]), se3.exp(np.full(6, 0.2)), k * np.eye(6)) for k in (3, 1)),
@@ -55,7 +57,7 @@ def example(rng: np.random.Generator, imu: bool = True, camera: bool = True) -> 
 
 
 def same(a: object, b: object) -> None:
-    """Equal to the last bit, field by field."""
+    """Assert that two values are equal to the last bit, field by field."""
     if isinstance(a, np.ndarray):
         np.testing.assert_array_equal(a, b, strict=True)
     elif isinstance(a, tuple):
@@ -66,19 +68,19 @@ def same(a: object, b: object) -> None:
     elif hasattr(a, "__dataclass_fields__"):
         assert type(a) is type(b)
         for name in a.__dataclass_fields__:
-            if name != "details":  # a source's own remarks are not kept
+            if name != "details":  # diagnostics of a source are not saved
                 same(getattr(a, name), getattr(b, name))
     else:
         assert a == b
         assert type(a) is type(b)
 
 
-@pytest.mark.parametrize(("imu", "camera"), [(True, True), (False, False)], ids=["everything", "the least"])
-def test_a_record_comes_back_as_it_was_saved(rng: np.random.Generator, tmp_path: Path, imu: bool, camera: bool):
+@pytest.mark.parametrize(("imu", "camera"), [(True, True), (False, False)], ids=["with IMU and camera", "without"])
+def test_a_saved_record_loads_unchanged(rng: np.random.Generator, tmp_path: Path, imu: bool, camera: bool):
     record = example(rng, imu, camera)
     record.save(tmp_path / "odometry.npz")
     loaded = Record.load(tmp_path / "odometry.npz")
-    # poses are made rotations again where they enter, which rounds a rotation that is one already
+    # loading orthonormalises poses, which changes the last digits
     np.testing.assert_allclose(loaded.online.poses, record.online.poses, atol=1e-14)
     again = tmp_path / "again.npz"
     loaded.save(again)
@@ -86,18 +88,18 @@ def test_a_record_comes_back_as_it_was_saved(rng: np.random.Generator, tmp_path:
     same(loaded.gps, record.gps)
     same(loaded.start, record.start)
     same(loaded.imu_noise, record.imu_noise)
-    for mine, theirs in zip(record.initial + record.relative, loaded.initial + loaded.relative, strict=True):
-        np.testing.assert_allclose(theirs.pose, mine.pose, atol=1e-14)
+    for step, found in zip(record.initial + record.relative, loaded.initial + loaded.relative, strict=True):
+        np.testing.assert_allclose(found.pose, step.pose, atol=1e-14)
         for name in ("covariance", "source", "degenerate", "ok", "from_imu", "drift"):
-            same(getattr(theirs, name), getattr(mine, name))
-        for near, read in zip(mine.keyframes, theirs.keyframes, strict=True):
+            same(getattr(found, name), getattr(step, name))
+        for near, read in zip(step.keyframes, found.keyframes, strict=True):
             assert read.stamp_ns == near.stamp_ns
             np.testing.assert_allclose(read.pose, near.pose, atol=1e-14)
             same(read.covariance, near.covariance)
     assert (loaded.calibration.T_camera_lidar is None) == (not camera)
 
 
-def test_saving_shows_no_half_written_file(rng: np.random.Generator, tmp_path: Path):
+def test_saving_leaves_no_temporary_file(rng: np.random.Generator, tmp_path: Path):
     example(rng).save(tmp_path / "odometry.npz")
     assert [path.name for path in tmp_path.iterdir()] == ["odometry.npz"]
 
@@ -119,19 +121,19 @@ def saved(rng: np.random.Generator, tmp_path: Path) -> Path:
     return tmp_path / "odometry.npz"
 
 
-def test_another_versions_file_is_refused_and_both_versions_named(saved: Path):
+def test_a_file_of_an_unknown_version_is_rejected(saved: Path):
     rewritten(saved, version=99)
     with pytest.raises(DataError, match=r"odometry\.npz: .*version 99"):
         Record.load(saved)
 
 
-def test_a_file_of_the_first_version_is_read_and_has_no_keyframes(saved: Path):
+def test_a_file_of_version_1_loads_without_poses_relative_to_keyframes(saved: Path):
     rewritten(saved, version=1, **{f"keyframe_{n}": None for n in ("step", "stamps_ns", "poses", "covariances")})
     old = Record.load(saved)
     assert [step.keyframes for step in old.relative] == [()] * 5
 
 
-def test_edges_hold_every_relative_pose_with_all_of_its_covariance(rng: np.random.Generator):
+def test_edges_hold_every_relative_pose_with_its_full_covariance(rng: np.random.Generator):
     record = example(rng)
     assert [(i, j) for i, j, _ in record.edges] == [(0, 1), (1, 2), (2, 3), (0, 3), (3, 4), (4, 5), (3, 5), (1, 5)]
     for i, j, edge in record.edges:
@@ -146,9 +148,9 @@ def test_edges_hold_every_relative_pose_with_all_of_its_covariance(rng: np.rando
 
 
 @pytest.mark.parametrize("missing", ["version", "relative_poses", "start_velocity_m_s", "imu_noise", "keyframe_poses"])
-def test_a_file_that_lacks_something_is_refused(saved: Path, missing: str):
+def test_a_file_that_lacks_an_array_is_rejected(saved: Path, missing: str):
     rewritten(saved, **{missing: None})
-    with pytest.raises(DataError, match=rf"odometry\.npz: not a record.*{missing}"):
+    with pytest.raises(DataError, match=rf"odometry\.npz: not the record of a run.*{missing}"):
         Record.load(saved)
 
 
@@ -164,13 +166,13 @@ def test_a_file_that_lacks_something_is_refused(saved: Path, missing: str):
     ],
     ids=lambda changes: next(iter(changes)),
 )
-def test_a_file_whose_parts_do_not_fit_is_refused(saved: Path, changes: dict):
+def test_a_file_with_inconsistent_arrays_is_rejected(saved: Path, changes: dict):
     rewritten(saved, **changes)
     with pytest.raises(DataError):
         Record.load(saved)
 
 
-def test_a_pickle_inside_is_never_unpacked(saved: Path, tmp_path: Path):
+def test_a_pickled_array_is_never_unpickled(saved: Path, tmp_path: Path):
     class Trap:
         def __reduce__(self) -> tuple:
             return (Path.touch, (tmp_path / "sprung",))
@@ -181,7 +183,7 @@ def test_a_pickle_inside_is_never_unpacked(saved: Path, tmp_path: Path):
     assert not (tmp_path / "sprung").exists()
 
 
-def test_a_pickle_in_its_place_is_never_unpacked(tmp_path: Path):
+def test_a_pickle_file_is_never_unpickled(tmp_path: Path):
     import pickle
 
     (tmp_path / "odometry.npz").write_bytes(pickle.dumps({"version": 1}))
@@ -190,14 +192,14 @@ def test_a_pickle_in_its_place_is_never_unpacked(tmp_path: Path):
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.99])
-def test_a_truncated_file_is_refused(saved: Path, share: float):
+def test_a_truncated_file_is_rejected(saved: Path, share: float):
     whole = saved.read_bytes()
     saved.write_bytes(whole[: int(share * len(whole))])
     with pytest.raises(DataError, match=r"odometry\.npz"):
         Record.load(saved)
 
 
-def test_a_damaged_file_is_refused(saved: Path):
+def test_a_damaged_file_is_rejected(saved: Path):
     with zipfile.ZipFile(saved) as archive:
         info = archive.getinfo("imu_noise.npy")
     damaged = bytearray(saved.read_bytes())
@@ -213,9 +215,9 @@ def test_a_missing_file_is_named(tmp_path: Path):
         Record.load(tmp_path / "nowhere.npz")
 
 
-def test_something_else_in_its_place_is_refused(tmp_path: Path):
+def test_other_numpy_files_are_rejected(tmp_path: Path):
     np.savez(tmp_path / "other.npz", x=np.arange(3))
-    with pytest.raises(DataError, match=r"other\.npz: not a record"):
+    with pytest.raises(DataError, match=r"other\.npz: not the record of a run"):
         Record.load(tmp_path / "other.npz")
     np.save(tmp_path / "array.npy", np.arange(3))
     with pytest.raises(DataError, match=r"array\.npy"):

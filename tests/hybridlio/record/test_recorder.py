@@ -1,3 +1,5 @@
+"""The recorder: packing, records of the first scans, and interrupts."""
+
 import sys
 
 import numpy as np
@@ -20,7 +22,7 @@ def random_covariance(rng: np.random.Generator) -> np.ndarray:
 
 
 def random_step(rng: np.random.Generator, k: int) -> RelativePose:
-    """One of all kinds: with and without drift, failed, of the IMU, with loose directions, with keyframes."""
+    """A step whose kind varies with ``k``: drift, failure, IMU source, degenerate directions, keyframes."""
     pose, covariance = se3.exp(0.1 * rng.standard_normal(6)), random_covariance(rng)
     near = (KeyframePose(k * STEP_NS, pose, covariance),) if k % 7 == 0 else ()
     return RelativePose(
@@ -35,19 +37,19 @@ def random_step(rng: np.random.Generator, k: int) -> RelativePose:
     )
 
 
-def test_steps_that_have_become_arrays_are_as_they_were(rng: np.random.Generator):
-    made, steps = Recorder(), [(random_step(rng, k), random_step(rng, k + 1)) for k in range(250)]
-    made.add(0, np.eye(4), np.eye(6))
+def test_packing_changes_no_step(rng: np.random.Generator):
+    recorder, steps = Recorder(), [(random_step(rng, k), random_step(rng, k + 1)) for k in range(250)]
+    recorder.add(0, np.eye(4), np.eye(6))
     for k, step in enumerate(steps):
-        made.add((k + 1) * STEP_NS, se3.exp(np.full(6, k / 1000)), random_covariance(rng), step)
-    record = made.record(
+        recorder.add((k + 1) * STEP_NS, se3.exp(np.full(6, k / 1000)), random_covariance(rng), step)
+    record = recorder.record(
         start_state(0, ImuSamples.empty(), ImuNoise()),
         Calibration(),
         ImuNoise(),
         LoopKeyframeSelector(LoopKeyframeSettings()).keyframes(),
     )
-    assert len(made) == len(record.online) == 251
-    assert made.last_ns == record.online.stamps_ns[-1] == 250 * STEP_NS
+    assert len(recorder) == len(record.online) == 251
+    assert recorder.last_ns == record.online.stamps_ns[-1] == 250 * STEP_NS
     for was, found in zip(
         [step for pair in steps for step in pair],
         [step for pair in zip(record.initial, record.relative, strict=True) for step in pair],
@@ -60,7 +62,7 @@ def test_steps_that_have_become_arrays_are_as_they_were(rng: np.random.Generator
         assert (found.drift is None) == (was.drift is None)
         if was.drift is not None:
             np.testing.assert_array_equal(found.drift, was.drift)
-    for (_, was), found in zip(steps, record.relative, strict=True):  # initial poses know no keyframes
+    for (_, was), found in zip(steps, record.relative, strict=True):  # initial poses have no keyframes
         assert [k.stamp_ns for k in found.keyframes] == [k.stamp_ns for k in was.keyframes]
         for a, b in zip(was.keyframes, found.keyframes, strict=True):
             np.testing.assert_array_equal(b.pose, a.pose)
@@ -68,27 +70,27 @@ def test_steps_that_have_become_arrays_are_as_they_were(rng: np.random.Generator
 
 
 def five_scans() -> Recorder:
-    made = Recorder()
+    recorder = Recorder()
     for k in range(5):
         stamps = np.arange(max(k - 1, 0) * STEP_NS, k * STEP_NS + 1, STEP_NS // 10)
         samples = ImuSamples(stamps, np.zeros((len(stamps), 3)), np.zeros((len(stamps), 3)))
         fix = GpsFix(k * STEP_NS, np.zeros(3), np.eye(3))
         step = RelativePose(np.eye(4), np.eye(6), "here")
-        made.add(k * STEP_NS, np.eye(4), np.eye(6), (step, step) if k else None, samples, (fix,))
-    return made
+        recorder.add(k * STEP_NS, np.eye(4), np.eye(6), (step, step) if k else None, samples, (fix,))
+    return recorder
 
 
-def record_of(made: Recorder, keyframes: LoopKeyframes, scans: int | None = None) -> Record:
-    return made.record(start_state(0, ImuSamples.empty(), ImuNoise()), Calibration(), ImuNoise(), keyframes, scans)
+def record_of(recorder: Recorder, keyframes: LoopKeyframes, scans: int | None = None) -> Record:
+    return recorder.record(start_state(0, ImuSamples.empty(), ImuNoise()), Calibration(), ImuNoise(), keyframes, scans)
 
 
 def three_keyframes() -> LoopKeyframes:
-    """Of scans 1, 3 and 4."""
+    """Keyframes of scans 1, 3 and 4."""
     rows = np.array([1, 3, 4])
     return LoopKeyframes(rows, rows * STEP_NS, tuple(np.full((1, 3), row, np.int16) for row in rows))
 
 
-def test_the_first_scans_of_a_record_bring_what_belongs_to_them_and_no_more():
+def test_a_record_of_the_first_scans_ends_with_the_last_of_them():
     record = record_of(five_scans(), three_keyframes(), scans=4)
     assert record.online.stamps_ns.tolist() == [0, STEP_NS, 2 * STEP_NS, 3 * STEP_NS]
     assert len(record.initial) == len(record.relative) == 3
@@ -100,13 +102,12 @@ def test_the_first_scans_of_a_record_bring_what_belongs_to_them_and_no_more():
 
 
 @pytest.mark.parametrize("scans", [3, 50, 51, 120])
-def test_an_interrupt_while_a_scan_is_taken_in_leaves_the_scans_before(monkeypatch, scans):
-    """At any line of it, as a signal may come between any two."""
+def test_an_interrupt_at_any_line_of_add_keeps_the_previous_scans(monkeypatch, scans):
     step = RelativePose(np.eye(4), np.eye(6), "here")
     for line in range(1, 12):
-        made = Recorder()
+        recorder = Recorder()
         for k in range(scans):
-            made.add(k * STEP_NS, np.eye(4), np.eye(6), (step, step) if k else None)
+            recorder.add(k * STEP_NS, np.eye(4), np.eye(6), (step, step) if k else None)
         lines = iter(range(1, 100))
 
         def tracer(frame, event, _arg, lines=lines, stop=line):
@@ -118,18 +119,18 @@ def test_an_interrupt_while_a_scan_is_taken_in_leaves_the_scans_before(monkeypat
 
         sys.settrace(tracer)
         try:
-            made.add(scans * STEP_NS, np.eye(4), np.eye(6), (step, step))
+            recorder.add(scans * STEP_NS, np.eye(4), np.eye(6), (step, step))
         except KeyboardInterrupt:
-            assert len(made) == scans
-            assert made.last_ns == (scans - 1) * STEP_NS
+            assert len(recorder) == scans
+            assert recorder.last_ns == (scans - 1) * STEP_NS
         finally:
             sys.settrace(None)
-        record = record_of(made, LoopKeyframeSelector(LoopKeyframeSettings()).keyframes())
-        assert record.online.stamps_ns.tolist() == [k * STEP_NS for k in range(len(made))]
-        assert len(record.relative) == len(made) - 1
+        record = record_of(recorder, LoopKeyframeSelector(LoopKeyframeSettings()).keyframes())
+        assert record.online.stamps_ns.tolist() == [k * STEP_NS for k in range(len(recorder))]
+        assert len(record.relative) == len(recorder) - 1
 
 
-def test_samples_on_a_common_border_are_taken_once():
+def test_samples_on_a_common_border_are_kept_once():
     stamps = np.arange(11) * 10**7
     whole = ImuSamples(stamps, np.arange(33.0).reshape(11, 3), np.arange(33.0).reshape(11, 3))
     again = concatenate_imu([whole.between(0, 5 * 10**7), ImuSamples.empty(), whole.between(5 * 10**7, 10**8)])
