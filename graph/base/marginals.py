@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
@@ -11,9 +9,8 @@ from gtsam.symbol_shorthand import X
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
+from hybridlio.core.progress import Progress
 from hybridlio.graph.base.isam import incremental_solver, reason
-
-Progress = Callable[[str, int, int], None]
 
 
 def bayes_tree(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.ISAM2:

@@ -1,6 +1,8 @@
-"""GTSAM noise models from covariances, with one clear error for those that are none."""
+"""GTSAM noise models from covariances, standard deviations and robust kernels."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import gtsam
 import numpy as np
@@ -8,16 +10,35 @@ import numpy as np
 from hybridlio.core.arrays import Array
 from hybridlio.core.covariance import check_covariance
 
+_KERNELS: dict[str, Callable[[float], gtsam.noiseModel.mEstimator.Base]] = {
+    "huber": gtsam.noiseModel.mEstimator.Huber,
+    "cauchy": gtsam.noiseModel.mEstimator.Cauchy,
+    "geman-mcclure": gtsam.noiseModel.mEstimator.GemanMcClure,
+    "dcs": gtsam.noiseModel.mEstimator.DCS,
+}
+
 
 def gaussian(covariance: Array, name: str) -> gtsam.noiseModel.Base:
-    """Noise model of a symmetric positive definite covariance; ``name`` says whose in the error.
+    """Return the noise model of a covariance ``(d, d)``; ``name`` is the measurement's, for error messages.
 
     Raises:
-        DataError: not finite, not symmetric or not positive definite.
+        DataError: the covariance is not finite, not symmetric or not positive definite.
     """
     return gtsam.noiseModel.Gaussian.Covariance(check_covariance(covariance, name, len(covariance)))
 
 
 def sigmas(values: Array) -> gtsam.noiseModel.Base:
-    """Noise model of independent standard deviations."""
+    """Return the noise model of independent standard deviations ``(d,)``."""
     return gtsam.noiseModel.Diagonal.Sigmas(np.asarray(values, dtype=np.float64))
+
+
+def with_kernel(model: gtsam.noiseModel.Base, kernel: str, width: float) -> gtsam.noiseModel.Base:
+    """Return the noise model with a robust kernel on it.
+
+    Args:
+        model: noise of a correct measurement.
+        kernel: ``huber``, ``cauchy``, ``geman-mcclure`` or ``dcs`` (dynamic covariance scaling).
+        width: norm of the whitened residual up to which a measurement counts in full.
+    """
+    # GTSAM compares DCS's parameter with the squared norm, the other kernels' with the norm
+    return gtsam.noiseModel.Robust.Create(_KERNELS[kernel](width**2 if kernel == "dcs" else width), model)

@@ -9,9 +9,9 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import gammaincinv
 
 from hybridlio.core.arrays import Array
+from hybridlio.core.chi_square import chi_square_quantile
 from hybridlio.core.covariance import check_covariance
 from hybridlio.core.errors import ConfigError, DataError, GraphError
 from hybridlio.core.sensors import ImuSamples
@@ -156,7 +156,7 @@ def make_robust(robust: RobustLike, size: int, name: str) -> Robust | None:
 
 def default_width(size: int) -> float:
     """The norm that 95 % of ``size`` standard normal numbers stay below."""
-    return float(np.sqrt(2 * gammaincinv(size / 2, _INLIER_SHARE)))
+    return float(np.sqrt(chi_square_quantile(_INLIER_SHARE, size)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
-"""What smoothing takes beside a run's own steps: groups of factors, such as GPS fixes or loop closures.
+"""Groups of factors that smoothing adds to a run's own steps, such as GPS fixes or loop closures.
 
-A group adds factors on the scans' variables (keys as in :mod:`hybridlio.graph.run.factors`) and variables of its own. Those
-of its measurements that may be wrong it gives as :class:`Doubtful`, so that one place makes them robust.
+A group adds factors on the scans' variables (keys as in :mod:`hybridlio.graph.run.factors`) and variables of its own.
+It returns measurements that may be wrong as :class:`Doubtful`, so that one module makes all of them robust.
 """
 
 from __future__ import annotations

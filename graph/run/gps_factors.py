@@ -2,7 +2,7 @@
 
 Fixes are in a local east-north-up frame, the run's poses in its own world; between the two lies an unknown pose, and
 between their clocks an unknown constant. Both are variables of the graph. A fix falls between scans: the motion from
-the nearest scan to its time is taken from the path as it is known (:class:`hybridlio.core.pose_interpolation.PosePath`), as a lever
+the nearest scan to its time is taken from the path (:class:`hybridlio.core.pose_interpolation.PosePath`), as a lever
 that the time shift draws along the velocity. In 50 ms the path is known to millimetres where a fix is known to
 decimetres, so no variable and no noise is added for it; each round takes the levers anew.
 

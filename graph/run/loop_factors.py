@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
 
 import gtsam
 from gtsam.symbol_shorthand import X
@@ -14,54 +11,9 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import State
 from hybridlio.graph.run.factor_groups import Doubtful, GroupAnswer, GroupFactors
-from hybridlio.record.record import Record
-from hybridlio.smoothing.loop_closure import Loop, LoopSearch, LoopSettings, RejectedLoop, find_loops
+from hybridlio.smoothing.loops import ClosedLoops, Loop, LoopSearch, RejectedLoop
 
 _KEPT_WEIGHT = 0.5
-LISTED = 200  # rejected candidates in metrics
-
-
-@dataclass(frozen=True, eq=False)
-class ClosedLoops:
-    """What became of a run's loops.
-
-    Attributes:
-        search: how they were found.
-        kept: the loops that the solve holds to.
-        chi2: ``(L,)`` of each of ``search.loops``, in the solved graph; 6 on average.
-        rejected: all candidates that are none of them, with stage and reason.
-    """
-
-    search: LoopSearch
-    kept: tuple[Loop, ...]
-    chi2: Array
-    rejected: tuple[RejectedLoop, ...]
-
-    def summary(self) -> str:
-        """One line that says what became of the candidates."""
-        search = self.search
-        return (
-            f"{search.candidates} candidates, {search.verified} verified, {len(search.loops)} consistent, "
-            f"{len(self.kept)} kept"
-        )
-
-    def to_json_dict(self, first: int = 0) -> dict[str, Any]:
-        """Counts, the loops kept as pairs of scans, and the first rejected candidates with their reasons.
-
-        ``first`` is the scan that the run starts at.
-        """
-        rejected = self.rejected[:LISTED]
-        return {
-            "keyframes": self.search.keyframes,
-            "candidates": self.search.candidates,
-            "verified": self.search.verified,
-            "consistent": len(self.search.loops),
-            "kept": len(self.kept),
-            "rejected_by_stage": dict(Counter(one.stage for one in self.rejected)),
-            "seconds": self.search.seconds,
-            "scans": [[first + loop.earlier, first + loop.later] for loop in self.kept],
-            "rejected": [vars(one) | {"earlier": first + one.earlier, "later": first + one.later} for one in rejected],
-        }
 
 
 class LoopClosures:
@@ -77,13 +29,6 @@ class LoopClosures:
 
     def __init__(self, search: LoopSearch, T_imu_lidar: Array) -> None:
         self._search, self._T_imu_lidar = search, T_imu_lidar
-
-    @classmethod
-    def of(
-        cls, record: Record, settings: LoopSettings | None, progress: Callable[[str, int, int], None] | None
-    ) -> LoopClosures:
-        """Find a record's loops; arguments and errors as :func:`hybridlio.smoothing.loop_closure.find_loops`."""
-        return cls(find_loops(record, settings, progress), record.calibration.T_imu_lidar)
 
     def build(self, states: Sequence[State], before: gtsam.Values | None) -> GroupFactors:
         """One between-factor for each loop."""

@@ -12,10 +12,9 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.estimates import State
 from hybridlio.graph.base import noise
+from hybridlio.graph.base.truncated_squares import GRADUATION, chi2_bound, first_control, truncated_weights
 from hybridlio.graph.model.measurements import KERNELS, Robust, default_width
 from hybridlio.graph.run.factor_groups import Doubtful, FactorGroup, GroupAnswer, GroupFactors, chi2_of
-from hybridlio.graph.solve.build import kernel_model
-from hybridlio.graph.solve.gnc import GRADUATION, chi2_bound, truncated_weights
 
 TREATMENTS = (*KERNELS, "gnc")
 _STEPS = 100
@@ -145,7 +144,7 @@ def reject(
     control = 0.0
     for step in range(_STEPS):
         shares = chi2_of(doubtful, values) / bounds
-        control = control * GRADUATION if step else 1 / max(2 * float(shares.max()) - 1, 1.0)
+        control = control * GRADUATION if step else first_control(float(shares.max()), 1.0)
         weights = truncated_weights(shares, 1.0, control)
         graph = gtsam.NonlinearFactorGraph(sure)
         for factor in robust_factors(doubtful, "gnc", weights):
@@ -173,4 +172,4 @@ def _kernel(measurement: Doubtful, kernel: str) -> Robust:
 
 def _with_kernel(measurement: Doubtful, kernel: str) -> gtsam.NonlinearFactor:
     model = noise.gaussian(measurement.covariance, measurement.name)
-    return measurement.make(kernel_model(_kernel(measurement, kernel), model))
+    return measurement.make(noise.with_kernel(model, kernel, default_width(len(measurement.covariance))))

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, G, V, X
-from numpy.typing import NDArray
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
 from hybridlio.core.estimates import State
+from hybridlio.core.progress import Progress
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.graph.base.isam import reason
 from hybridlio.graph.base.marginals import bayes_tree, pose_covariances
@@ -22,49 +22,20 @@ from hybridlio.graph.base.preintegration import covers, preintegrate
 from hybridlio.graph.run import factors
 from hybridlio.graph.run.factor_groups import FactorGroup
 from hybridlio.graph.run.gps_factors import GpsGroup
+from hybridlio.graph.run.loop_factors import LoopClosures
 from hybridlio.graph.run.ordering import chain_order
 from hybridlio.graph.run.robust import Added, check_treatment
 from hybridlio.graph.run.scan_numbers import Scans
 from hybridlio.record.record import Record
 from hybridlio.smoothing.gps_options import GpsOptions
+from hybridlio.smoothing.smoothed import Smoothed
 
 if TYPE_CHECKING:
     from hybridlio.smoothing.loop_closure import LoopSettings
 
-Progress = Callable[[str, int, int], None]
-
 _MAX_ITERATIONS = 50
 _ITERATIONS_A_STEP = 4  # while wrong measurements are looked for
 _ROUNDS = 2  # samples are summed up again with the biases that the first round found
-
-
-@dataclass(frozen=True, eq=False)
-class Smoothed:
-    """A smoothed run.
-
-    Attributes:
-        trajectory: ``N`` lidar poses in the first scan's frame, with covariances ``(N, 6, 6)``.
-        step_covariances: ``(N-1, 6, 6)`` of the relative poses between consecutive scans.
-        velocities_m_s: ``(N, 3)`` of the IMU, in the IMU's first pose; meaningless without IMU.
-        accel_biases_m_s2, gyro_biases_rad_s: ``(N, 3)`` each; meaningless without IMU.
-        gravity_m_s2: ``(3,)`` in the IMU's first pose.
-        error_before, error_after: half the sum of squared, whitened residuals at the online estimate and at the answer.
-        iterations: Levenberg-Marquardt steps of the last round.
-        converged: whether the error had stopped falling.
-        found: what each group of further measurements found, by its name.
-    """
-
-    trajectory: Trajectory
-    step_covariances: NDArray[np.float64]
-    velocities_m_s: NDArray[np.float64]
-    accel_biases_m_s2: NDArray[np.float64]
-    gyro_biases_rad_s: NDArray[np.float64]
-    gravity_m_s2: NDArray[np.float64]
-    error_before: float
-    error_after: float
-    iterations: int
-    converged: bool
-    found: dict[str, Any] = field(default_factory=dict)
 
 
 def smooth(
@@ -82,7 +53,7 @@ def smooth(
         record: of the run, from :meth:`hybridlio.odometry.odometry.Odometry.record` or a run folder's ``odometry.npz``.
         progress: called with the stage, what is done of it and what there is in all.
         loops: find where the run comes back to a place, and close the loops; settings of how, or True. What became of
-            them is ``found["loops"]``, a :class:`hybridlio.graph.run.loop_factors.ClosedLoops`.
+            them is ``found["loops"]``, a :class:`hybridlio.smoothing.loops.ClosedLoops`.
         gps: whether to use the record's GPS fixes, and how; what came of it is ``found["gps"]``, a
             :class:`hybridlio.smoothing.gps_options.GpsFit`.
         groups: more measurements.
@@ -120,9 +91,10 @@ def _with_loops(
 ) -> Sequence[FactorGroup]:
     if loops is False:
         return groups
-    from hybridlio.graph.run.loop_factors import LoopClosures  # late: registration is of no use to those without loops
+    from hybridlio.smoothing.loop_closure import find_loops  # late: only those who close loops load registration
 
-    return (*groups, LoopClosures.of(record, None if loops is True else loops, report))
+    search = find_loops(record, None if loops is True else loops, report)
+    return (*groups, LoopClosures(search, record.calibration.T_imu_lidar))
 
 
 def _silent(stage: str, done: int, total: int) -> None:

@@ -14,6 +14,7 @@ from hybridlio.core.errors import GraphError
 from hybridlio.core.estimates import State
 from hybridlio.core.motion_limits import GRAVITY_M_S2
 from hybridlio.core.sensors import NS_PER_S, ImuNoise
+from hybridlio.graph.base.noise import with_kernel
 from hybridlio.graph.base.preintegration import preintegrate
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.checks import chains_without_bias
@@ -31,12 +32,6 @@ _GAUSSIAN: dict[str, Callable[[Array], gtsam.noiseModel.Base]] = {
     "sigmas": gtsam.noiseModel.Diagonal.Sigmas,
     "information": gtsam.noiseModel.Gaussian.Information,
     "covariance": gtsam.noiseModel.Gaussian.Covariance,
-}
-_ROBUST = {
-    "huber": gtsam.noiseModel.mEstimator.Huber,
-    "cauchy": gtsam.noiseModel.mEstimator.Cauchy,
-    "geman-mcclure": gtsam.noiseModel.mEstimator.GemanMcClure,
-    "dcs": gtsam.noiseModel.mEstimator.DCS,
 }
 
 
@@ -181,13 +176,7 @@ def noise_model(form: str, values: Array, kernel: Robust | None, dimension: int)
     if dimension == 2:
         values = values[_PLANAR_SIGMAS] if form == "sigmas" else values.ravel()[_PLANAR_MATRIX].reshape(3, 3)
     model = _GAUSSIAN[form](values)
-    return model if kernel is None else kernel_model(kernel, model)
-
-
-def kernel_model(kernel: Robust, model: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
-    """GTSAM's noise model with a robust kernel on it."""
-    width = kernel.width**2 if kernel.kernel == "dcs" else kernel.width
-    return gtsam.noiseModel.Robust.Create(_ROBUST[kernel.kernel](width), model)
+    return model if kernel is None else with_kernel(model, kernel.kernel, kernel.width)
 
 
 def _given_bias(data: GraphData) -> Callable[[int], gtsam.imuBias.ConstantBias]:

@@ -10,11 +10,11 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
-from scipy.special import gammaincinv
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
 from hybridlio.graph.base.isam import reason
+from hybridlio.graph.base.truncated_squares import GRADUATION, chi2_bound, first_control, truncated_weights
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.checks import components
 from hybridlio.graph.model.edge_arrays import Edges, edges_of, loops_of
@@ -23,8 +23,6 @@ from hybridlio.graph.solve.build import Builder, noise_model
 from hybridlio.graph.solve.levenberg import Progress, needs_orthogonal, parameters, poses_of
 from hybridlio.graph.solve.starts import find
 
-_INLIER_SHARE = 0.99  # of right factors have a χ² below the bound
-GRADUATION = 1.4  # the paper's
 _ITERATIONS_A_STEP = 2
 _STEPS = 200
 _LEAST_WEIGHT = 1e-9  # where the loops hold parts together, each keeps a trace
@@ -59,7 +57,7 @@ def reject_outliers(data: GraphData, start: Array, report: Progress) -> tuple[Ar
     control = 0.0
     for step in range(_STEPS):
         chi2 = edges.chi2(co.to_matrices(poses_of(values, data.dimension)))
-        control = control * GRADUATION if step else bound / max(2 * float(chi2.max()) - bound, bound)
+        control = control * GRADUATION if step else first_control(float(chi2.max()), bound)
         weights = truncated_weights(chi2, bound, control)
         report("rejecting", step, float(np.minimum(chi2, bound).sum()))
         if ((weights == 0) | (weights == 1)).all():
@@ -75,18 +73,6 @@ def start_without_loops(data: GraphData) -> Array | None:
         return find(data, "odometry")
     except GraphError:
         return None
-
-
-def chi2_bound(size: int) -> float:
-    """What right factors' χ² of ``size`` degrees of freedom stay below in 99 of 100 cases."""
-    return float(2 * gammaincinv(size / 2, _INLIER_SHARE))
-
-
-def truncated_weights(chi2: Array, bound: float, control: float) -> Array:
-    """Weights ``(M,)`` of truncated least squares at a control parameter (Yang et al., eq. 14)."""
-    between = np.sqrt(bound * control * (control + 1) / np.maximum(chi2, 1e-12 * bound)) - control
-    weights = np.where(chi2 >= bound * (control + 1) / control, 0.0, between)
-    return np.where(chi2 <= bound * control / (control + 1), 1.0, weights)
 
 
 class _Weighted:

@@ -15,9 +15,9 @@ from hybridlio.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from hybridlio.evaluation.report_data import Findings
-    from hybridlio.graph.run.smooth import Smoothed
     from hybridlio.record.record import Record
     from hybridlio.smoothing.gps_options import GpsOptions
+    from hybridlio.smoothing.smoothed import Smoothed
 
 
 @guarded

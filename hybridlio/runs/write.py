@@ -22,10 +22,9 @@ from hybridlio.runs import folder as run_folder
 from hybridlio.runs.run import Run
 
 if TYPE_CHECKING:
-    from hybridlio.graph.run.loop_factors import ClosedLoops
-    from hybridlio.graph.run.smooth import Smoothed
     from hybridlio.smoothing.gps_options import GpsFit
-    from hybridlio.smoothing.loop_closure import Loop
+    from hybridlio.smoothing.loops import ClosedLoops, Loop
+    from hybridlio.smoothing.smoothed import Smoothed
     from hybridlio.sources.innovation_gate import Verdict
 
 _ONLINE, _SMOOTHED = "odometry", "smoothed"

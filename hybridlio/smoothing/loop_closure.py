@@ -8,31 +8,29 @@ with odometry and with one another are kept. What is wrong all the same is left 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Index
+from hybridlio.core.chi_square import chi_square_quantile
 from hybridlio.core.errors import DataError
-from hybridlio.core.estimates import RelativePose
+from hybridlio.core.progress import Progress
 from hybridlio.record.loop_keyframes import LoopKeyframes
 from hybridlio.record.record import Record
 from hybridlio.smoothing.loop_candidates import Candidate, CandidateFinder, CandidateSettings
 from hybridlio.smoothing.loop_consistency import (
     ConsistencySettings,
     MeasuredLoops,
-    chi2_bound,
     largest_agreeing,
     odometry_chi2,
     pairwise_chi2,
     witnessed,
 )
 from hybridlio.smoothing.loop_verification import Verdict, VerificationSettings, Verifier
+from hybridlio.smoothing.loops import Loop, LoopSearch, RejectedLoop
 from hybridlio.smoothing.step_uncertainty import OdometryChain
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
@@ -42,65 +40,6 @@ class LoopSettings:
     candidates: CandidateSettings = field(default_factory=CandidateSettings)
     verification: VerificationSettings = field(default_factory=VerificationSettings)
     consistency: ConsistencySettings = field(default_factory=ConsistencySettings)
-
-
-@dataclass(frozen=True, eq=False)
-class Loop:
-    """Two visits to a place.
-
-    Attributes:
-        earlier, later: rows of the run.
-        pose: ``(4, 4)`` ``T_earlier_later``, lidar frames.
-        covariance: ``(6, 6)`` of a right perturbation, rad² and m², rotation first.
-        matched: share of points that lie near a surface.
-        cost: mean robust cost of the registration, 0 to 1.
-    """
-
-    earlier: int
-    later: int
-    pose: Array
-    covariance: Array
-    matched: float
-    cost: float
-
-    def as_relative_pose(self) -> RelativePose:
-        """The relative pose of the two scans."""
-        return RelativePose(self.pose, self.covariance, "loop")
-
-
-@dataclass(frozen=True)
-class RejectedLoop:
-    """A candidate that is no loop.
-
-    Attributes:
-        earlier, later: rows of the run.
-        stage: ``verification``, ``consistency`` or ``solve``.
-        reason: why.
-    """
-
-    earlier: int
-    later: int
-    stage: str
-    reason: str
-
-
-@dataclass(frozen=True, eq=False)
-class LoopSearch:
-    """What was found in a run.
-
-    Attributes:
-        keyframes, candidates, verified: how many of each.
-        loops: those that are consistent.
-        rejected: the other candidates.
-        seconds: by stage.
-    """
-
-    keyframes: int
-    candidates: int
-    verified: int
-    loops: tuple[Loop, ...]
-    rejected: tuple[RejectedLoop, ...]
-    seconds: dict[str, float]
 
 
 def find_loops(record: Record, settings: LoopSettings | None = None, progress: Progress | None = None) -> LoopSearch:
@@ -116,7 +55,7 @@ def find_loops(record: Record, settings: LoopSettings | None = None, progress: P
     """
     settings = settings or LoopSettings()
     keyframes = _keyframes_of(record)
-    chain = OdometryChain(record)
+    chain = OdometryChain(record.online, record.relative)
     rows = keyframes.rows
     verifier = Verifier(keyframes, chain, settings.verification)
     finder = CandidateFinder(chain, rows, _up(record), verifier.surroundings, settings.candidates)
@@ -142,7 +81,7 @@ def consistent(
     verified: list[Loop], chain: OdometryChain, settings: ConsistencySettings
 ) -> tuple[tuple[Loop, ...], tuple[RejectedLoop, ...]]:
     """Those loops that agree with odometry and with one another, and the others with the reason."""
-    bound = chi2_bound(settings.inlier_share)
+    bound = chi_square_quantile(settings.inlier_share, 6)
     chi2 = odometry_chi2(_arrays(verified), chain, settings.odometry_scale) if verified else np.empty(0)
     rejected = [
         _inconsistent(one, f"against odometry (χ² {x:.0f})") for one, x in zip(verified, chi2, strict=True) if x > bound

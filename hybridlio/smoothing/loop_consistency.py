@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaincinv
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Index, Mask
@@ -60,11 +59,6 @@ class MeasuredLoops:
     later: Index
     poses: Array
     covariances: Array
-
-
-def chi2_bound(share: float) -> float:
-    """What this share of right poses' χ² stays below."""
-    return float(2 * gammaincinv(3.0, share))
 
 
 def odometry_chi2(loops: MeasuredLoops, chain: OdometryChain, scale: float) -> Array:

@@ -6,12 +6,14 @@ sum up to one scan less that up to another is the uncertainty between them, what
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Index
 from hybridlio.core.estimates import RelativePose
-from hybridlio.record.record import Record
+from hybridlio.core.trajectory import Trajectory
 
 
 class OdometryChain:
@@ -21,20 +23,20 @@ class OdometryChain:
     covariances are larger by that much.
     """
 
-    def __init__(self, record: Record) -> None:
-        self.poses = record.online.poses
-        steps = np.linalg.norm(np.diff(self.poses[:, :3, 3], axis=0), axis=1)
-        self.travelled_m: Array = np.append(0.0, np.cumsum(steps))
-        along = np.array([_along(step) for step in record.relative]).reshape(-1, 6, 6)
-        beside = np.array([_beside(step) for step in record.relative]).reshape(-1, 6, 6)
+    def __init__(self, online: Trajectory, steps: Sequence[RelativePose]) -> None:
+        self.poses = online.poses
+        lengths_m = np.linalg.norm(np.diff(self.poses[:, :3, 3], axis=0), axis=1)
+        self.travelled_m: Array = np.append(0.0, np.cumsum(lengths_m))
+        along = np.array([_along(step) for step in steps]).reshape(-1, 6, 6)
+        beside = np.array([_beside(step) for step in steps]).reshape(-1, 6, 6)
         self._sums = np.concatenate(
             [np.zeros((1, 6, 6)), np.cumsum(se3.rotate_covariance(along, self.poses[1:]), axis=0)]
         )
         self._scatter = np.concatenate([np.zeros((1, 6, 6)), se3.rotate_covariance(beside, self.poses[1:])])
         self._scale: Array = np.ones(len(self.poses))
-        if record.online.covariances is not None:
+        if online.covariances is not None:
             own = self.covariance(np.zeros(len(self.poses), np.int64), np.arange(len(self.poses)))
-            shares = _spread(record.online.covariances) / np.maximum(_spread(own), 1e-12)
+            shares = _spread(online.covariances) / np.maximum(_spread(own), 1e-12)
             self._scale = np.maximum(1.0, np.where(self.travelled_m > 1.0, shares, 1.0))
 
     def relative(self, i: Index, j: Index) -> Array:

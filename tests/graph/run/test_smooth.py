@@ -17,7 +17,8 @@ from hybridlio.core.start_state import start_state
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.evaluation.consistency import pose_consistency, step_errors
 from hybridlio.graph.run import smooth as offline
-from hybridlio.graph.run.smooth import Smoothed, smooth
+from hybridlio.graph.run.smooth import smooth
+from hybridlio.smoothing.smoothed import Smoothed
 
 ALMOST_NONE = ImuNoise(1e-6, 1e-6, 1e-9, 1e-9, 1e-6, 1e-6)
 TIGHT = np.r_[np.full(3, 1e-5), np.full(3, 1e-4)]
@@ -106,6 +107,13 @@ def test_the_first_pose_is_the_origin_and_as_sure_as_can_be(many: list[tuple[Any
         assert smoothed.trajectory.covariances is not None
         assert np.sqrt(np.diag(smoothed.trajectory.covariances[0])).max() < 1e-5
         assert smoothed.trajectory.stamps_ns.tolist() == [frame.scan.stamp_ns for frame in drive.frames]
+
+
+def test_the_repr_is_one_informative_line(many: list[tuple[Any, Smoothed]]):
+    smoothed = many[0][1]
+    length_m, count = smoothed.trajectory.length_m, smoothed.iterations
+    errors = f"error {smoothed.error_before:.4g} -> {smoothed.error_after:.4g}"
+    assert repr(smoothed) == f"Smoothed(41 poses, {length_m:.1f} m, {errors}, converged after {count} iterations)"
 
 
 def test_covariances_are_positive_definite_and_grow_with_the_way(many: list[tuple[Any, Smoothed]]):

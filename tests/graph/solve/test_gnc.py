@@ -10,7 +10,7 @@ import pytest
 from hybridlio.core import se3
 from hybridlio.core.errors import GraphError
 from hybridlio.graph import PoseGraph
-from hybridlio.graph.solve.gnc import chi2_bound, truncated_weights
+from hybridlio.graph.base.truncated_squares import chi2_bound, truncated_weights
 
 
 def laps(rng: np.random.Generator, dimension: int, count: int = 120, lap: int = 30) -> PoseGraph:

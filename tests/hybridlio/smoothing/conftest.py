@@ -16,7 +16,8 @@ from hybridlio.core.start_state import start_state
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.record.loop_keyframes import LoopKeyframeSelector, LoopKeyframeSettings
 from hybridlio.record.record import Record
-from hybridlio.smoothing.loop_closure import Loop, LoopSearch, find_loops
+from hybridlio.smoothing.loop_closure import find_loops
+from hybridlio.smoothing.loops import Loop, LoopSearch
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def candidates(record: Any, settings: CandidateSettings | None = None) -> list[Candidate]:
-    chain, rows = OdometryChain(record), record.keyframes.rows
+    chain, rows = OdometryChain(record.online, record.relative), record.keyframes.rows
     verifier = Verifier(record.keyframes, chain, VerificationSettings())
     finder = CandidateFinder(chain, rows, UP, verifier.surroundings, settings or CandidateSettings())
     return [one for k in range(len(rows)) for one in finder.add(k)]
@@ -47,7 +47,7 @@ def test_the_other_lane_the_other_way_is_a_candidate_too(round_trip: Any, found:
 
 def test_what_is_near_along_the_path_is_no_candidate(round_trip: Any, found: list[Candidate]):
     rows = round_trip.record.keyframes.rows
-    travelled = OdometryChain(round_trip.record).travelled_m
+    travelled = OdometryChain(round_trip.record.online, round_trip.record.relative).travelled_m
     assert min(travelled[rows[one.later]] - travelled[rows[one.earlier]] for one in found) >= 40.0
     settings = CandidateSettings(min_path_m=200.0)
     farther = [rows[one.later] - rows[one.earlier] for one in candidates(round_trip.record, settings)]

@@ -10,8 +10,9 @@ from hybridlio.core import se3
 from hybridlio.core.errors import DataError
 from hybridlio.evaluation.consistency import pose_consistency
 from hybridlio.record.loop_keyframes import LoopKeyframes
-from hybridlio.smoothing.loop_closure import Loop, LoopSearch, consistent, find_loops
+from hybridlio.smoothing.loop_closure import consistent, find_loops
 from hybridlio.smoothing.loop_consistency import ConsistencySettings
+from hybridlio.smoothing.loops import Loop, LoopSearch
 from hybridlio.smoothing.step_uncertainty import OdometryChain
 
 
@@ -58,7 +59,7 @@ def test_a_street_that_looks_the_same_elsewhere_closes_no_loop(round_trip: Any):
 
 
 def test_wrong_loops_among_those_verified_are_found(round_trip: Any, closed_round_trip: LoopSearch):
-    chain = OdometryChain(round_trip.record)
+    chain = OdometryChain(round_trip.record.online, round_trip.record.relative)
     right = list(closed_round_trip.loops)
     wrong = [
         Loop(loop.earlier, loop.later, loop.pose @ se3.exp(np.array([0, 0, 0, 4.0, 0, 0])), loop.covariance, 0.9, 0.2)
@@ -72,9 +73,8 @@ def test_wrong_loops_among_those_verified_are_found(round_trip: Any, closed_roun
 
 
 def test_a_single_loop_is_not_believed(round_trip: Any, closed_round_trip: LoopSearch):
-    kept, rejected = consistent(
-        [closed_round_trip.loops[0]], OdometryChain(round_trip.record), ConsistencySettings()
-    )  # fmt: skip
+    chain = OdometryChain(round_trip.record.online, round_trip.record.relative)
+    kept, rejected = consistent([closed_round_trip.loops[0]], chain, ConsistencySettings())
     assert kept == ()
     assert [one.reason for one in rejected] == ["no other loop nearby agrees"]
 

@@ -14,7 +14,8 @@ from hybridlio.smoothing.step_uncertainty import OdometryChain
 
 @pytest.fixture(scope="module")
 def verifier(round_trip: Any) -> Verifier:
-    return Verifier(round_trip.record.keyframes, OdometryChain(round_trip.record), VerificationSettings())
+    record = round_trip.record
+    return Verifier(record.keyframes, OdometryChain(record.online, record.relative), VerificationSettings())
 
 
 def keyframe_at(drive: Any, row: int) -> int:
@@ -60,7 +61,7 @@ def test_bare_ground_holds_too_little(round_trip: Any, rng: np.random.Generator)
     rows, stamps = round_trip.record.keyframes.rows, round_trip.record.keyframes.stamps_ns
     flat = np.column_stack([rng.uniform(-40, 40, (4000, 2)), rng.normal(-1.8, 0.01, 4000)])
     clouds = tuple(np.round(flat / RESOLUTION_M).astype(np.int16) for _ in rows)
-    chain = OdometryChain(round_trip.record)
+    chain = OdometryChain(round_trip.record.online, round_trip.record.relative)
     verdict = Verifier(LoopKeyframes(rows, stamps, clouds), chain, VerificationSettings()).verify(3, 70, [np.eye(4)])
     assert verdict.reason == "hardly anything stands out of the ground"
 
@@ -72,7 +73,7 @@ def test_one_wall_alone_leaves_the_way_along_it_open(round_trip: Any, rng: np.ra
     wall = np.column_stack([rng.uniform(-40, 40, 2500), np.full(2500, 6.0), rng.uniform(-1.8, 4, 2500)])
     cloud = np.concatenate([flat, wall]) + rng.normal(0.0, 0.01, (5000, 3))
     clouds = tuple(np.round(cloud / RESOLUTION_M).astype(np.int16) for _ in rows)
-    chain = OdometryChain(replace(round_trip.record, online=straight))
+    chain = OdometryChain(straight, round_trip.record.relative)
     verdict = Verifier(LoopKeyframes(rows, stamps, clouds), chain, VerificationSettings()).verify(3, 70, [np.eye(4)])
     assert verdict.reason == "a direction is not held"
 

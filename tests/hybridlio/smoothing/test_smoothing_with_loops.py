@@ -14,13 +14,13 @@ from hybridlio.commands.app import app
 from hybridlio.core import se3
 from hybridlio.core.errors import DataError
 from hybridlio.graph import PoseGraph
-from hybridlio.graph.run.loop_factors import ClosedLoops, LoopClosures
-from hybridlio.graph.run.smooth import Smoothed
+from hybridlio.graph.run.loop_factors import LoopClosures
 from hybridlio.record.loop_keyframes import LoopKeyframes
 from hybridlio.runs import folder as run_folder
 from hybridlio.runs.folder import StoredRun
 from hybridlio.runs.write import write_smoothed
-from hybridlio.smoothing.loop_closure import LoopSearch
+from hybridlio.smoothing.loops import ClosedLoops, LoopSearch
+from hybridlio.smoothing.smoothed import Smoothed
 
 
 def smoothed_with(drive: Any, search: LoopSearch, robust: str | None = None) -> Smoothed:

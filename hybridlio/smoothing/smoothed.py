@@ -1,0 +1,54 @@
+"""The result of smoothing a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from hybridlio.core.arrays import Array
+from hybridlio.core.trajectory import Trajectory
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Smoothed:
+    """A smoothed run.
+
+    Attributes:
+        trajectory: ``N`` lidar poses in the first scan's frame, with covariances ``(N, 6, 6)``.
+        step_covariances: ``(N-1, 6, 6)`` of the relative poses between consecutive scans.
+        velocities_m_s: ``(N, 3)`` of the IMU, in the frame of its first pose; meaningless without IMU.
+        accel_biases_m_s2, gyro_biases_rad_s: ``(N, 3)`` each; meaningless without IMU.
+        gravity_m_s2: ``(3,)`` in the frame of the IMU's first pose.
+        error_before, error_after: half the sum of squared, whitened residuals at the online estimate and at the
+            solution.
+        iterations: Levenberg-Marquardt iterations of the last round.
+        converged: whether the error stopped falling within the allowed iterations.
+        found: results of the further measurements, by the name of their group: ``loops``
+            (:class:`hybridlio.smoothing.loops.ClosedLoops`), ``gps``
+            (:class:`hybridlio.smoothing.gps_options.GpsFit`).
+    """
+
+    trajectory: Trajectory
+    step_covariances: Array
+    velocities_m_s: Array
+    accel_biases_m_s2: Array
+    gyro_biases_rad_s: Array
+    gravity_m_s2: Array
+    error_before: float
+    error_after: float
+    iterations: int
+    converged: bool
+    found: dict[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        end = "converged" if self.converged else "not converged"
+        found = "".join(f", {name}: {result.summary()}" for name, result in self.found.items() if _has_summary(result))
+        return (
+            f"Smoothed({len(self.trajectory)} poses, {self.trajectory.length_m:.1f} m, error "
+            f"{self.error_before:.4g} -> {self.error_after:.4g}, {end} after {self.iterations} iterations{found})"
+        )
+
+
+def _has_summary(result: object) -> bool:
+    """Whether a group's result can describe itself; a user's own group may return anything."""
+    return callable(getattr(result, "summary", None))
