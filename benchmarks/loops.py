@@ -96,7 +96,7 @@ def drifted(record: Record, times: float, seed: int) -> Record:
         pose = step.pose @ se3.exp(sigmas * rng.standard_normal(6))
         own = np.diag(sigmas**2)
         drift = None if step.drift is None else step.drift + own
-        steps.append(replace(step, pose=pose, covariance=step.covariance + own, drift=drift, keyframes=()))
+        steps.append(replace(step, pose=pose, covariance=step.covariance + own, drift=drift, earlier_scans=()))
     poses, covariances = [np.eye(4)], [1e-12 * np.eye(6)]
     for step in steps:
         poses.append(poses[-1] @ step.pose)

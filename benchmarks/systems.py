@@ -49,7 +49,7 @@ def ours(config: Config, _: Sequence, threads: int) -> Step:
     def step(frame: Frame) -> Answer:
         estimate = odometry.step(frame)
         relative = estimate.relative
-        disagreed = estimate.agreement.verdict not in ("untested", "agrees")
+        disagreed = estimate.gate.verdict not in ("untested", "accepted")
         marks = (False, False) if relative is None else (not relative.ok, len(relative.degenerate) > 0)
         return Answer(estimate.pose, estimate.stamp_ns, estimate.covariance, *marks, disagreed)
 

@@ -90,7 +90,7 @@ def map_factors(i: int, relative: RelativePose, drift: Array, T_imu_lidar: Array
     return graph
 
 
-def keyframe_factors(k: int, relative: RelativePose, scans: Scans, T_imu_lidar: Array) -> Factors:
+def earlier_scan_factors(k: int, relative: RelativePose, scans: Scans, T_imu_lidar: Array) -> Factors:
     """Scan ``k`` relative to earlier scans than the last, as far as they are still in the graph.
 
     All of a scan's relative poses share its noise, be it the newer one or the keyframe. Where the step says how much
@@ -100,7 +100,7 @@ def keyframe_factors(k: int, relative: RelativePose, scans: Scans, T_imu_lidar: 
     """
     on_path = relative.drift is not None and relative.ok
     graph: Factors = []
-    for keyframe in relative.keyframes:
+    for keyframe in relative.earlier_scans:
         j = scans.number(keyframe.stamp_ns)
         if j is not None:
             before = M(j) if on_path and scans.is_on_path(j) else X(j)
@@ -173,7 +173,7 @@ def step_factors(
     if relative.drift is not None:
         for factor in map_factors(i, relative, relative.drift, T_imu_lidar, fresh=not scans.is_on_path(i)):
             graph.add(factor)
-    for factor in keyframe_factors(i + 1, relative, scans, T_imu_lidar):
+    for factor in earlier_scan_factors(i + 1, relative, scans, T_imu_lidar):
         graph.add(factor)
     usable = relative.ok and not relative.from_imu and relative.drift is None
     if usable or (pim is None and not (relative.ok and relative.drift is not None)):

@@ -121,7 +121,7 @@ class IncrementalBackend:
         By default iSAM2 eliminates all variables of the new factors last, old keyframes too; within a hundred scans
         each update would then reach far back (fifty times as slow).
         """
-        found = [j for k in relative.keyframes if (j := self._scans.number(k.stamp_ns)) is not None]
+        found = [j for k in relative.earlier_scans if (j := self._scans.number(k.stamp_ns)) is not None]
         if not found or min(found) >= self._k:
             return None
         order = gtsam.KeyGroupMap()

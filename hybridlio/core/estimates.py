@@ -19,7 +19,7 @@ from hybridlio.core.sensors import Frame
 
 
 @dataclass(frozen=True, eq=False)
-class KeyframePose:
+class EarlierScanPose:
     """Where a scan is relative to an earlier scan than the last one.
 
     Attributes:
@@ -53,7 +53,7 @@ class RelativePose:
             the next step takes back. None where the steps' errors are independent, so that all of it adds up.
         from_imu: whether the pose is the inertial data's; a graph that has the IMU itself must not count it twice.
         proposed: ``(4, 4)``, of an initial pose: where else a residual source may start, if it finds that to be better.
-        keyframes: the same scan k+1 relative to earlier scans than k, from a source that looks at several.
+        earlier_scans: the same scan k+1 relative to earlier scans than k, from a source that looks at several.
         details: the source's own diagnostics by name (inliers, iterations, error …).
     """
 
@@ -65,7 +65,7 @@ class RelativePose:
     from_imu: bool = False
     drift: Array | None = None
     proposed: Array | None = None
-    keyframes: tuple[KeyframePose, ...] = ()
+    earlier_scans: tuple[EarlierScanPose, ...] = ()
     details: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -88,8 +88,8 @@ class RelativePose:
 
         Args:
             times: by which every covariance grows.
-            added: ``(6, 6)`` to add to the step's covariance; it does not add up over steps. To those of ``keyframes``
-                too, where they do not share the step's scatter.
+            added: ``(6, 6)`` to add to the step's covariance; it does not add up over steps. Added to
+                ``earlier_scans`` as well where they do not share the scatter of the step.
         """
         extra: Array = np.zeros((6, 6)) if added is None else added
         shared = self.drift is not None
@@ -97,8 +97,8 @@ class RelativePose:
             self,
             covariance=times * self.covariance + extra,
             drift=None if self.drift is None else times * self.drift,
-            keyframes=tuple(
-                replace(k, covariance=times * k.covariance + (0 if shared else extra)) for k in self.keyframes
+            earlier_scans=tuple(
+                replace(k, covariance=times * k.covariance + (0 if shared else extra)) for k in self.earlier_scans
             ),
         )
 

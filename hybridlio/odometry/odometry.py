@@ -23,7 +23,7 @@ from hybridlio.odometry.registry import Setup, check_names, make_chosen
 from hybridlio.record.loop_keyframes import LoopKeyframeSelector
 from hybridlio.record.record import Record
 from hybridlio.record.recorder import Recorder, concatenate_imu
-from hybridlio.sources.innovation_gate import UNTESTED, Agreement, Witness
+from hybridlio.sources.innovation_gate import UNTESTED, GateResult, InnovationGate
 
 _STARTS_WITHOUT_IMU = 3  # then the first step changes no more
 
@@ -40,7 +40,7 @@ class Estimate:
         relative: the relative pose ``T = δT·T̂`` after the residual source; None at the first frame.
         step: the relative pose as the backend sees it after all; None at the first frame.
         seconds: time spent, by stage.
-        agreement: whether the residual source and the IMU agree; ``relative`` is what became of it.
+        gate: whether the residual source's pose and the IMU agree; ``relative`` is what passed the gate.
     """
 
     index: int
@@ -51,7 +51,7 @@ class Estimate:
     relative: RelativePose | None
     step: RelativePose | None
     seconds: dict[str, float]
-    agreement: Agreement = UNTESTED
+    gate: GateResult = UNTESTED
 
     @property
     def residual(self) -> Array:
@@ -117,7 +117,7 @@ class Odometry:
         if self._state is None and relative.ok:
             relative = self._restart(self._first, frame, relative, state)
         with _timed(seconds, "graph"):
-            relative, agreement = self._compare(frame, initial, relative, state)
+            relative, gate = self._compare(frame, initial, relative, state)
             self._state = self._backend.update(frame, relative)
             step = self._backend.last_step()
         if relative.ok and relative.source != initial.source:  # its own guess is nothing to learn from
@@ -126,7 +126,7 @@ class Odometry:
         with _timed(seconds, "keyframes"):
             self._keyframes.offer(len(self._made), self._compensated, pose)
         return self._keep(
-            Estimate(frame.index, frame.scan.stamp_ns, pose, covariance, initial, relative, step, seconds, agreement),
+            Estimate(frame.index, frame.scan.stamp_ns, pose, covariance, initial, relative, step, seconds, gate),
             frame,
         )
 
@@ -146,7 +146,7 @@ class Odometry:
         """Take the first frame: it defines the origin."""
         self._setup = _setup(self._config, frame)
         self._initial_pose, self._residual, self._backend = make_chosen(self._chosen, self._setup)
-        self._witness = Witness()
+        self._gate = InnovationGate()
         self._residual.start(self._turned_back(frame))
         self._first = frame
         covariance = np.eye(6) * 1e-12  # it defines the frame; GTSAM and files want it positive definite
@@ -196,13 +196,13 @@ class Odometry:
 
     def _compare(
         self, frame: Frame, initial: RelativePose, measured: RelativePose, state: State
-    ) -> tuple[RelativePose, Agreement]:
+    ) -> tuple[RelativePose, GateResult]:
         """Down-weight or reject what the IMU contradicts."""
         predicted = self._setup.inertial_steps.predicted(frame, state) if state.has_imu else None
-        relative, agreement = self._witness.judge(measured, predicted, initial)
-        if agreement.verdict == "rejected" and isinstance(self._residual, TakesBack):
+        relative, gate = self._gate.apply(measured, predicted, initial)
+        if gate.verdict == "rejected" and isinstance(self._residual, TakesBack):
             self._residual.take_back(initial)
-        return relative, agreement
+        return relative, gate
 
     def _restart(self, first: Frame, frame: Frame, found: RelativePose, state: State) -> RelativePose:
         """Do the first step again: only now is it known how fast the first two scans moved.

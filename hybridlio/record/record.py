@@ -25,10 +25,10 @@ from hybridlio.core.start_state import start_state
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.record.loop_keyframes import LoopKeyframes
 from hybridlio.record.odometry_noise import odometry_noise
-from hybridlio.record.step_arrays import keyframe_arrays, relative_arrays, relative_poses, with_keyframes
+from hybridlio.record.step_arrays import earlier_scan_arrays, relative_arrays, relative_poses, with_earlier_scans
 
 FORMAT_VERSION = 2
-_READABLE = (1, 2)  # version 1 has no poses relative to map keyframes
+_READABLE = (1, 2)  # version 1 has no poses relative to earlier scans
 _SOURCE = "odometry"  # `source` of the steps of an odometry that is not ours
 _FIRST_POSE_VARIANCE = 1e-12  # rad², m²; the first pose is the origin, but a covariance must be positive definite
 
@@ -121,7 +121,7 @@ class Record:
         for k, step in enumerate(self.relative):
             out.append((k, k + 1, step))
             scatter = 0 if step.drift is None or not step.ok else step.covariance - step.drift
-            for near in step.keyframes:
+            for near in step.earlier_scans:
                 edge = RelativePose(near.pose, near.covariance + scatter, step.source)
                 out.append((number[near.stamp_ns], k + 1, edge))
         return out
@@ -201,7 +201,7 @@ def _to_arrays(record: Record) -> dict[str, Any]:
         arrays["gps_origin"] = np.array(record.origin)
     arrays |= {f"start_{f.name}": getattr(record.start, f.name) for f in fields(State)}
     steps = relative_arrays("initial", record.initial) | relative_arrays("relative", record.relative)
-    return arrays | steps | keyframe_arrays(record.relative)
+    return arrays | steps | earlier_scan_arrays(record.relative)
 
 
 def _from_arrays(arrays: Mapping[str, Any]) -> Record:
@@ -214,7 +214,7 @@ def _from_arrays(arrays: Mapping[str, Any]) -> Record:
     return Record(
         online=Trajectory(arrays["stamps_ns"], arrays["online_poses"], arrays["online_covariances"]),
         initial=relative_poses("initial", arrays),
-        relative=with_keyframes(relative_poses("relative", arrays), arrays),
+        relative=with_earlier_scans(relative_poses("relative", arrays), arrays),
         imu=ImuSamples(arrays["imu_stamps_ns"], arrays["gyro_rad_s"], arrays["accel_m_s2"]),
         gps=tuple(GpsFix(int(stamp), position, covariance, origin) for stamp, position, covariance in gps),
         start=State(**start),

@@ -14,7 +14,7 @@ from hybridlio.core.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.record.loop_keyframes import LoopKeyframes
 from hybridlio.record.record import Record
-from hybridlio.record.step_arrays import keyframe_arrays, relative_arrays, relative_poses, with_keyframes
+from hybridlio.record.step_arrays import earlier_scan_arrays, relative_arrays, relative_poses, with_earlier_scans
 
 # Scans that are packed together. As objects they take five times the memory, so few should wait; packing more at once
 # only makes the step longer in which it happens.
@@ -109,14 +109,13 @@ def _arrays(scans: list[_ScanEstimate]) -> dict[str, Any]:
         "online_poses": np.array([scan.pose for scan in scans]),
         "online_covariances": np.array([scan.covariance for scan in scans]),
     }
-    return (
-        online | relative_arrays("initial", initial) | relative_arrays("relative", relative) | keyframe_arrays(relative)
-    )
+    steps = relative_arrays("initial", initial) | relative_arrays("relative", relative)
+    return online | steps | earlier_scan_arrays(relative)
 
 
 def _steps(arrays: dict[str, Any]) -> Iterator[tuple[RelativePose, RelativePose]]:
     return zip(
-        relative_poses("initial", arrays), with_keyframes(relative_poses("relative", arrays), arrays), strict=True
+        relative_poses("initial", arrays), with_earlier_scans(relative_poses("relative", arrays), arrays), strict=True
     )
 
 

@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from hybridlio.core.estimates import KeyframePose, RelativePose
+from hybridlio.core.estimates import EarlierScanPose, RelativePose
 
 
 def relative_arrays(prefix: str, steps: tuple[RelativePose, ...]) -> dict[str, Any]:
     """Convert steps to plain arrays; names start with ``prefix``.
 
-    Leaves out ``details`` and ``proposed``, which smoothing does not use, and ``keyframes``, which
-    :func:`keyframe_arrays` converts. A step without drift has NaN as its drift.
+    Leaves out ``details`` and ``proposed``, which smoothing does not use, and ``earlier_scans``, which
+    :func:`earlier_scan_arrays` converts. A step without drift has NaN as its drift.
     """
     return {
         f"{prefix}_poses": np.array([s.pose for s in steps]).reshape(-1, 4, 4),
@@ -36,26 +36,26 @@ def relative_arrays(prefix: str, steps: tuple[RelativePose, ...]) -> dict[str, A
     }
 
 
-def keyframe_arrays(steps: tuple[RelativePose, ...]) -> dict[str, Any]:
-    """Convert the steps' poses relative to map keyframes to plain arrays, one row per pose."""
-    found = [(row, keyframe) for row, step in enumerate(steps) for keyframe in step.keyframes]
+def earlier_scan_arrays(steps: tuple[RelativePose, ...]) -> dict[str, Any]:
+    """Convert the steps' poses relative to earlier scans to plain arrays, one row per pose."""
+    found = [(row, earlier) for row, step in enumerate(steps) for earlier in step.earlier_scans]
     return {
         "keyframe_step": np.array([row for row, _ in found], dtype=np.int64),
-        "keyframe_stamps_ns": np.array([keyframe.stamp_ns for _, keyframe in found], dtype=np.int64),
-        "keyframe_poses": np.array([keyframe.pose for _, keyframe in found]).reshape(-1, 4, 4),
-        "keyframe_covariances": np.array([keyframe.covariance for _, keyframe in found]).reshape(-1, 6, 6),
+        "keyframe_stamps_ns": np.array([earlier.stamp_ns for _, earlier in found], dtype=np.int64),
+        "keyframe_poses": np.array([earlier.pose for _, earlier in found]).reshape(-1, 4, 4),
+        "keyframe_covariances": np.array([earlier.covariance for _, earlier in found]).reshape(-1, 6, 6),
     }
 
 
-def with_keyframes(steps: tuple[RelativePose, ...], arrays: Mapping[str, Any]) -> tuple[RelativePose, ...]:
-    """Return the steps with their poses relative to map keyframes: the inverse of :func:`keyframe_arrays`."""
+def with_earlier_scans(steps: tuple[RelativePose, ...], arrays: Mapping[str, Any]) -> tuple[RelativePose, ...]:
+    """Return the steps with their poses relative to earlier scans: the inverse of :func:`earlier_scan_arrays`."""
     if "keyframe_step" not in arrays:  # version 1 of the format
         return steps
     columns = (arrays[f"keyframe_{name}"] for name in ("step", "stamps_ns", "poses", "covariances"))
-    found: dict[int, list[KeyframePose]] = {}
+    found: dict[int, list[EarlierScanPose]] = {}
     for row, stamp, pose, covariance in zip(*columns, strict=True):
-        found.setdefault(int(row), []).append(KeyframePose(int(stamp), pose, covariance))
-    return tuple(replace(step, keyframes=tuple(found.get(row, ()))) for row, step in enumerate(steps))
+        found.setdefault(int(row), []).append(EarlierScanPose(int(stamp), pose, covariance))
+    return tuple(replace(step, earlier_scans=tuple(found.get(row, ()))) for row, step in enumerate(steps))
 
 
 def relative_poses(prefix: str, arrays: Mapping[str, Any]) -> tuple[RelativePose, ...]:

@@ -21,7 +21,7 @@ from hybridlio.evaluation.evaluate import Steps
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.odometry import Estimate, Odometry
 from hybridlio.record.record import Record
-from hybridlio.sources.innovation_gate import GATE, Verdict
+from hybridlio.sources.innovation_gate import GATE_NIS, Verdict
 
 _log = logging.getLogger(__name__)
 
@@ -110,7 +110,7 @@ class Run:
 
     def judged(self, verdict: Verdict) -> list[int]:
         """The frames whose relative pose came off so in the comparison with the IMU."""
-        return [self.skipped + k for k, e in enumerate(self.estimates) if e.agreement.verdict == verdict]
+        return [self.skipped + k for k, e in enumerate(self.estimates) if e.gate.verdict == verdict]
 
     @property
     def timings_s(self) -> dict[str, Array]:
@@ -184,9 +184,9 @@ def _advance(run: Run, k: int) -> None:
         return
     run.reading_s.append(read)
     run.estimates.append(estimate)
-    if estimate.agreement.verdict in ("down-weighted", "rejected", "relocated"):
-        chi2, verdict = estimate.agreement.chi2, estimate.agreement.verdict
-        _log.info("frame %d: %s: it and the IMU differ by χ² = %.0f (%.0f is the limit)", k, verdict, chi2, GATE)
+    if estimate.gate.verdict in ("down-weighted", "rejected", "relocated"):
+        nis, verdict = estimate.gate.nis, estimate.gate.verdict
+        _log.info("frame %d: %s: innovation against the IMU has χ² = %.0f (gate %.0f)", k, verdict, nis, GATE_NIS)
     elif estimate.relative is not None and not estimate.relative.ok and k not in run.unreadable:
         _log.info("frame %d: bridged by the initial pose: %s", k, _why(estimate.relative.details))
     _log.debug("frame %d: %s", k, _described(estimate))

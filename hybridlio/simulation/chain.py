@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.estimates import KeyframePose, RelativePose, State
+from hybridlio.core.estimates import EarlierScanPose, RelativePose, State
 from hybridlio.core.motion_limits import GRAVITY_MAGNITUDE_SIGMA_M_S2
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples, Scan
 from hybridlio.core.start_state import start_state
@@ -132,9 +132,9 @@ def _relative(
 
     out = []
     for k in range(1, len(lidar)):
-        near = [KeyframePose(int(stamps[k - b]), measured(k - b, k), own * covariance) for b in back if b <= k]
+        near = [EarlierScanPose(int(stamps[k - b]), measured(k - b, k), own * covariance) for b in back if b <= k]
         drift = None if drift_share is None else own * covariance
-        out.append(RelativePose(measured(k - 1, k), covariance, "test", drift=drift, keyframes=tuple(near)))
+        out.append(RelativePose(measured(k - 1, k), covariance, "test", drift=drift, earlier_scans=tuple(near)))
     return out
 
 

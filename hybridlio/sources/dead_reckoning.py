@@ -59,7 +59,7 @@ class DeadReckoning:
     def last_step(self) -> RelativePose:
         """The relative pose that the last update was given."""
         assert self._step is not None, "there is no step before the first update"
-        return replace(self._step, source=self.name, drift=None, keyframes=())
+        return replace(self._step, source=self.name, drift=None, earlier_scans=())
 
     def _compounded(self, relative: RelativePose, step: Array, R_world_imu: Array, dt_s: float) -> Array:
         """``(9, 9)`` of rotation, position and velocity after the step; moves the path's covariance on.

@@ -1,8 +1,8 @@
-"""Whether a relative pose and the IMU agree within their covariances, and what becomes of one that does not.
+"""The innovation gate: compares each relative pose with the IMU's prediction and limits the effect of wrong ones.
 
-The test is the normalised innovation squared (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking
-and Navigation" (2001), §5.4.2): the difference of the two under the sum of their covariances, χ² with six degrees of
-freedom where both tell the truth.
+The test statistic is the normalised innovation squared (NIS): the squared difference of measurement and prediction
+under the sum of their covariances (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and
+Navigation" (2001), §5.4.2). Where both covariances are right it is χ² distributed with six degrees of freedom.
 """
 
 from __future__ import annotations
@@ -17,111 +17,118 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.motion_limits import UNKNOWN_TRANSLATION_SIGMA_M
 
-Verdict = Literal["untested", "agrees", "down-weighted", "rejected", "relocated", "trusted again"]
+Verdict = Literal["untested", "accepted", "down-weighted", "rejected", "relocated", "trusted again"]
 
-GATE = 27.86  # χ², six degrees of freedom: one in ten thousand lies above
-GROSS = 10 * GATE  # no covariance that is only somewhat too small explains this
-MOST_REJECTED = 5  # in a row; then it may be the IMU that is wrong
-START_STEPS = 10  # speed, tilt and biases are still being found from the scans
+GATE_NIS = 27.86  # 99.99 % quantile of χ² with six degrees of freedom: one right measurement in 10,000 is above
+GROSS_NIS = 10 * GATE_NIS  # a right pose stays below even with covariances 10 times too small; above, the pose is wrong
+MAX_REJECTIONS = 5  # in a row: half a second at 10 Hz; the IMU bridges so long to a few decimetres
+WARM_UP_STEPS = 10  # one second at 10 Hz, in which speed, tilt and biases are still being found from the scans
+_BISECTIONS = 40  # halves the bracket to 1e-12 of its width, below any effect on a covariance
 
 
 @dataclass(frozen=True)
-class Agreement:
-    """What came of the comparison at one step.
+class GateResult:
+    """Outcome of the gate at one step.
 
     Attributes:
-        verdict: ``untested`` where there is nothing to compare, or the IMU does not know its speed and tilt yet;
-            ``agrees``; ``down-weighted``, with a covariance just large enough to agree; ``rejected``, so that the IMU
-            bridges; ``relocated``, bridged too, but the residual source goes on from where it found the scan, after too
-            many rejections; ``trusted again``, taken as it is, after that.
-        chi2: the difference under both covariances; None where untested.
+        verdict: what was done with the relative pose:
+
+            * ``untested``: passed on; there is no usable prediction, or the run is in its first steps.
+            * ``accepted``: passed on; the innovation is within the gate.
+            * ``down-weighted``: passed on with a covariance inflated until the innovation is at the gate.
+            * ``rejected``: replaced by the bridge; the residual source is asked to take the scan back.
+            * ``relocated``: replaced by the bridge after too many rejections in a row, but the residual source
+              continues from where it found the scan.
+            * ``trusted again``: passed on although outside the gate, after a relocation that did not help.
+        nis: normalised innovation squared; None where untested.
     """
 
     verdict: Verdict
-    chi2: float | None = None
+    nis: float | None = None
 
 
-UNTESTED = Agreement("untested")
+UNTESTED = GateResult("untested")
 
 
-def chi2_of(measured: RelativePose, predicted: RelativePose, times: float = 1.0) -> float:
-    """The squared difference under the sum of the covariances, the measured one's taken ``times`` as large.
+def normalised_innovation_squared(measured: RelativePose, predicted: RelativePose) -> float:
+    """Return the squared innovation ``Log(measured⁻¹·predicted)`` under the sum of both covariances.
 
-    The difference is ``Log(measured⁻¹·predicted)``; so small that both covariances hold in one tangent space.
+    The innovation is taken to be so small that both covariances hold in one tangent space.
     """
-    return _chi2(_difference(measured, predicted), times * measured.covariance + predicted.covariance)
+    return _nis(_innovation(measured, predicted), measured.covariance + predicted.covariance)
 
 
-def widening(measured: RelativePose, predicted: RelativePose, chi2: float = GATE) -> float:
-    """By how much the measured covariance must grow for the two to differ by ``chi2`` only; 1 where they do already.
+def inflation_to_gate(measured: RelativePose, predicted: RelativePose, gate_nis: float = GATE_NIS) -> float:
+    """Return the factor on the measured covariance that brings the NIS down to the gate; 1 where it is within already.
 
-    Solved by bisection in its logarithm: the difference falls as the covariance grows, towards zero.
+    Solved by bisection in the factor's logarithm: the NIS falls monotonically, towards zero, as the factor grows.
     """
-    error = _difference(measured, predicted)
+    innovation = _innovation(measured, predicted)
 
-    def is_too_far(log_times: float) -> bool:
-        return _chi2(error, np.exp(log_times) * measured.covariance + predicted.covariance) > chi2
+    def is_outside(log_factor: float) -> bool:
+        return _nis(innovation, np.exp(log_factor) * measured.covariance + predicted.covariance) > gate_nis
 
     low, high = 0.0, 1.0
-    if not is_too_far(low):
+    if not is_outside(low):
         return 1.0
-    while is_too_far(high):
+    while is_outside(high):
         low, high = high, 2 * high
-    for _ in range(40):
+    for _ in range(_BISECTIONS):
         middle = (low + high) / 2
-        low, high = (middle, high) if is_too_far(middle) else (low, middle)
+        low, high = (middle, high) if is_outside(middle) else (low, middle)
     return float(np.exp(high))
 
 
-def _difference(measured: RelativePose, predicted: RelativePose) -> Array:
+def _innovation(measured: RelativePose, predicted: RelativePose) -> Array:
     return se3.log(se3.between(measured.pose, predicted.pose))
 
 
-def _chi2(error: Array, covariance: Array) -> float:
-    return float(error @ np.linalg.solve(covariance, error))
+def _nis(innovation: Array, covariance: Array) -> float:
+    return float(innovation @ np.linalg.solve(covariance, innovation))
 
 
-class Witness:
-    """Compares each step's relative pose with what the IMU predicted, and remembers how often it was rejected.
+class InnovationGate:
+    """Tests each step's relative pose against the IMU's prediction and counts rejections in a row.
 
-    After :data:`MOST_REJECTED` rejections in a row it may be the map that was lost: the next scan's place in it is a
-    jump and no motion, and those after it agree again. Where they do not, it may be the IMU that is wrong, and they are
-    taken as they are until one agrees: the graph can then learn its bias or speed.
+    After :data:`MAX_REJECTIONS` rejections the map may be lost rather than the scan be wrong: the next scan's
+    place in the map is then a jump and no motion, and the scans after it agree with the IMU again. If they do not, the
+    IMU may be wrong, and relative poses pass until one is within the gate, so that the graph can correct the IMU's
+    biases or the speed.
     """
 
     def __init__(self) -> None:
         self._steps = 0
-        self._rejected = 0
+        self._rejected_in_a_row = 0
 
-    def judge(
+    def apply(
         self, measured: RelativePose, predicted: RelativePose | None, bridge: RelativePose
-    ) -> tuple[RelativePose, Agreement]:
-        """The relative pose for the graph, and how it compares.
+    ) -> tuple[RelativePose, GateResult]:
+        """Return the relative pose that the backend is to use, and the gate's result.
 
         Args:
-            measured: of the residual source.
-            predicted: by the IMU; None where it cannot say.
-            bridge: what stands in for a rejected one.
+            measured: the residual source's relative pose.
+            predicted: the IMU's; None where there is no inertial data.
+            bridge: the relative pose that replaces a rejected one.
         """
         self._steps += 1
-        if self._steps <= START_STEPS or not _comparable(measured, predicted):
+        if predicted is None or self._steps <= WARM_UP_STEPS or not _comparable(measured, predicted):
             return measured, UNTESTED
-        assert predicted is not None
-        chi2 = chi2_of(measured, predicted)
-        if chi2 <= GATE:
-            self._rejected = 0
-            return measured, Agreement("agrees", chi2)
-        if self._rejected > MOST_REJECTED:
-            return measured, Agreement("trusted again", chi2)
-        if chi2 <= GROSS:
-            return measured.wider(widening(measured, predicted)), Agreement("down-weighted", chi2)
-        self._rejected += 1
-        verdict: Verdict = "relocated" if self._rejected > MOST_REJECTED else "rejected"
-        details = {**measured.details, "chi2": chi2}
-        return replace(bridge, ok=False, drift=None, keyframes=(), details=details), Agreement(verdict, chi2)
+        nis = normalised_innovation_squared(measured, predicted)
+        if nis <= GATE_NIS:
+            self._rejected_in_a_row = 0
+            return measured, GateResult("accepted", nis)
+        if self._rejected_in_a_row > MAX_REJECTIONS:
+            return measured, GateResult("trusted again", nis)
+        if nis <= GROSS_NIS:
+            return measured.wider(inflation_to_gate(measured, predicted)), GateResult("down-weighted", nis)
+        self._rejected_in_a_row += 1
+        verdict: Verdict = "relocated" if self._rejected_in_a_row > MAX_REJECTIONS else "rejected"
+        details = {**measured.details, "nis": nis}
+        return replace(bridge, ok=False, drift=None, earlier_scans=(), details=details), GateResult(verdict, nis)
 
 
-def _comparable(measured: RelativePose, predicted: RelativePose | None) -> bool:
-    if predicted is None or not predicted.ok or not measured.ok or measured.from_imu:
+def _comparable(measured: RelativePose, predicted: RelativePose) -> bool:
+    """Whether both are measurements, independent of each other, and the IMU knows its speed well enough to judge."""
+    if not predicted.ok or not measured.ok or measured.from_imu:
         return False
     return predicted.translation_sigma_m <= UNKNOWN_TRANSLATION_SIGMA_M

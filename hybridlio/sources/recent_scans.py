@@ -1,7 +1,7 @@
 """Residuals against several recent keyframes beside the last scan, for any source that can compare two scans.
 
 A relative pose over a few metres hardly errs more than one over a single step, and does not add up: the path then
-drifts less. What the poses of one scan share is said in :class:`hybridlio.core.estimates.KeyframePose`.
+drifts less. What the poses of one scan share is said in :class:`hybridlio.core.estimates.EarlierScanPose`.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.estimates import KeyframePose, RelativePose, ResidualSource, TakesBack
+from hybridlio.core.estimates import EarlierScanPose, RelativePose, ResidualSource, TakesBack
 from hybridlio.core.motion_limits import PREDICTION_FLOOR_SIGMAS
 from hybridlio.core.sensors import Frame
 from hybridlio.core.setting_checks import check_not_negative, check_positive, check_setting
-from hybridlio.sources.innovation_gate import GATE, chi2_of
+from hybridlio.sources.innovation_gate import GATE_NIS, normalised_innovation_squared
 
 _FLOOR = np.diag(PREDICTION_FLOOR_SIGMAS**2)  # no way is known better
 
@@ -138,22 +138,22 @@ class WithRecentScans:
         self._keyframes = [kept.after(step) for kept in self._keyframes]
         self._good = None if self._good is None else self._good.after(step)
 
-    def _compared(self, kept: _Kept) -> KeyframePose | None:
+    def _compared(self, kept: _Kept) -> EarlierScanPose | None:
         """The scan relative to a keyframe; None where that fails or is not where the path could have come to."""
         guess = RelativePose(kept.pose, kept.unsure, self.name)
         found = self._source.pair(kept.seen, self._source.seen, guess)
-        if not found.ok or chi2_of(found, guess) > GATE:
+        if not found.ok or normalised_innovation_squared(found, guess) > GATE_NIS:
             return None
-        return KeyframePose(kept.stamp_ns, found.pose, found.covariance)
+        return EarlierScanPose(kept.stamp_ns, found.pose, found.covariance)
 
     def _is_far(self, way: Array) -> bool:
         angle_deg = np.degrees(np.linalg.norm(se3.so3_log(way[:3, :3])))
         return bool(np.linalg.norm(way[:3, 3]) > self._settings.distance_m or angle_deg > self._settings.angle_deg)
 
-    def _shared(self, step: RelativePose, keyframes: list[KeyframePose]) -> RelativePose:
+    def _shared(self, step: RelativePose, keyframes: list[EarlierScanPose]) -> RelativePose:
         """With what the step's covariance shares with the keyframes' told from what is each pose's own."""
         if not step.ok or step.drift is not None:
-            return replace(step, keyframes=tuple(keyframes))
+            return replace(step, earlier_scans=tuple(keyframes))
         own = 1 - self._settings.shared
         near = tuple(replace(keyframe, covariance=own * keyframe.covariance) for keyframe in keyframes)
-        return replace(step, drift=own * step.covariance, keyframes=near)
+        return replace(step, drift=own * step.covariance, earlier_scans=near)

@@ -17,7 +17,7 @@ import pytest
 from gtsam.symbol_shorthand import G, M, X
 
 from hybridlio.core import se3
-from hybridlio.core.estimates import KeyframePose, RelativePose
+from hybridlio.core.estimates import EarlierScanPose, RelativePose
 from hybridlio.core.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.core.start_state import start_state
 from hybridlio.graph import PoseGraph
@@ -94,8 +94,8 @@ def odometry() -> Case:
     for state in after:
         scans.add(state.stamp_ns, on_path=False)
     to_first = se3.between(begin.T_world_imu @ mount, after[1].T_world_imu @ mount)
-    keyframes = (KeyframePose(begin.stamp_ns, to_first, covariance(rng, 6)),)
-    made += factors.keyframe_factors(2, replace(relative, keyframes=keyframes), scans, mount)
+    keyframes = (EarlierScanPose(begin.stamp_ns, to_first, covariance(rng, 6)),)
+    made += factors.earlier_scan_factors(2, replace(relative, earlier_scans=keyframes), scans, mount)
     made += factors.imu_factors(0, 1, preintegrate(samples(rng), begin, ImuNoise()))
     made += factors.bridge_factors(1, 2, 0.1)
     return made, values

@@ -12,7 +12,7 @@ import pytest
 
 from hybridlio.core import se3
 from hybridlio.core.errors import DataError
-from hybridlio.core.estimates import KeyframePose, RelativePose
+from hybridlio.core.estimates import EarlierScanPose, RelativePose
 from hybridlio.core.sensors import ImuSamples
 from hybridlio.core.start_state import start_state
 from hybridlio.evaluation.consistency import anees
@@ -56,13 +56,13 @@ def scans(count: int, on_path: bool) -> Scans:
 
 
 def joined(relative: RelativePose, of: Scans) -> list[list[str]]:
-    graph = factors.keyframe_factors(5, relative, of, np.eye(4))
+    graph = factors.earlier_scan_factors(5, relative, of, np.eye(4))
     return [[gtsam.DefaultKeyFormatter(key) for key in factor.keys()] for factor in graph]  # noqa: SIM118
 
 
 def step(*back_stamps: int, **changes: Any) -> RelativePose:
-    keyframes = tuple(KeyframePose(stamp, np.eye(4), np.eye(6)) for stamp in back_stamps)
-    return replace(RelativePose(np.eye(4), np.eye(6), "test", keyframes=keyframes), **changes)
+    keyframes = tuple(EarlierScanPose(stamp, np.eye(4), np.eye(6)) for stamp in back_stamps)
+    return replace(RelativePose(np.eye(4), np.eye(6), "test", earlier_scans=keyframes), **changes)
 
 
 def test_independent_poses_join_the_scans_themselves():
@@ -100,7 +100,7 @@ def drives(chain: Callable[..., Any]) -> list[Any]:
 
 def alone(drive: Any) -> Any:
     """One factor a pose."""
-    return replace(drive, relative=[replace(relative, keyframes=()) for relative in drive.relative])
+    return replace(drive, relative=[replace(relative, earlier_scans=()) for relative in drive.relative])
 
 
 def claiming(drive: Any, share: float | None) -> Any:
@@ -108,8 +108,8 @@ def claiming(drive: Any, share: float | None) -> Any:
 
     def claim(relative: RelativePose) -> RelativePose:
         own = relative.covariance * (1.0 if share is None else 1 - share)
-        keyframes = tuple(replace(k, covariance=own) for k in relative.keyframes)
-        return replace(relative, drift=None if share is None else own, keyframes=keyframes)
+        keyframes = tuple(replace(k, covariance=own) for k in relative.earlier_scans)
+        return replace(relative, drift=None if share is None else own, earlier_scans=keyframes)
 
     return replace(drive, relative=[claim(relative) for relative in drive.relative])
 

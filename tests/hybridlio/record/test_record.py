@@ -9,7 +9,7 @@ import pytest
 
 from hybridlio.core import se3
 from hybridlio.core.errors import DataError
-from hybridlio.core.estimates import KeyframePose, RelativePose, State
+from hybridlio.core.estimates import EarlierScanPose, RelativePose, State
 from hybridlio.core.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.record.record import Record
@@ -29,13 +29,13 @@ def step(rng: np.random.Generator, k: int, source: str) -> RelativePose:
     )
 
 
-def with_keyframes(relative: tuple[RelativePose, ...], stamps: np.ndarray) -> tuple[RelativePose, ...]:
+def with_earlier_scans(relative: tuple[RelativePose, ...], stamps: np.ndarray) -> tuple[RelativePose, ...]:
     """Add poses relative to earlier scans to the third and fifth step."""
     near = {
-        2: (KeyframePose(int(stamps[0]), se3.exp(np.full(6, 0.1)), 2 * np.eye(6)),),
-        4: tuple(KeyframePose(int(stamps[k]), se3.exp(np.full(6, 0.2)), k * np.eye(6)) for k in (3, 1)),
+        2: (EarlierScanPose(int(stamps[0]), se3.exp(np.full(6, 0.1)), 2 * np.eye(6)),),
+        4: tuple(EarlierScanPose(int(stamps[k]), se3.exp(np.full(6, 0.2)), k * np.eye(6)) for k in (3, 1)),
     }
-    return tuple(replace(step, keyframes=near.get(k, ())) for k, step in enumerate(relative))
+    return tuple(replace(step, earlier_scans=near.get(k, ())) for k, step in enumerate(relative))
 
 
 def example(rng: np.random.Generator, imu: bool = True, camera: bool = True) -> Record:
@@ -47,7 +47,7 @@ def example(rng: np.random.Generator, imu: bool = True, camera: bool = True) -> 
     return Record(
         online=Trajectory(stamps, se3.exp(rng.normal(size=(6, 6))), np.tile(np.eye(6), (6, 1, 1)) * 0.1),
         initial=tuple(step(rng, k, "preintegration") for k in range(5)),
-        relative=with_keyframes(tuple(step(rng, k + 1, "scan-matching") for k in range(5)), stamps),
+        relative=with_earlier_scans(tuple(step(rng, k + 1, "scan-matching") for k in range(5)), stamps),
         imu=samples if imu else ImuSamples.empty(),
         gps=tuple(GpsFix(int(t), rng.normal(size=3), np.eye(3) * 2) for t in stamps[:2]) if imu else (),
         start=state,
@@ -92,7 +92,7 @@ def test_a_saved_record_loads_unchanged(rng: np.random.Generator, tmp_path: Path
         np.testing.assert_allclose(found.pose, step.pose, atol=1e-14)
         for name in ("covariance", "source", "degenerate", "ok", "from_imu", "drift"):
             same(getattr(found, name), getattr(step, name))
-        for near, read in zip(step.keyframes, found.keyframes, strict=True):
+        for near, read in zip(step.earlier_scans, found.earlier_scans, strict=True):
             assert read.stamp_ns == near.stamp_ns
             np.testing.assert_allclose(read.pose, near.pose, atol=1e-14)
             same(read.covariance, near.covariance)
@@ -127,10 +127,10 @@ def test_a_file_of_an_unknown_version_is_rejected(saved: Path):
         Record.load(saved)
 
 
-def test_a_file_of_version_1_loads_without_poses_relative_to_keyframes(saved: Path):
+def test_a_file_of_version_1_loads_without_poses_relative_to_earlier_scans(saved: Path):
     rewritten(saved, version=1, **{f"keyframe_{n}": None for n in ("step", "stamps_ns", "poses", "covariances")})
     old = Record.load(saved)
-    assert [step.keyframes for step in old.relative] == [()] * 5
+    assert [step.earlier_scans for step in old.relative] == [()] * 5
 
 
 def test_edges_hold_every_relative_pose_with_its_full_covariance(rng: np.random.Generator):
@@ -141,7 +141,7 @@ def test_edges_hold_every_relative_pose_with_its_full_covariance(rng: np.random.
         if j == i + 1:
             assert edge is step
             continue
-        (near,) = (k for k in step.keyframes if k.stamp_ns == record.online.stamps_ns[i])
+        (near,) = (k for k in step.earlier_scans if k.stamp_ns == record.online.stamps_ns[i])
         np.testing.assert_allclose(edge.pose, near.pose, atol=1e-14)
         shared = step.covariance - step.drift if step.drift is not None and step.ok else np.zeros((6, 6))
         np.testing.assert_allclose(edge.covariance, near.covariance + shared)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hybridlio.core import se3
-from hybridlio.core.estimates import KeyframePose, RelativePose
+from hybridlio.core.estimates import EarlierScanPose, RelativePose
 from hybridlio.core.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.core.start_state import start_state
 from hybridlio.record.loop_keyframes import LoopKeyframes, LoopKeyframeSelector, LoopKeyframeSettings
@@ -22,9 +22,9 @@ def random_covariance(rng: np.random.Generator) -> np.ndarray:
 
 
 def random_step(rng: np.random.Generator, k: int) -> RelativePose:
-    """A step whose kind varies with ``k``: drift, failure, IMU source, degenerate directions, keyframes."""
+    """A step whose kind varies with ``k``: drift, failure, IMU source, degenerate directions, earlier scans."""
     pose, covariance = se3.exp(0.1 * rng.standard_normal(6)), random_covariance(rng)
-    near = (KeyframePose(k * STEP_NS, pose, covariance),) if k % 7 == 0 else ()
+    near = (EarlierScanPose(k * STEP_NS, pose, covariance),) if k % 7 == 0 else ()
     return RelativePose(
         pose,
         covariance,
@@ -33,7 +33,7 @@ def random_step(rng: np.random.Generator, k: int) -> RelativePose:
         ok=k % 5 > 0,
         from_imu=k % 4 == 0,
         drift=0.1 * covariance if k % 2 else None,
-        keyframes=near,
+        earlier_scans=near,
     )
 
 
@@ -62,9 +62,9 @@ def test_packing_changes_no_step(rng: np.random.Generator):
         assert (found.drift is None) == (was.drift is None)
         if was.drift is not None:
             np.testing.assert_array_equal(found.drift, was.drift)
-    for (_, was), found in zip(steps, record.relative, strict=True):  # initial poses have no keyframes
-        assert [k.stamp_ns for k in found.keyframes] == [k.stamp_ns for k in was.keyframes]
-        for a, b in zip(was.keyframes, found.keyframes, strict=True):
+    for (_, was), found in zip(steps, record.relative, strict=True):  # initial poses have none to earlier scans
+        assert [k.stamp_ns for k in found.earlier_scans] == [k.stamp_ns for k in was.earlier_scans]
+        for a, b in zip(was.earlier_scans, found.earlier_scans, strict=True):
             np.testing.assert_array_equal(b.pose, a.pose)
             np.testing.assert_array_equal(b.covariance, a.covariance)
 

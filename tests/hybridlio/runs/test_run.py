@@ -19,7 +19,7 @@ from hybridlio.record.record import Record
 from hybridlio.record.recorder import Recorder
 from hybridlio.runs.run import Run, run_odometry
 from hybridlio.runs.write import notes, write_run
-from hybridlio.sources.innovation_gate import Agreement
+from hybridlio.sources.innovation_gate import GateResult
 from hybridlio.sources.residual_chain import NoResidual
 
 
@@ -204,7 +204,7 @@ def test_a_range_that_is_none_or_holds_no_scan_is_refused(text, error, sequence)
 def test_an_imu_that_many_scans_contradict_is_named_as_what_may_be_wrong(whole):
     estimates = list(whole.estimates)
     for count, told in ((1, False), (5, True)):
-        doubted = [replace(e, agreement=Agreement("trusted again", 1e3)) for e in estimates[-count:]]
+        doubted = [replace(e, gate=GateResult("trusted again", 1e3)) for e in estimates[-count:]]
         said = notes(replace(whole, estimates=[*estimates[:-count], *doubted]))
         assert f"{count} scan" in said[0]
         assert ("check T_imu_lidar, units, clock" in said[-1]) == told

@@ -17,7 +17,7 @@ from hybridlio.graph.run.inertial_initial_pose import Preintegration
 from hybridlio.graph.run.inertial_steps import InertialSteps
 from hybridlio.odometry.odometry import Odometry
 from hybridlio.sources.dead_reckoning import DeadReckoning
-from hybridlio.sources.innovation_gate import START_STEPS
+from hybridlio.sources.innovation_gate import WARM_UP_STEPS
 
 T_IMU_LIDAR = se3.exp(np.array([0.02, -0.01, 0.03, -0.8, 0.3, 0.8]))
 T_LIDAR_IMU = se3.inverse(T_IMU_LIDAR)
@@ -123,5 +123,5 @@ def test_a_prediction_from_the_state_knows_the_speed_however_unsure_the_heading(
 
 def test_scans_that_are_right_are_never_taken_to_contradict_the_imu(tiny_drive: Path):
     sequence, odometry = open_sequence(tiny_drive), Odometry(backend="none")
-    verdicts = [odometry.step(sequence[k]).agreement.verdict for k in range(len(sequence))]
-    assert set(verdicts[START_STEPS + 1 :]) == {"agrees"}
+    verdicts = [odometry.step(sequence[k]).gate.verdict for k in range(len(sequence))]
+    assert set(verdicts[WARM_UP_STEPS + 1 :]) == {"accepted"}

@@ -1,4 +1,4 @@
-"""The comparison of relative poses with the IMU, against χ² and with wrong poses put in on purpose."""
+"""The innovation gate: its statistic against χ², its verdicts, and drives with wrong registrations put in."""
 
 from __future__ import annotations
 
@@ -8,12 +8,20 @@ import numpy as np
 import pytest
 
 from hybridlio.core import se3
-from hybridlio.core.estimates import KeyframePose, RelativePose
+from hybridlio.core.estimates import EarlierScanPose, RelativePose
 from hybridlio.core.sensors import Frame
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.odometry import Estimate, Odometry
-from hybridlio.sources.innovation_gate import GATE, GROSS, MOST_REJECTED, START_STEPS, Witness, chi2_of, widening
+from hybridlio.sources.innovation_gate import (
+    GATE_NIS,
+    GROSS_NIS,
+    MAX_REJECTIONS,
+    WARM_UP_STEPS,
+    InnovationGate,
+    inflation_to_gate,
+    normalised_innovation_squared,
+)
 from hybridlio.sources.scan_matching import ScanMatching
 
 STEP = se3.exp(np.array([0.01, -0.02, 0.05, 1.0, 0.1, -0.02]))
@@ -22,67 +30,67 @@ IMU = RelativePose(STEP, COVARIANCE, "preintegration", from_imu=True)
 
 
 def off_by(sigmas: float, axis: int = 3, **changes: object) -> RelativePose:
-    """A step that differs from the IMU's by so many standard deviations of the difference."""
+    """A step that differs from the IMU's by ``sigmas`` standard deviations of the difference."""
     xi = np.zeros(6)
     xi[axis] = sigmas * np.sqrt(2 * COVARIANCE[axis, axis])
     return replace(RelativePose(STEP @ se3.exp(xi), COVARIANCE, "test"), **changes)
 
 
-def started() -> Witness:
-    witness = Witness()
-    for _ in range(START_STEPS):
-        assert witness.judge(off_by(100), IMU, IMU)[1].verdict == "untested"
-    return witness
+def started() -> InnovationGate:
+    gate = InnovationGate()
+    for _ in range(WARM_UP_STEPS):
+        assert gate.apply(off_by(100), IMU, IMU)[1].verdict == "untested"
+    return gate
 
 
-def test_the_gate_is_what_one_true_difference_in_ten_thousand_passes():
+def test_one_right_measurement_in_ten_thousand_is_outside_the_gate():
     from scipy.stats import chi2
 
-    assert chi2.sf(GATE, 6) == pytest.approx(1e-4, rel=0.01)
+    assert chi2.sf(GATE_NIS, 6) == pytest.approx(1e-4, rel=0.01)
 
 
-def test_differences_as_large_as_the_covariances_say_give_chi_square(rng: np.random.Generator):
+def test_the_normalised_innovation_squared_of_right_covariances_is_chi_square_distributed(rng: np.random.Generator):
     roots = np.linalg.cholesky(COVARIANCE)
     measured = [RelativePose(STEP @ se3.exp(roots @ rng.normal(size=6)), COVARIANCE, "test") for _ in range(2000)]
     predicted = [RelativePose(STEP @ se3.exp(roots @ rng.normal(size=6)), COVARIANCE, "imu") for _ in range(2000)]
-    values = [chi2_of(m, p) for m, p in zip(measured, predicted, strict=True)]
+    values = [normalised_innovation_squared(m, p) for m, p in zip(measured, predicted, strict=True)]
     assert np.mean(values) == pytest.approx(6.0, abs=0.3)
     assert np.mean(np.array(values) > 16.81) == pytest.approx(0.01, abs=0.007)
 
 
 @pytest.mark.parametrize(("sigmas", "axis"), [(7.0, 3), (12.0, 3), (9.0, 0)])
-def test_a_widened_covariance_just_agrees(sigmas: float, axis: int):
+def test_an_inflated_covariance_puts_the_innovation_at_the_gate(sigmas: float, axis: int):
     measured = off_by(sigmas, axis)
-    times = widening(measured, IMU)
+    times = inflation_to_gate(measured, IMU)
     assert times > 1
-    assert chi2_of(measured.wider(times), IMU) == pytest.approx(GATE, rel=1e-6)
+    assert normalised_innovation_squared(measured.wider(times), IMU) == pytest.approx(GATE_NIS, rel=1e-6)
 
 
-def test_what_agrees_is_not_widened():
-    assert widening(off_by(1.0), IMU) == 1.0
+def test_a_covariance_within_the_gate_is_not_inflated():
+    assert inflation_to_gate(off_by(1.0), IMU) == 1.0
 
 
-def test_a_step_is_taken_as_it_is_down_weighted_or_rejected_by_how_far_it_is_off():
-    witness = started()
-    taken, agreement = witness.judge(measured := off_by(3.0), IMU, IMU)
-    assert (taken, agreement.verdict) == (measured, "agrees")
-    keyframe = KeyframePose(7, STEP, COVARIANCE)
-    far = off_by(10.0, drift=0.1 * COVARIANCE, keyframes=(keyframe,))
-    taken, agreement = witness.judge(far, IMU, IMU)
-    assert agreement.verdict == "down-weighted"
-    assert agreement.chi2 == pytest.approx(100.0)
-    times = widening(far, IMU)
+def test_a_step_is_accepted_down_weighted_or_rejected_by_its_innovation():
+    gate = started()
+    taken, result = gate.apply(measured := off_by(3.0), IMU, IMU)
+    assert (taken, result.verdict) == (measured, "accepted")
+    earlier = EarlierScanPose(7, STEP, COVARIANCE)
+    far = off_by(10.0, drift=0.1 * COVARIANCE, earlier_scans=(earlier,))
+    taken, result = gate.apply(far, IMU, IMU)
+    assert result.verdict == "down-weighted"
+    assert result.nis == pytest.approx(100.0)
+    times = inflation_to_gate(far, IMU)
     for mine, theirs in (
         (taken.covariance, far.covariance),
         (taken.drift, far.drift),
-        (taken.keyframes[0].covariance, COVARIANCE),
+        (taken.earlier_scans[0].covariance, COVARIANCE),
     ):
         np.testing.assert_allclose(mine, times * theirs)
     np.testing.assert_allclose(taken.pose, far.pose, atol=1e-12)
-    taken, agreement = witness.judge(off_by(20.0, keyframes=(keyframe,)), IMU, IMU)
-    assert agreement.verdict == "rejected"
-    assert (taken.ok, taken.source, taken.keyframes, taken.drift) == (False, "preintegration", (), None)
-    assert taken.details["chi2"] > GROSS
+    taken, result = gate.apply(off_by(20.0, earlier_scans=(earlier,)), IMU, IMU)
+    assert result.verdict == "rejected"
+    assert (taken.ok, taken.source, taken.earlier_scans, taken.drift) == (False, "preintegration", (), None)
+    assert taken.details["nis"] > GROSS_NIS
 
 
 @pytest.mark.parametrize(
@@ -96,43 +104,45 @@ def test_a_step_is_taken_as_it_is_down_weighted_or_rejected_by_how_far_it_is_off
     ],
     ids=["no IMU", "IMU gap", "unknown speed", "failed scan", "the IMU itself"],
 )
-def test_without_a_witness_nothing_is_tested(measured: RelativePose, predicted: RelativePose | None):
-    taken, agreement = started().judge(measured, predicted, IMU)
+def test_nothing_is_tested_without_a_prediction_and_a_measurement(
+    measured: RelativePose, predicted: RelativePose | None
+):
+    taken, result = started().apply(measured, predicted, IMU)
     assert taken is measured
-    assert agreement.verdict == "untested"
-    assert agreement.chi2 is None
+    assert result.verdict == "untested"
+    assert result.nis is None
 
 
-def rejected_as_often_as_may_be() -> Witness:
-    witness = started()
-    verdicts = [witness.judge(off_by(50), IMU, IMU)[1].verdict for _ in range(MOST_REJECTED)]
-    assert verdicts == ["rejected"] * MOST_REJECTED
-    return witness
+def at_the_limit_of_rejections() -> InnovationGate:
+    gate = started()
+    verdicts = [gate.apply(off_by(50), IMU, IMU)[1].verdict for _ in range(MAX_REJECTIONS)]
+    assert verdicts == ["rejected"] * MAX_REJECTIONS
+    return gate
 
 
-def test_after_a_few_rejections_a_jump_is_followed_but_not_believed_to_be_motion():
-    witness = rejected_as_often_as_may_be()
-    taken, agreement = witness.judge(off_by(50), IMU, IMU)
-    assert agreement.verdict == "relocated"
+def test_after_a_few_rejections_the_map_is_relocated_and_the_jump_left_out_of_the_path():
+    gate = at_the_limit_of_rejections()
+    taken, result = gate.apply(off_by(50), IMU, IMU)
+    assert result.verdict == "relocated"
     assert (taken.ok, taken.source) == (False, "preintegration")
     np.testing.assert_array_equal(taken.pose, STEP)
-    assert witness.judge(off_by(0.5), IMU, IMU)[1].verdict == "agrees"
-    assert witness.judge(off_by(50), IMU, IMU)[1].verdict == "rejected"
+    assert gate.apply(off_by(0.5), IMU, IMU)[1].verdict == "accepted"
+    assert gate.apply(off_by(50), IMU, IMU)[1].verdict == "rejected"
 
 
-def test_scans_that_go_on_to_contradict_the_imu_are_trusted_until_one_agrees():
-    witness = rejected_as_often_as_may_be()
-    verdicts = [witness.judge(off_by(50), IMU, IMU)[1].verdict for _ in range(4)]
+def test_scans_that_keep_contradicting_the_imu_are_trusted_until_one_agrees():
+    gate = at_the_limit_of_rejections()
+    verdicts = [gate.apply(off_by(50), IMU, IMU)[1].verdict for _ in range(4)]
     assert verdicts == ["relocated"] + ["trusted again"] * 3
-    assert witness.judge(off_by(0.5), IMU, IMU)[1].verdict == "agrees"
-    assert witness.judge(off_by(50), IMU, IMU)[1].verdict == "rejected"
+    assert gate.apply(off_by(0.5), IMU, IMU)[1].verdict == "accepted"
+    assert gate.apply(off_by(50), IMU, IMU)[1].verdict == "rejected"
 
 
 # ---------------------------------------------------------------------------------------------------- in a drive
 
 
 class Slipping(ScanMatching):
-    """Scan matching that is sure of a wrong pose at some scans."""
+    """Scan matching that reports a wrong pose with a small covariance at some scans."""
 
     def __init__(self, wrong: range, by_m: float) -> None:
         super().__init__()
@@ -158,25 +168,28 @@ def farthest_off(estimates: list[Estimate], sequence: Sequence) -> float:
     return float(np.linalg.norm(poses[:, :3, 3] - sequence.reference.poses[:, :3, 3], axis=1).max())
 
 
-def test_a_registration_that_slips_is_rejected_and_does_no_harm(sequence: Sequence):
+def test_a_wrong_registration_is_rejected_and_leaves_the_path_unharmed(sequence: Sequence):
     clean, slipped = driven(sequence, ScanMatching()), driven(sequence, Slipping(range(15, 17), 2.0))
-    assert {e.agreement.verdict for e in clean[START_STEPS + 1 :]} <= {"agrees", "down-weighted"}
-    rejected = [e.index for e in slipped if e.agreement.verdict == "rejected"]
+    assert {e.gate.verdict for e in clean[WARM_UP_STEPS + 1 :]} <= {"accepted", "down-weighted"}
+    rejected = [e.index for e in slipped if e.gate.verdict == "rejected"]
     assert rejected == [15, 16]
     assert [e.index for e in slipped[1:] if e.relative and not e.relative.ok] == rejected
     assert farthest_off(slipped, sequence) < farthest_off(clean, sequence) + 0.05
 
 
-def test_a_map_that_was_lost_is_found_again_without_the_jump_in_the_path(sequence: Sequence):
-    """The registration slips once and says so ever after: where it is told to go back, it slips again."""
-    clean, slipped = driven(sequence, ScanMatching()), driven(sequence, Slipping(range(12, 13 + MOST_REJECTED), 1.0))
-    verdicts = [e.agreement.verdict for e in slipped[12 : 14 + MOST_REJECTED]]
-    assert verdicts == ["rejected"] * MOST_REJECTED + ["relocated", "agrees"]
+def test_a_lost_map_is_relocated_without_a_jump_in_the_path(sequence: Sequence):
+    """The registration slips at every scan until its own path is allowed to keep the jump."""
+    clean, slipped = (
+        driven(sequence, ScanMatching()),
+        driven(sequence, Slipping(range(12, 13 + MAX_REJECTIONS), 1.0)),
+    )
+    verdicts = [e.gate.verdict for e in slipped[12 : 14 + MAX_REJECTIONS]]
+    assert verdicts == ["rejected"] * MAX_REJECTIONS + ["relocated", "accepted"]
     bridged_m = 0.2  # six steps by an IMU that started a second ago
     assert farthest_off(slipped, sequence) < farthest_off(clean, sequence) + bridged_m
 
 
-def test_any_initial_pose_has_the_imu_for_witness(sequence: Sequence):
+def test_the_imu_gates_steps_with_any_initial_pose_source(sequence: Sequence):
     odometry = Odometry(initial_pose="constant-velocity", residual=Slipping(range(15, 16), 2.0))
     estimates = [odometry.step(sequence[k]) for k in range(18)]
-    assert [e.index for e in estimates if e.agreement.verdict == "rejected"] == [15]
+    assert [e.index for e in estimates if e.gate.verdict == "rejected"] == [15]

@@ -68,7 +68,7 @@ def numbered(**settings: Any) -> tuple[Numbered, WithRecentScans]:
 
 
 def behind(step: RelativePose) -> list[int]:
-    return sorted(keyframe.stamp_ns - 1000 for keyframe in step.keyframes)
+    return sorted(keyframe.stamp_ns - 1000 for keyframe in step.earlier_scans)
 
 
 def test_each_scan_is_compared_with_the_last_keyframes_but_the_scan_before():
@@ -77,7 +77,7 @@ def test_each_scan_is_compared_with_the_last_keyframes_but_the_scan_before():
     # with a keyframe every other metre and steps of one
     assert [behind(step) for step in steps] == [[], [0], [0], [0, 2], [2], [2, 4], [4]]
     for k, step in enumerate(steps, 1):
-        for near in step.keyframes:
+        for near in step.earlier_scans:
             np.testing.assert_allclose(near.pose, np.linalg.matrix_power(STEP, k - near.stamp_ns + 1000), atol=1e-12)
 
 
@@ -88,7 +88,7 @@ def test_what_is_shared_is_told_from_what_is_each_poses_own():
     assert step.drift is not None
     np.testing.assert_allclose(step.covariance, COVARIANCE)
     np.testing.assert_allclose(step.drift, 0.4 * COVARIANCE)
-    np.testing.assert_allclose(step.keyframes[0].covariance, 0.4 * COVARIANCE)
+    np.testing.assert_allclose(step.earlier_scans[0].covariance, 0.4 * COVARIANCE)
 
 
 def test_after_a_failed_scan_the_last_good_one_is_a_keyframe():
@@ -179,7 +179,7 @@ def test_keyframes_are_in_the_record(tmp_path: Path):
     _, record = driven(3, seed=1)
     record.save(tmp_path / "odometry.npz")
     loaded = Record.load(tmp_path / "odometry.npz")
-    assert sum(len(step.keyframes) for step in loaded.relative) > 30
+    assert sum(len(step.earlier_scans) for step in loaded.relative) > 30
     assert {j - i for i, j, _ in loaded.edges} > {1, 2, 5}
 
 
