@@ -11,11 +11,15 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
+from hybridlio.cloud.projection import MapGeometry
 from hybridlio.core.errors import ConfigError
 from hybridlio.learned.settings import LossSettings, NetworkSettings, OptimiserSettings, Recipe
 
-PAPER = Recipe("paper", NetworkSettings(), LossSettings(), OptimiserSettings())
-"""The published set-up: shared weights where it says siamese, Euler angles, one pass, sums, Adam with halved steps."""
+PAPER = Recipe("paper", NetworkSettings(), LossSettings(normal_thin_m=0.0), OptimiserSettings())
+"""The published set-up: shared weights where it says siamese, Euler angles, one pass, sums, Adam with halved steps.
+
+Where the text cannot be meant as printed, ``paper-element-wise`` and ``paper-rows-as-printed`` follow it to the letter.
+"""
 
 
 def _paper_with(name: str, loss: Mapping[str, Any] = MappingProxyType({}), **network: Any) -> Recipe:
@@ -65,6 +69,47 @@ the points of a registration between them, instead of the residual being read of
 Each departure from ``paper``, and what it is worth, is in docs/learned.md.
 """
 
+PUBLISHED = Recipe(
+    "published",
+    NetworkSettings(
+        rotation="log",
+        geometry=MapGeometry(3.0, -23.0, 52, 360),
+        imu_hidden=32,
+        imu_layers=1,
+        velocity=True,
+        mean_rate=True,
+        stem=16,
+        stem_stride=(2, 4),
+        stages=(24, 32, 64),
+        blocks=1,
+        normalisation="group",
+        features=64,
+        iterations=2,
+        remap_gradient=False,
+        distance="gradient",
+        vertex_scale_m=20.0,
+        output_scale=0.02,
+    ),
+    LossSettings(
+        kernel_m=0.03,
+        max_distance_m=1.0,
+        reduction="mean",
+        matched_at="answer",
+        initial_weight=0.1,
+        keep_ground=True,
+    ),
+    OptimiserSettings(
+        epochs=30,
+        batch=16,
+        learning_rate=1e-3,
+        schedule="cosine",
+        clip_norm=1.0,
+        initial_noise_rad=0.004,
+        initial_noise_m=0.08,
+        velocity_noise_m_s=0.1,
+    ),
+)
+
 _ENCODER: Mapping[str, Any] = MappingProxyType(
     {
         "encoder": True,
@@ -111,7 +156,11 @@ DEPARTURES = (
 
 _ALL = (
     PAPER,
+    PUBLISHED,
     *DEPARTURES,
+    _paper_with("paper-element-wise", {"product": "element-wise"}),
+    _paper_with("paper-rows-as-printed", geometry=MapGeometry(23.0, -3.0, 52, 720)),
+    _paper_with("paper-thinned-normals", {"normal_thin_m": 0.2}),
     _paper_with("imu-feature", imu="feature"),
     _paper_with("no-imu", imu="none"),
     _paper_with("normals-joined", normals="joined"),

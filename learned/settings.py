@@ -29,8 +29,9 @@ class NetworkSettings:
             the initial pose is the identity), ``none``, or ``given`` (the initial pose comes from elsewhere).
         normals: ``separate`` (translation from vertex features alone), ``joined`` (both from all features), ``none``.
         head: ``attention`` (the paper's gate) or ``mlp`` (``tanh(W₂ tanh(W₁x + b₁) + b₂)``).
-        siamese: whether the two encoders, and the two LSTMs, share their weights, as the word means, or are ``twins``
-            of one structure.
+        siamese: ``shared``: the two encoders, and the two LSTMs, have the same weights, but for normalisation layers,
+            which each encoder has of its own; or ``twins`` of one structure, each with weights of its own. Shared
+            branches both take the inputs that ``velocity`` and ``distance`` add.
         rotation: ``euler`` angles (roll, pitch, yaw) or ``log``, a rotation vector.
         geometry: cells of the maps.
         imu_samples: S, rows of inertial data between two scans.
@@ -46,9 +47,11 @@ class NetworkSettings:
         features: outputs of the fully connected layer after pooling; not in the paper.
         pooled_columns: sectors of azimuth that are pooled by themselves; 1 pools everything.
         iterations: how often the residual is estimated, each from the maps moved by all before; the paper's is 1.
+        remap_gradient: whether gradients reach the initial pose also through the maps that it moves, as in the paper;
+            without, only through ``T = δT·T̂``, which takes half the time.
         distance: more inputs, from the plane of the last scan in each cell: the signed ``distance`` d of the moved
             point to it, or with it the ``gradient`` of d²/2 by translation and rotation, d·n and d·(p × n). Not in the
-            paper, and needs ``twins``.
+            paper.
         projective_steps: each iteration starts with so many weighted steps of point-to-plane registration between the
             maps (:mod:`hybridlio.learned.networks.projective_steps`), which the residual network corrects; not in the
             paper.
@@ -79,10 +82,11 @@ class NetworkSettings:
     features: int = 256
     pooled_columns: int = 1
     iterations: int = 1
+    remap_gradient: bool = True
     distance: Literal["none", "distance", "gradient"] = "none"
     projective_steps: int = 0
     weight_channels: int = 8
-    vertex_scale_m: float = 1.0
+    vertex_scale_m: float = 20.0
     residual_scale: float = 0.1
     output_scale: float = 1.0
 
@@ -102,10 +106,6 @@ class NetworkSettings:
             raise ConfigError("network: without encoder it needs projective_steps, else nothing gives a residual")
         if not self.stages or min(self.stages) < 1:
             raise ConfigError(f"network: stages needs channels of 1 or more each, got {self.stages}")
-        if self.distance != "none" and self.siamese == "shared" and self.normals != "none":
-            raise ConfigError("network: distance gives the encoders different inputs; set siamese to 'twins'")
-        if self.velocity and self.siamese == "shared":
-            raise ConfigError("network: velocity gives the LSTMs different inputs; set siamese to 'twins'")
 
 
 @dataclass(frozen=True)
@@ -128,6 +128,8 @@ class LossSettings:
             down the loss lead from the answer. The loss itself hardly weighs directions that few points see, such as
             ahead on an open road; this weighs all alike. Not in the paper.
         keep_ground: the clouds keep the ground, which the paper removes; decided when recordings are prepared.
+        normal_thin_m: side of the voxels to whose mean points planes are fitted for the clouds' normals; 0 fits them
+            to the full cloud, as the paper does; decided when recordings are prepared.
     """
 
     alpha: float = 1.0
@@ -143,17 +145,16 @@ class LossSettings:
     target_weight: float = 0.0
     target_steps: int = 2
     keep_ground: bool = False
+    normal_thin_m: float = 0.2
 
     def __post_init__(self) -> None:
         _check_choices(self)
         check_positive(self, "kernel_m", "max_distance_m")
-        if (
-            min(self.alpha, self.lambda_, self.initial_weight, self.target_weight, self.target_steps) < 0
-            or self.alpha + self.lambda_ == 0
-        ):
+        weights = (self.alpha, self.lambda_, self.initial_weight, self.target_weight)
+        if min(*weights, self.target_steps, self.normal_thin_m) < 0 or self.alpha + self.lambda_ == 0:
             raise ConfigError(
-                f"loss: weights must not be negative, nor alpha and lambda_ both 0, got {self.alpha}, {self.lambda_}, "
-                f"{self.initial_weight}"
+                "loss: alpha, lambda_, initial_weight, target_weight, target_steps and normal_thin_m must be 0 or more, "
+                f"and alpha and lambda_ not both 0; got {weights}, {self.target_steps} and {self.normal_thin_m}"
             )
 
 

@@ -198,4 +198,7 @@ def preparation_for(recipe: Recipe) -> PreparationOptions:
     """How scans are prepared for a network and its loss."""
     from hybridlio.cloud.preparation import PreparationOptions
 
-    return PreparationOptions(geometry=recipe.network.geometry, remove_ground=not recipe.loss.keep_ground)
+    loss = recipe.loss
+    return PreparationOptions(
+        geometry=recipe.network.geometry, remove_ground=not loss.keep_ground, normal_thin_m=loss.normal_thin_m
+    )

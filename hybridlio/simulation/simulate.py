@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hybridlio.core.errors import DataError
 from hybridlio.core.files import alone_in, write_whole
 from hybridlio.core.geodesy import origin_of
-from hybridlio.core.sensors import NS_PER_S, Scan
+from hybridlio.core.sensors import NS_PER_S, LidarModel, Scan
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.kitti_writer import (
     FIRST_PLACE,
@@ -155,8 +155,13 @@ def _write_scans(folders: DriveFolders, drive: Drive, config: SimulationConfig, 
             progress(k + 1, total)
 
 
-def scan_at(drive: Drive, index: int, pattern: RayPattern, config: SimulationConfig) -> Scan:
-    """Scan ``index`` of a drive, with noise. The same whatever was scanned before."""
+def scan_at(
+    drive: Drive, index: int, pattern: RayPattern, config: SimulationConfig, lidar: LidarModel | None = None
+) -> Scan:
+    """Return scan ``index`` of a drive, with noise. The same whatever was scanned before.
+
+    ``lidar`` replaces the configured sensor; ``pattern`` holds its rays.
+    """
     stamp_s = float(drive.scan_times_s[index])
     offsets_s: NDArray[np.float64] = np.zeros(1)
     if config.motion_distortion:
@@ -166,4 +171,4 @@ def scan_at(drive: Drive, index: int, pattern: RayPattern, config: SimulationCon
     hits = first_hits(scene, drive.cars, pattern, poses, stamp_s + offsets_s)
     rng = np.random.default_rng([config.seed, 9, index])
     stamp_ns = START_NS + round(stamp_s * NS_PER_S)
-    return measure(hits, pattern, config.lidar_model, stamp_ns, config.motion_distortion, rng)
+    return measure(hits, pattern, lidar or config.lidar_model, stamp_ns, config.motion_distortion, rng)

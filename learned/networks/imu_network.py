@@ -19,26 +19,26 @@ _RATE_RAD_S = 0.5  # what a road vehicle turns at
 class ImuNetwork(nn.Module):
     """Two LSTMs over ``S`` rows, of the same structure; with ``siamese="shared"`` of the same weights too.
 
-    Rows are divided by 9.81 m/s² and 0.5 rad/s, so that weights for both kinds are of one size. With ``velocity`` the
-    translation LSTM sees the last velocity (in units of 10 m/s) in every row, and its output is added to what that
-    velocity gives in the time between the scans: acceleration alone cannot tell a constant speed. With ``mean_rate``
-    the orientation LSTM's output is added to what the mean angular velocity gives. What is added to is a first guess,
-    so the layers that correct it start small.
+    Rows are divided by 9.81 m/s² and 0.5 rad/s, so that both kinds are about 1. With ``velocity`` the translation LSTM
+    also sees the last velocity (in units of 10 m/s) in every row, and its output is added to that velocity times the
+    time between the scans: acceleration alone does not determine a constant speed. A shared LSTM sees the velocity for
+    both kinds. With ``mean_rate`` the orientation LSTM's output is added to the rotation at the mean angular velocity.
+    The last layers start small and without bias, so that training starts near the identity or near that first guess.
     """
 
     def __init__(self, settings: NetworkSettings) -> None:
         super().__init__()
         self.settings = settings
         self.accel_lstm = _lstm(settings, 6 if settings.velocity else 3)
-        self.gyro_lstm = self.accel_lstm if settings.siamese == "shared" else _lstm(settings, 3)
+        self.shared = settings.siamese == "shared"
+        self.gyro_lstm = self.accel_lstm if self.shared else _lstm(settings, 3)
         if settings.imu != "feature":
             self.translation = nn.Linear(settings.imu_hidden, 3)
             self.rotation = nn.Linear(settings.imu_hidden, 3)
             with torch.no_grad():
-                for layer, corrects in ((self.translation, settings.velocity), (self.rotation, settings.mean_rate)):
-                    if corrects:
-                        layer.weight *= settings.residual_scale
-                        layer.bias.zero_()
+                for layer in (self.translation, self.rotation):
+                    layer.weight *= settings.residual_scale
+                    layer.bias.zero_()
 
     def features(self, imu: Tensor, velocity_m_s: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """What the LSTMs end with, ``(B, hidden)`` of accelerations and of angular velocities.
@@ -49,7 +49,10 @@ class ImuNetwork(nn.Module):
         """
         accel, gyro = imu[..., 3:] / GRAVITY_M_S2, imu[..., :3] / _RATE_RAD_S
         if self.settings.velocity and velocity_m_s is not None:
-            accel = torch.cat([accel, (velocity_m_s / 10.0)[:, None].expand_as(accel)], dim=-1)
+            velocity = (velocity_m_s / 10.0)[:, None].expand_as(accel)
+            accel = torch.cat([accel, velocity], dim=-1)
+            if self.shared:  # one LSTM takes the same number of columns for either kind
+                gyro = torch.cat([gyro, velocity], dim=-1)
         return self.accel_lstm(accel)[0][:, -1], self.gyro_lstm(gyro)[0][:, -1]
 
     def forward(self, imu: Tensor, velocity_m_s: Tensor | None = None, dt_s: Tensor | None = None) -> Tensor:

@@ -133,7 +133,8 @@ class OdometryNetwork(nn.Module):
                 poses += self.projective(last.points, current.points, pose)
                 pose = poses[-1]
             if self.residual_network is not None:
-                moved = maps.remap(current.vertices, current.normals, pose, self.settings.geometry)
+                at = pose if self.settings.remap_gradient else pose.detach()
+                moved = maps.remap(current.vertices, current.normals, at, self.settings.geometry)
                 with torch.autocast(pose.device.type, torch.bfloat16, enabled=self.mixed_precision):
                     residual = self.residual_network((last.vertices, last.normals), moved, features)
                 pose = residual.float() @ pose

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from hybridlio.learned.networks import maps
 from hybridlio.learned.networks import torch_se3 as se3
 from hybridlio.learned.networks.attention import make_head
 from hybridlio.learned.networks.imu_network import rotation_matrix
@@ -83,11 +84,25 @@ class Encoder(nn.Module):
         self.stages = nn.Sequential(*layers)
         self.full = nn.Linear(channels * settings.pooled_columns, settings.features)
 
-    def forward(self, maps: Tensor) -> Tensor:
-        """The features of maps."""
-        x = self.stages(torch.relu(self.stem_norm(self.stem(maps))))
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the features ``(B, features)`` of maps ``(B, C, H, W)``."""
+        x = self.stages(torch.relu(self.stem_norm(self.stem(x))))
         pooled = functional.adaptive_avg_pool2d(x, (1, self.pooled_columns)).flatten(1)
         return self.full(pooled)  # type: ignore[no-any-return]
+
+
+def sharing_convolutions(encoder: Encoder, settings: NetworkSettings) -> Encoder:
+    """Return an encoder with the convolutions and linear layers of ``encoder`` and normalisation layers of its own.
+
+    Vertices and normals have other statistics, so that one batch normalisation for both would evaluate with a running
+    mixture that fits neither.
+    """
+    other = Encoder(encoder.stem.conv.in_channels, settings)
+    for name, module in encoder.named_modules():
+        if isinstance(module, nn.Conv2d | nn.Linear):
+            parent, _, child = name.rpartition(".")
+            setattr(other.get_submodule(parent), child, module)
+    return other
 
 
 class ResidualNetwork(nn.Module):
@@ -97,9 +112,11 @@ class ResidualNetwork(nn.Module):
         super().__init__()
         self.settings = settings
         self.vertex_encoder = Encoder(6 + _MORE_CHANNELS[settings.distance], settings)
+        self.shared = settings.siamese == "shared"
         if settings.normals != "none":
-            shared = settings.siamese == "shared"
-            self.normal_encoder = self.vertex_encoder if shared else Encoder(6, settings)
+            self.normal_encoder = (
+                sharing_convolutions(self.vertex_encoder, settings) if self.shared else Encoder(6, settings)
+            )
         more = settings.imu_hidden if settings.imu == "feature" else 0
         both = settings.features * (1 if settings.normals == "none" else 2)
         separate = settings.normals == "separate"
@@ -125,10 +142,13 @@ class ResidualNetwork(nn.Module):
             current: those of the current scan, moved into the last scan's frame.
             imu_features: of acceleration and of angular velocity, ``(B, imu_hidden)`` each, with ``imu="feature"``.
         """
-        of_vertices = self.vertex_encoder(self._vertex_pair(last, current))
-        parts = [of_vertices.float()]
+        scale_m, distances = self.settings.vertex_scale_m, self._distances(last, current[0])
+        vertices = torch.cat([last[0] / scale_m, current[0] / scale_m, *distances], dim=1)
+        parts = [self.vertex_encoder(vertices).float()]
         if self.settings.normals != "none":
-            parts.append(self.normal_encoder(torch.cat([last[1], current[1]], dim=1)).float())
+            # shared convolutions take the same number of channels from either kind of map
+            normals = torch.cat([last[1], current[1], *(distances if self.shared else [])], dim=1)
+            parts.append(self.normal_encoder(normals).float())
         translation_parts = parts[:1] if self.settings.normals == "separate" else parts
         rotation_parts = parts
         if imu_features is not None:
@@ -141,11 +161,10 @@ class ResidualNetwork(nn.Module):
         scale = self.settings.output_scale
         return se3.make(rotation_matrix(scale * angles.float(), self.settings), scale * t.float())
 
-    def _vertex_pair(self, last: tuple[Tensor, Tensor], current: tuple[Tensor, Tensor]) -> Tensor:
-        channels = [last[0] / self.settings.vertex_scale_m, current[0] / self.settings.vertex_scale_m]
-        if self.settings.distance != "none":
-            channels.append(_distance(last, current[0], self.settings.distance == "gradient"))
-        return torch.cat(channels, dim=1)
+    def _distances(self, last: tuple[Tensor, Tensor], current: Tensor) -> list[Tensor]:
+        if self.settings.distance == "none":
+            return []
+        return [_distance(last, current, self.settings.distance == "gradient")]
 
 
 def _distance(last: tuple[Tensor, Tensor], current: Tensor, gradient: bool) -> Tensor:
@@ -154,12 +173,12 @@ def _distance(last: tuple[Tensor, Tensor], current: Tensor, gradient: bool) -> T
     ``(B, 1, H, W)``; with ``gradient`` ``(B, 7, H, W)``: also d·n, and d·(p × n) for p in units of 10 m.
     """
     vertices, normals = last
-    seen = (current != 0).any(dim=1, keepdim=True)
+    seen = maps.valid_cells(current)[:, None]
     distance = (normals * (current - vertices)).sum(dim=1, keepdim=True)
     distance = torch.where(seen, distance, 0.0).clamp(-1.0, 1.0) / _DISTANCE_M
     if not gradient:
         return distance
-    turning = torch.linalg.cross(current / _LEVER_M, normals, dim=1)
+    turning = maps.cross(current / _LEVER_M, normals, dim=1)
     return torch.cat([distance, distance * normals, distance * turning], dim=1)
 
 

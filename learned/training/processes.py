@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,6 +12,8 @@ import torch
 import torch.distributed
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -45,14 +48,21 @@ class Processes:
             torch.distributed.barrier()
 
     def joined(self, network: nn.Module) -> nn.Module:
-        """The network, or one with its loss, with gradients averaged over the processes.
+        """Return the network, or one with its loss, with gradients averaged over the processes.
 
-        Statistics of batches are averaged too, where the device can.
+        On GPUs batch normalisation takes its statistics over all processes. PyTorch has no such layer for CPUs: there
+        each process normalises by its own share of the batch, and the result depends on the number of processes.
         """
         if self.count == 1:
             return network
         if self.device.type == "cuda":
             network = nn.SyncBatchNorm.convert_sync_batchnorm(network)  # type: ignore[no-untyped-call]
+        elif self.leads and any(isinstance(module, nn.BatchNorm2d) for module in network.modules()):
+            _log.warning(
+                "%d CPU processes: batch normalisation uses each process's own share of the batch, so the result "
+                "depends on the number of processes; train with network.normalisation 'group' for one that does not",
+                self.count,
+            )
         # not every recipe's loss reaches every part: LSTMs, for one, are beyond it where steps forget their start
         return DistributedDataParallel(network, find_unused_parameters=True)
 

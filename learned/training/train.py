@@ -1,4 +1,7 @@
-"""Training: one flat loop, the same on a CPU, a GPU, or many machines under ``torchrun``.
+"""Training: one flat loop for a CPU, a GPU, or many machines under ``torchrun``.
+
+The result does not depend on the number of processes beyond rounding, with one exception: batch normalisation on CPUs
+(see :meth:`hybridlio.learned.training.processes.Processes.joined`).
 
 Source: UnDeepLIO, "Implementation Details". A run is a folder with ``recipe.json``, ``log.jsonl``, ``checkpoint.pt``
 and, when it has come to its end, ``weights.safetensors``; given the same folder again, it goes on exactly where its

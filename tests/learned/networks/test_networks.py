@@ -122,9 +122,38 @@ def test_an_initial_pose_is_shaken_before_it_is_refined_and_is_judged_as_it_was(
 def test_siamese_lstms_and_encoders_share_their_weights_and_twins_do_not():
     shared, twins = network(), network(siamese="twins")
     assert shared.imu_network.gyro_lstm is shared.imu_network.accel_lstm
-    assert shared.residual_network.normal_encoder is shared.residual_network.vertex_encoder
+    vertices, normals = shared.residual_network.vertex_encoder, shared.residual_network.normal_encoder
+    assert normals.stem.conv is vertices.stem.conv
+    assert normals.full is vertices.full
+    assert normals.stages[0].first_norm is not vertices.stages[0].first_norm
     assert twins.imu_network.gyro_lstm is not twins.imu_network.accel_lstm
     assert parameter_count(twins) > parameter_count(shared)
+
+
+@pytest.mark.parametrize("normalisation", ["batch", "group", "none"])
+@pytest.mark.parametrize("siamese", ["shared", "twins"])
+def test_evaluation_gives_the_features_of_training(siamese, normalisation):
+    net, x = network(siamese=siamese, normalisation=normalisation, vertex_scale_m=1.0), given(batch=8)
+    residual = net.residual_network
+    with torch.no_grad():
+        for _ in range(60):  # running statistics forget their start by a tenth each time
+            trained = _branch_features(residual, net, x)
+        evaluated = _branch_features(residual.eval(), net, x)
+    for a, b in zip(trained, evaluated, strict=True):
+        assert (a - b).norm() < 0.1 * a.norm()  # with one normalisation for both kinds of map it is 0.5 and more
+
+
+def _branch_features(residual, net, x):
+    last, current = net.look(x.last), net.look(x.current)
+    pairs = [torch.cat(both, dim=1) for both in ((last.vertices, current.vertices), (last.normals, current.normals))]
+    return residual.vertex_encoder(pairs[0]), residual.normal_encoder(pairs[1])
+
+
+def test_initial_poses_start_near_the_identity():
+    x = given(batch=8)
+    for siamese in ("shared", "twins"):
+        moved = se3.log(network(siamese=siamese).imu_network(x.imu))
+        assert moved.norm(dim=1).median() < 0.05  # 0.3 where the last layers start as any other
 
 
 def test_features_do_not_depend_on_where_the_map_is_cut():
@@ -155,6 +184,7 @@ ROWS = [
 ]
 MORE = [
     {"siamese": "twins", "velocity": True, "distance": "distance"},
+    {"siamese": "shared", "velocity": True, "distance": "gradient", "normalisation": "group"},
     {"projective_steps": 2, "iterations": 2},
     {"projective_steps": 2, "encoder": False, "weight_channels": 0},
     {"siamese": "twins", "velocity": True, "mean_rate": True, "rotation": "log", "stem_stride": (2, 4)},
