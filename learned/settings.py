@@ -153,7 +153,7 @@ class LossSettings:
         weights = (self.alpha, self.lambda_, self.initial_weight, self.target_weight)
         if min(*weights, self.target_steps, self.normal_thin_m) < 0 or self.alpha + self.lambda_ == 0:
             raise ConfigError(
-                "loss: alpha, lambda_, initial_weight, target_weight, target_steps and normal_thin_m must be 0 or more, "
+                "loss: alpha, lambda_, initial_weight, target_weight, target_steps, normal_thin_m must be 0 or more, "
                 f"and alpha and lambda_ not both 0; got {weights}, {self.target_steps} and {self.normal_thin_m}"
             )
 
