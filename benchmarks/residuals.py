@@ -29,7 +29,8 @@ from hybridlio.core.sensors import ImuNoise
 from hybridlio.datasets.registry import open_sequence, sequence_names
 from hybridlio.datasets.sequence import Sequence, part_of
 from hybridlio.odometry.config import Config
-from hybridlio.odometry.registry import RESIDUAL_SOURCES, Setup
+from hybridlio.odometry.registry import RESIDUAL_SOURCES
+from hybridlio.odometry.setup import Setup
 
 
 @dataclass

@@ -1,42 +1,27 @@
-"""The three seams' implementations by name. A new one is one entry here; contract tests run on every entry.
+"""Implementations of the three seams by name.
 
-Each is made when it is asked for, so that only what is used is imported.
+To add one, write one function here that makes it from a :class:`~hybridlio.odometry.setup.Setup`, and one line in
+:data:`INITIAL_POSE_SOURCES`, :data:`RESIDUAL_SOURCES` or :data:`BACKENDS`. The command line then offers the name, and
+the contract tests run on it. Import the implementation inside the function: only what a run uses gets loaded, and the
+command line stays quick.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from typing import TYPE_CHECKING
 
 from hybridlio.core.errors import ConfigError, DataError
+from hybridlio.odometry.setup import Setup
 
-if TYPE_CHECKING:  # the command line lists the names, and must start quickly
+if TYPE_CHECKING:  # the command line imports this module for the names
     from hybridlio.cloud.preparation import PreparationOptions
     from hybridlio.core.estimates import Backend, InitialPoseSource, ResidualSource
-    from hybridlio.core.sensors import Calibration, ImuNoise
-    from hybridlio.graph.run.inertial_steps import InertialSteps
     from hybridlio.learned.settings import Recipe
     from hybridlio.learned.sources.network_residual import NetworkResidual
     from hybridlio.odometry.config import Config
     from hybridlio.sources.recent_scans import PairSource
-
-
-@dataclass(frozen=True, eq=False)
-class Setup:
-    """What an implementation may need to know when it is made."""
-
-    config: Config
-    calibration: Calibration
-    imu_noise: ImuNoise
-
-    @cached_property
-    def inertial_steps(self) -> InertialSteps:
-        """One for all, so that each step's samples are summed up once."""
-        from hybridlio.graph.run.inertial_steps import InertialSteps
-
-        return InertialSteps(self.calibration, self.imu_noise)
 
 
 def _preintegration(setup: Setup) -> InitialPoseSource:
@@ -73,26 +58,13 @@ def _scan_matching(setup: Setup) -> ResidualSource:
     from hybridlio.sources.scan_matching import ScanMatching
 
     settings = setup.config.scan_matching
-    if settings.target == "local-map":  # it is made of the keyframes
+    if settings.target == "local-map":  # it holds several earlier scans already
         return ScanMatching(settings)
     return _with_recent_scans(ScanMatching(settings), setup)
 
 
-def _network_alone(setup: Setup) -> NetworkResidual:
-    from hybridlio.cloud.preparation import prepare
-    from hybridlio.learned.sources.network_residual import NetworkResidual
-
-    return NetworkResidual(lambda recipe: partial(prepare, options=preparation_for(recipe)), setup.config.network)
-
-
 def _network(setup: Setup) -> ResidualSource:
     return _with_recent_scans(_network_alone(setup), setup)
-
-
-def _with_recent_scans(source: PairSource, setup: Setup) -> ResidualSource:
-    from hybridlio.sources.recent_scans import WithRecentScans
-
-    return WithRecentScans(source, setup.config.recent_scans) if setup.config.recent_scans.count else source
 
 
 def _network_then_scan_matching(setup: Setup) -> ResidualSource:
@@ -148,11 +120,11 @@ BACKENDS: dict[str, Callable[[Setup], Backend]] = {
 Chosen = tuple["str | InitialPoseSource", "str | ResidualSource", "str | Backend"]
 
 
-def make_chosen(chosen: Chosen, setup: Setup) -> tuple[InitialPoseSource, ResidualSource, Backend]:
-    """Make those of the three that are names; objects are taken as they are.
+def make_implementations(chosen: Chosen, setup: Setup) -> tuple[InitialPoseSource, ResidualSource, Backend]:
+    """Make the implementations that are given by name; pass on those that are given as objects.
 
     Raises:
-        ConfigError: one cannot be made as it is set, such as for want of its weights.
+        ConfigError: one cannot be made with its settings, for instance because its weights are missing.
     """
     initial_pose, residual, backend = chosen
     try:
@@ -165,40 +137,53 @@ def make_chosen(chosen: Chosen, setup: Setup) -> tuple[InitialPoseSource, Residu
         raise ConfigError(str(error)) from error
 
 
-def check_made(config: Config) -> None:
-    """Check, without a recording, that the three can be made as they are set.
+def check_implementations(config: Config) -> None:
+    """Check, without a recording, that the configuration's three implementations can be made.
 
     Raises:
-        ConfigError: there is no implementation of a name, or it cannot be made.
+        ConfigError: a name is unknown, or an implementation cannot be made with its settings.
     """
     from hybridlio.core.sensors import Calibration, ImuNoise
 
     chosen = (config.initial_pose, config.residual, config.backend)
     check_names(*chosen)
-    make_chosen(chosen, Setup(config, Calibration(), config.imu_noise or ImuNoise()))
+    make_implementations(chosen, Setup(config, Calibration(), config.imu_noise or ImuNoise()))
 
 
 def check_names(initial_pose: object, residual: object, backend: object) -> None:
-    """Check those of the three that are names; objects are taken as they are.
+    """Check the implementations that are given by name; accept those that are given as objects.
 
     Raises:
-        ConfigError: there is no implementation of that name; lists those there are.
+        ConfigError: a name is unknown; the message lists the known ones.
     """
     seams: tuple[tuple[str, object, Iterable[str]], ...] = (
         ("initial pose", initial_pose, INITIAL_POSE_SOURCES),
         ("residual", residual, RESIDUAL_SOURCES),
         ("backend", backend, BACKENDS),
     )
-    for kind, choice, known in seams:
+    for seam, choice, known in seams:
         if isinstance(choice, str) and choice not in known:
-            raise ConfigError(f"unknown {kind} {choice!r}; choose one of {', '.join(known)}")
+            raise ConfigError(f"unknown {seam} {choice!r}; choose one of {', '.join(known)}")
 
 
 def preparation_for(recipe: Recipe) -> PreparationOptions:
-    """How scans are prepared for a network and its loss."""
+    """Return how scans are prepared for the network and the loss of a recipe."""
     from hybridlio.cloud.preparation import PreparationOptions
 
     loss = recipe.loss
     return PreparationOptions(
         geometry=recipe.network.geometry, remove_ground=not loss.keep_ground, normal_thin_m=loss.normal_thin_m
     )
+
+
+def _network_alone(setup: Setup) -> NetworkResidual:
+    from hybridlio.cloud.preparation import prepare
+    from hybridlio.learned.sources.network_residual import NetworkResidual
+
+    return NetworkResidual(lambda recipe: partial(prepare, options=preparation_for(recipe)), setup.config.network)
+
+
+def _with_recent_scans(source: PairSource, setup: Setup) -> ResidualSource:
+    from hybridlio.sources.recent_scans import WithRecentScans
+
+    return WithRecentScans(source, setup.config.recent_scans) if setup.config.recent_scans.count else source

@@ -18,7 +18,7 @@ from typing import Any
 from hybridlio.core.errors import ConfigError, DataError, HybridLioError
 from hybridlio.core.files import make_folder, write_whole
 from hybridlio.odometry.config import Config
-from hybridlio.odometry.registry import check_made, check_names
+from hybridlio.odometry.registry import check_implementations, check_names
 from hybridlio.runs import engines
 from hybridlio.runs import folder as run_folder
 from hybridlio.runs.batch_table import DONE, DONE_BEFORE, FAILED, NOT_RUN, Batch, BatchRow, figures_of, write_batch
@@ -93,7 +93,7 @@ def run_batch(
     if engines.is_remote(engine):
         check_names(config.initial_pose, config.residual, config.backend)
     else:
-        check_made(config)
+        check_implementations(config)
     local = engine == engines.LOCAL
     jobs = max(1, min(jobs or engines.cores(), len(recordings))) if local else jobs
     threads = threads or (max(1, engines.cores() // jobs) if local and jobs else 1)

@@ -14,7 +14,7 @@ from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.learned.source_settings import LstmSettings, NetworkResidualSettings
 from hybridlio.odometry.config import Config
-from hybridlio.odometry.registry import Setup
+from hybridlio.odometry.setup import Setup
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,8 @@ from hybridlio.core import se3
 from hybridlio.core.estimates import Backend
 from hybridlio.core.sensors import Frame, ImuSamples
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.odometry.registry import BACKENDS, Setup
+from hybridlio.odometry.registry import BACKENDS
+from hybridlio.odometry.setup import Setup
 
 BACKEND = sorted(BACKENDS)
 

@@ -12,7 +12,8 @@ from hybridlio.core import se3
 from hybridlio.core.estimates import InitialPoseSource, RelativePose
 from hybridlio.core.sensors import Frame, ImuSamples
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.odometry.registry import INITIAL_POSE_SOURCES, Setup
+from hybridlio.odometry.registry import INITIAL_POSE_SOURCES
+from hybridlio.odometry.setup import Setup
 
 INITIAL = sorted(INITIAL_POSE_SOURCES)
 

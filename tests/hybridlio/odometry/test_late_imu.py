@@ -46,8 +46,8 @@ def driven(drive: Chain, frames: list[Frame], backend: str) -> tuple[Odometry, l
     odometry, states = Odometry(residual=Given(drive.relative), backend=backend), []
     for frame in frames:
         odometry.step(frame)
-        if odometry._state is not None:
-            states.append(odometry._state)
+        if odometry._pipeline.state is not None:
+            states.append(odometry._pipeline.state)
     return odometry, states
 
 
@@ -103,6 +103,6 @@ def test_a_drive_whose_imu_starts_late_is_followed_by_default_and_says_so(
     assert sequence.reference is not None
     errors = se3.log(se3.between(poses, sequence.reference.poses))
     assert np.linalg.norm(errors[:, 3:5], axis=1).max() < 0.1
-    assert [m for r in caplog.records if "inertial samples from here on" in (m := r.getMessage())] == [
-        "frame 11: inertial samples from here on; the scans so far had none"
+    assert [m for r in caplog.records if "IMU samples start here" in (m := r.getMessage())] == [
+        "frame 11: IMU samples start here; the scans before had none"
     ]

@@ -129,7 +129,7 @@ def test_what_is_no_answer_and_no_configuration_is_named(frames: list[Frame]):
 
     odometry = Odometry(initial_pose=Bare())
     odometry.step(frames[0])
-    with pytest.raises(ConfigError, match="source 'bare' must answer with a RelativePose, not with ndarray"):
+    with pytest.raises(ConfigError, match="source 'bare' must return a RelativePose, got ndarray"):
         odometry.step(frames[1])
     with pytest.raises(ConfigError, match="load_config reads one"):
         Odometry(config="my.yaml")  # type: ignore[arg-type]

@@ -8,7 +8,8 @@ import pytest
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.sensors import Calibration, ImuNoise
 from hybridlio.odometry.config import Config
-from hybridlio.odometry.registry import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES, Setup, check_names
+from hybridlio.odometry.registry import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES, check_names
+from hybridlio.odometry.setup import Setup
 
 INITIAL, RESIDUAL, BACKEND = sorted(INITIAL_POSE_SOURCES), sorted(RESIDUAL_SOURCES), sorted(BACKENDS)
 

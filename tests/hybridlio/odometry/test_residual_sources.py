@@ -12,7 +12,8 @@ from hybridlio.core import se3
 from hybridlio.core.estimates import ResidualSource
 from hybridlio.core.sensors import Frame, Scan
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.odometry.registry import RESIDUAL_SOURCES, Setup
+from hybridlio.odometry.registry import RESIDUAL_SOURCES
+from hybridlio.odometry.setup import Setup
 
 RESIDUAL = sorted(RESIDUAL_SOURCES)
 

@@ -12,7 +12,8 @@ import pytest
 from hybridlio.core.sensors import Frame
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.odometry import Odometry
-from hybridlio.odometry.registry import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES, Setup
+from hybridlio.odometry.registry import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
+from hybridlio.odometry.setup import Setup
 
 
 @pytest.mark.parametrize("residual", sorted(RESIDUAL_SOURCES))

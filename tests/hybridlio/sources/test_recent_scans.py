@@ -15,7 +15,8 @@ from hybridlio.core.estimates import RelativePose
 from hybridlio.core.sensors import Calibration, Frame, ImuNoise, Scan
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.odometry import Odometry
-from hybridlio.odometry.registry import RESIDUAL_SOURCES, Setup
+from hybridlio.odometry.registry import RESIDUAL_SOURCES
+from hybridlio.odometry.setup import Setup
 from hybridlio.record.record import Record
 from hybridlio.sources.recent_scans import RecentScansSettings, WithRecentScans
 from hybridlio.sources.scan_matching import ScanMatching

@@ -1,0 +1,50 @@
+"""What implementations of the seams are made from: the configuration and what the first frame says of the sensors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+from hybridlio.core.sensors import Calibration, Frame, ImuNoise
+from hybridlio.core.setting_checks import check_positive
+
+if TYPE_CHECKING:  # the command line imports this module and must start quickly
+    from hybridlio.graph.run.inertial_steps import InertialSteps
+    from hybridlio.odometry.config import Config
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """Arguments for the functions in :mod:`hybridlio.odometry.registry`.
+
+    Attributes:
+        config: all settings.
+        calibration: the extrinsics.
+        imu_noise: the IMU's noise densities.
+    """
+
+    config: Config
+    calibration: Calibration
+    imu_noise: ImuNoise
+
+    @classmethod
+    def from_frame(cls, config: Config, frame: Frame) -> Setup:
+        """Return the setup for a run that starts at ``frame``.
+
+        The IMU's noise is the configuration's if it gives one, else the recording's, else that of an industrial MEMS
+        unit.
+
+        Raises:
+            SettingError: a noise density is 0. A simulator may have such an IMU, but the graph cannot weigh it.
+        """
+        noise = config.imu_noise or frame.imu_noise or ImuNoise()
+        check_positive(noise, *(field.name for field in fields(noise)))
+        return cls(config, frame.calibration or Calibration(), noise)
+
+    @cached_property
+    def inertial_steps(self) -> InertialSteps:
+        """Preintegration that the initial pose, the gate and the backend share, so that each step is done once."""
+        from hybridlio.graph.run.inertial_steps import InertialSteps
+
+        return InertialSteps(self.calibration, self.imu_noise)

@@ -1,0 +1,129 @@
+"""Start-up: the first frame, the first step, and an IMU whose samples start after the scans.
+
+The first scan comes without a speed. It is compensated for rotation only at first, and once more when the first step
+has been found. The backend starts at the second frame, because the samples up to it say where down is.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from hybridlio.core.estimates import Backend, InitialPoseSource, RelativePose, ResidualSource, State
+from hybridlio.core.motion_limits import BRIDGED_ACCELERATION_SIGMA_M_S2
+from hybridlio.core.sensors import NS_PER_S, Frame, ImuSamples, Scan
+from hybridlio.core.start_state import start_state
+from hybridlio.odometry.compensation import MotionCompensation
+from hybridlio.odometry.pipeline import Pipeline
+from hybridlio.odometry.setup import Setup
+from hybridlio.record.record import Record
+from hybridlio.record.recorder import concatenate_imu
+
+_log = logging.getLogger(__name__)
+
+# How often the first step is repeated without an IMU. The first answer comes from a coarse search over rotations too;
+# after three repetitions, each from the answer before, it no longer changes.
+_REPETITIONS_WITHOUT_IMU = 3
+_LEVELLING_NS = NS_PER_S  # samples this long before the first scan help to find where down is
+
+
+def start_pipeline(
+    implementations: tuple[InitialPoseSource, ResidualSource, Backend], setup: Setup, first: Frame
+) -> Pipeline:
+    """Give the first frame to the residual source and return the pipeline for the frames after it.
+
+    The first scan is compensated for its rotation alone, because its speed is unknown. The second scan is compensated
+    no better by its first initial pose: two scans that the same speed has distorted fit each other, while one with and
+    one without that distortion would end centimetres and milliradians apart.
+
+    Raises:
+        DataError: the residual source cannot start at this scan.
+    """
+    initial_pose, residual, backend = implementations
+    compensation = MotionCompensation(setup.calibration, setup.imu_noise)
+    stamp_ns = first.scan.stamp_ns
+    residual.start(compensation.compensate(first, np.eye(4), stamp_ns - NS_PER_S, stamp_ns, np.zeros(3)))
+    return Pipeline(first, setup, initial_pose, residual, backend, compensation)
+
+
+def start_backend(pipeline: Pipeline, second: Frame) -> State:
+    """Start the backend at the first scan and return the state there.
+
+    Gravity comes from the samples of the last second before the first scan and those up to the second one.
+
+    Raises:
+        DataError: the samples hold no specific force.
+    """
+    first = pipeline.first
+    before = ImuSamples.empty()
+    if len(first.imu):
+        before = first.imu.between(first.scan.stamp_ns - _LEVELLING_NS, first.scan.stamp_ns)
+    samples = concatenate_imu([before, second.imu])
+    pipeline.start = start_state(first.scan.stamp_ns, samples, pipeline.setup.imu_noise)
+    pipeline.backend.start(pipeline.start)
+    return pipeline.start
+
+
+def repeat_first_step(
+    pipeline: Pipeline, second: Frame, found: tuple[Frame, RelativePose], start: State
+) -> tuple[Frame, RelativePose]:
+    """Repeat the first step now that its motion is known, and return it as :meth:`Pipeline.refine` does.
+
+    The first scan is compensated again, with the speed that was found. Without an IMU the rotation was unknown too and
+    was searched for on a coarse grid; repeating the step from the answer improves it even where scans need no
+    compensation.
+    """
+    first, (compensated, relative) = pipeline.first, found
+    repetitions = int(pipeline.compensation.applies_to(first)) if start.has_imu else _REPETITIONS_WITHOUT_IMU
+    for _ in range(repetitions):
+        if not relative.ok:
+            break
+        pipeline.residual.start(
+            pipeline.compensation.compensate(
+                first, relative.pose, first.scan.stamp_ns, second.scan.stamp_ns, start.gyro_bias_rad_s
+            )
+        )
+        compensated, relative = pipeline.refine(second, relative, start, {})
+    return compensated, relative
+
+
+def take_up_imu(pipeline: Pipeline, record: Record, frame: Frame) -> State:
+    """Restart the backend when the first IMU samples come after some steps, and return the state at the last scan.
+
+    The samples say where down is, which the backend needs at its start. It then gets all steps of the run so far
+    again; to the graph, the run is one with a gap in its inertial data at the beginning.
+
+    Args:
+        pipeline: its state is at the last scan, without IMU.
+        record: the run so far; one step or more.
+        frame: the next frame, which carries the first samples.
+
+    Raises:
+        GraphError: the graph cannot be solved.
+    """
+    assert pipeline.state is not None
+    _log.warning("frame %d: IMU samples start here; the scans before had none", frame.index)
+    R_world_imu = pipeline.state.T_world_imu[:3, :3]
+    in_world = replace(
+        frame.imu, accel_m_s2=frame.imu.accel_m_s2 @ R_world_imu.T, gyro_rad_s=frame.imu.gyro_rad_s @ R_world_imu.T
+    )
+    start = before = now = start_state(record.start.stamp_ns, in_world, record.imu_noise)
+    pipeline.backend.start(start)
+    no_points, stamps_ns = np.empty((0, 3), np.float32), record.online.stamps_ns.tolist()
+    for k, (stamp_ns, relative) in enumerate(zip(stamps_ns[1:], record.relative, strict=True), start=1):
+        step = Frame(k, Scan(stamp_ns, no_points), ImuSamples.empty(), calibration=frame.calibration)
+        before, now = now, pipeline.backend.update(step, relative)
+    pipeline.start, pipeline.state = start, _with_mean_velocity(now, before)
+    return pipeline.state
+
+
+def _with_mean_velocity(now: State, before: State) -> State:
+    """Return ``now`` with the mean velocity since ``before``; the graph has no velocity of its own without samples."""
+    dt_s = (now.stamp_ns - before.stamp_ns) / NS_PER_S
+    covariance = now.covariance.copy()
+    covariance[6:9] = covariance[:, 6:9] = 0.0
+    covariance[6:9, 6:9] = np.eye(3) * (BRIDGED_ACCELERATION_SIGMA_M_S2 * dt_s) ** 2
+    velocity = (now.T_world_imu[:3, 3] - before.T_world_imu[:3, 3]) / dt_s
+    return replace(now, velocity_m_s=velocity, covariance=covariance)
