@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybridlio.cloud.plane_fitting import LEAST_NEIGHBOURS
+from hybridlio.cloud.plane_fitting import MIN_NEIGHBOURS
 from hybridlio.cloud.voxel import label_means, voxel_labels
 from hybridlio.core.arrays import Floats
 from hybridlio.core.errors import ConfigError
@@ -40,9 +40,9 @@ def estimate_normals(
     Raises:
         ConfigError: fewer than five neighbours, no thread, or a side out of range.
     """
-    if neighbours < LEAST_NEIGHBOURS or threads < 1 or not thin_m >= 0 or not support_m > 0:
+    if neighbours < MIN_NEIGHBOURS or threads < 1 or not thin_m >= 0 or not support_m > 0:
         raise ConfigError(
-            f"normals: need at least {LEAST_NEIGHBOURS} neighbours, 1 thread, thin_m of 0 or more and support_m above "
+            f"normals: need at least {MIN_NEIGHBOURS} neighbours, 1 thread, thin_m of 0 or more and support_m above "
             f"0, got {neighbours}, {threads}, {thin_m}, {support_m}"
         )
     points = np.asarray(points, dtype=np.float32).reshape(-1, 3)
@@ -88,7 +88,7 @@ def _has_support(places: Floats, side_m: float) -> NDArray[np.bool_]:
     """Whether five places lie in the 3 × 3 × 3 cubes around each, and not all in one place."""
     columns = np.ascontiguousarray(places.T)
     low, extent = columns.min(axis=1), np.ptp(columns, axis=1).astype(np.float64)
-    if len(places) < LEAST_NEIGHBOURS or not extent.any():
+    if len(places) < MIN_NEIGHBOURS or not extent.any():
         return np.zeros(len(places), bool)
     # a point far outside would make the table huge: coarser cubes then
     while np.prod(np.floor(extent / side_m) + 3) > _TABLE_CELLS:
@@ -102,4 +102,4 @@ def _has_support(places: Floats, side_m: float) -> NDArray[np.bool_]:
         around[step:] += count[:-step]
         around[:-step] += count[step:]
         count = around
-    return np.asarray(count[key] >= LEAST_NEIGHBOURS)
+    return np.asarray(count[key] >= MIN_NEIGHBOURS)

@@ -1,4 +1,8 @@
-"""Planes through points of a scan and their neighbours, by their directions of least spread, and what each is worth."""
+"""Planes fitted to groups of neighbouring points by principal component analysis, with a weight for each.
+
+The normal is the eigenvector of the smallest eigenvalue of the neighbours' scatter matrix. The eigenvalues are mean
+squares: the smallest is the plane's thickness squared, the middle one its width squared.
+"""
 
 from __future__ import annotations
 
@@ -9,18 +13,20 @@ from numpy.typing import NDArray
 
 from hybridlio.core.arrays import Array
 
-LEAST_NEIGHBOURS = 5  # that make a plane; small_gicp, too, fits none to fewer
-_THIN_M = 0.15  # so thick a plane counts half
-_RING_RAD = np.deg2rad(0.1)  # beams of spinning lidars are 0.3° apart and more
-_LEAST_OF_OTHERS = 2  # of ten
+MIN_NEIGHBOURS = 5  # of a plane: two more than its unknowns. small_gicp, too, fits none to fewer
+# Thickness at which a plane has half its weight. Narrower is better on simulated drives (best at 3 cm) and worse on
+# real ones, where paths become too long: real surfaces are rough and real poses of the map are not exact.
+_HALF_WEIGHT_THICKNESS_M = 0.15
+_SAME_RING_RAD = np.deg2rad(0.1)  # a third of the least distance between beams of spinning lidars
+_MIN_OTHER_RINGS = 2  # of ten neighbours; a single one may be a stray return
 
 
 class Planes(NamedTuple):
-    """Points with the planes about them, map frame.
+    """Points with planes through them, map frame.
 
     Attributes:
         points, normals: ``(M, 3)`` each.
-        weights: ``(M,)``, how much each plane counts.
+        weights: ``(M,)`` of the planes.
     """
 
     points: Array
@@ -28,43 +34,49 @@ class Planes(NamedTuple):
     weights: Array
 
 
-class Fitted(NamedTuple):
-    """Planes fitted to so many neighbours each.
+class FittedPlanes(NamedTuple):
+    """Planes fitted to groups of neighbours.
 
     Attributes:
-        normals: ``(M, 3)`` directions of least spread.
-        weights: ``(M,)``, the less the thicker.
-        breadth_m: ``(M,)`` root mean square along the direction in the plane in which the neighbours spread less.
+        normals: ``(M, 3)`` unit vectors, sign arbitrary.
+        weights: ``(M,)``, between 0 and 1, smaller for thicker planes.
+        width_m: ``(M,)`` root mean square extent of the neighbours along the shorter direction within the plane.
     """
 
     normals: Array
     weights: Array
-    breadth_m: Array
+    width_m: Array
 
 
-def fit_planes(near: Array) -> Fitted:
-    """A plane through each of the groups of points ``(M, K, 3)``.
+def fit_planes(neighbours: Array) -> FittedPlanes:
+    """Fit a plane through each group of points ``(M, K, 3)``.
 
-    A hedge's points make no plane, and pull a scan anywhere: what a scan's points lie off planes was seen to grow with
-    their thickness, the root mean square along the normal. On simulated drives weights by the inverse square of that
-    are the best (half at 3 cm); with real scans and poses so narrow a choice makes paths longer than they are.
+    A hedge's points make no plane, and matching them as one pulls the scan in arbitrary directions: residuals were
+    found to grow with the thickness ``d``, the root mean square distance of the neighbours from their plane. Their
+    variance is taken as ``σ²·(1 + d²/τ²)``, so the weight, its inverse, is ``τ²/(τ² + d²)``, with ``τ`` = 15 cm.
     """
-    near = near - near.mean(axis=1, keepdims=True)
-    spread, axes = np.linalg.eigh(near.transpose(0, 2, 1) @ near)
-    spread2 = np.maximum(spread, 0.0) / near.shape[1]
-    weights = _THIN_M**2 / (_THIN_M**2 + spread2[:, 0])
-    return Fitted(np.asarray(axes[:, :, 0]), np.asarray(weights), np.sqrt(spread2[:, 1]))
+    centred = neighbours - neighbours.mean(axis=1, keepdims=True)
+    eigenvalues, axes = np.linalg.eigh(centred.transpose(0, 2, 1) @ centred)
+    mean_squares = np.maximum(eigenvalues, 0.0) / centred.shape[1]
+    weights = _HALF_WEIGHT_THICKNESS_M**2 / (_HALF_WEIGHT_THICKNESS_M**2 + mean_squares[:, 0])
+    return FittedPlanes(np.asarray(axes[:, :, 0]), np.asarray(weights), np.sqrt(mean_squares[:, 1]))
 
 
-def of_several_rings(points: Array, near: NDArray[np.uint64]) -> NDArray[np.bool_]:
-    """Whether those of the points ``(N, 3)``, lidar frame, that ``near`` ``(M, K)`` numbers are of more than one beam.
+def span_several_rings(points: Array, neighbours: NDArray[np.uint64]) -> NDArray[np.bool_]:
+    """Return which groups of neighbours contain points of more than one beam.
 
-    One beam's points lie on a cone about the lidar's axis: whatever it hits, their plane is the cone's. On a far wall
-    its normal stands upright, and the next scan's ring would be pulled to the height of this one's.
+    A beam's points lie on a cone about the lidar's axis, so the plane through one ring is the cone's and not the
+    surface's. On a distant wall it is horizontal, and the next scan's ring would be pulled to the height of this one.
+
+    Args:
+        points: ``(N, 3)``, lidar frame.
+        neighbours: ``(M, K)`` indices of points.
     """
     elevation_rad = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
-    beams_rad = np.sort(elevation_rad[near], axis=1)
-    count = beams_rad.shape[1]
-    middle_rad = (beams_rad[:, (count - 1) // 2] + beams_rad[:, count // 2]) / 2  # np.median takes three times as long
-    others = np.abs(beams_rad - middle_rad[:, None]) > _RING_RAD
-    return np.asarray(others.sum(axis=1) >= _LEAST_OF_OTHERS)
+    sorted_rad = np.sort(elevation_rad[neighbours], axis=1)
+    count = sorted_rad.shape[1]
+    median_rad = (
+        sorted_rad[:, (count - 1) // 2] + sorted_rad[:, count // 2]
+    ) / 2  # np.median takes three times as long
+    others = np.abs(sorted_rad - median_rad[:, None]) > _SAME_RING_RAD
+    return np.asarray(others.sum(axis=1) >= _MIN_OTHER_RINGS)

@@ -1,16 +1,20 @@
-"""Whether a scan really says something of a direction of which its Hessian says little.
+"""Decides whether a weakly constrained direction is truly observed, or only seems so because normals are noisy.
 
-Normals are estimates: on a smooth wall some lean to one side and some to the other, at its edges far, and each pretends
-to know a little of the way along it. A few trunks in an open field know no more by the Hessian's count. The difference
-shows a step away, where points find other neighbours: the cost of trunks rises, whereas leaning normals are no worse
-there than here. So the cost is looked at half a metre to either side, where all other directions have found their
-minimum anew; a parabola through the three says where the minimum is, and the scatter of the points' rises how surely.
+The Hessian cannot tell. On a smooth wall some estimated normals lean forward and some back, strongly at its edges, and
+each contributes spurious information along the wall; a few tree trunks in an open field contribute no more. The cost
+itself differs: half a metre away, where points find other neighbours, trunks no longer fit, whereas leaning normals fit
+as well as before. So the pose is displaced by half a metre to either side of each weak direction, the strong directions
+are minimised again, and a parabola through the three costs gives the minimum, its significance and its standard
+deviation (:mod:`hybridlio.registration.cost_profile`). If the start is not known to a decimetre, costs up to two metres
+away are weighed as likelihoods.
 
-Who does not know to a few decimetres where to start may ask more: what the costs up to two metres off make likely.
+A lidar's own pattern looks like structure: where its rings fall on the ground, and the offset of each beam, are the
+same in every scan. A scan therefore fits a single other scan best where it has not moved at all; between smooth walls
+such minima were up to twelve times as deep as their scatter. A minimum within half a metre of the only other scan is
+ignored.
 
-A lidar's own pattern goes with it: where its rings fall on the ground, and by how much each beam is off, is the same
-from scan to scan. A scan lies best on another alone where it has not moved from it. Between smooth walls such minima
-were up to twelve times as deep as their scatter; so a minimum where the only other scan was is no sign.
+On open ground, where all three horizontal directions are weak and observed, a last registration matches thick objects
+point by point (:mod:`hybridlio.registration.point_to_point`), with a kernel too narrow to find the minimum by itself.
 """
 
 from __future__ import annotations
@@ -22,230 +26,221 @@ from numpy.typing import NDArray
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
+from hybridlio.registration.cost_profile import OFFSETS_M, PROBE_STEP_M, parabola_minimum, weigh_offsets
 from hybridlio.registration.icp import Registration, RegistrationSettings, register
 from hybridlio.registration.information import UNKNOWN_SIGMA_M, covariance_of, weak_basis
 from hybridlio.registration.surface import Surface
 
-_STEP_M = 0.5  # more than neighbours lie apart, so that points find others there
-_STEPS = 6  # down the other directions, there
-_SEEN = 4.5  # times the scatter: between smooth walls the rise was at most 3.5 times that, in a field 6 and more
-_NARROW = 0.3  # of the kernel, where points are brought to points
-_SEEN_SCALE = 6.0  # of a seen direction's variance: the few points that see it stand on a few trunks, and share errors
-_OPEN = 3  # weak directions on open ground: ahead, sideways, the turn
-_NEAR_SCALE = 20.0  # the same of points brought to points
-_NEAR_M = 0.1  # a parabola through costs half a metre apart is good for so far
-_ROUNDS = 4
-_OFFSETS_M = np.linspace(-2.0, 2.0, 9)
-_TEMPER = 1.5  # times the scatter of a rise that makes a place e times less likely: so σ was true between smooth walls
-_SHARED = 2.0  # times the variance: the errors of what is weighed are alike from scan to scan, as the scene is
-_OWN_PATTERN_M = 0.5  # from a scan: there its own pattern may be what matches
-_TOLD = 0.9  # a variance that is hardly less than that of knowing nothing tells nothing
+_PROBE_ITERATIONS = (
+    6  # in the strong directions after a displacement; they move by centimetres, where Gauss-Newton is fast
+)
+_MAX_ROUNDS = 4  # of moving to the parabola's minimum: at 0.5 m a round, a start may be 2 m off, like OFFSETS_M
+_SETTLED_M = 0.1  # a fifth of the parabola's step: closer to the minimum, a new parabola gives the same one
+# On the variance of an observed direction. Only few points observe it, they stand on a few trunks and share their
+# errors, like points on one surface: twice the covariance scale of scan matching when it was chosen. Over simulated
+# fields the mean normalised error is then below 1 (tests/hybridlio/registration/test_degeneracy.py).
+_OBSERVED_VARIANCE_SCALE = 6.0
+_OPEN_GROUND_DIRECTIONS = 3  # that are weak on open ground: ahead, sideways and yaw
+_POINT_KERNEL_RATIO = 0.3  # of the settings' kernel: 3 cm by default, the noise of the difference of two points
+# On the covariance of the point-to-point registration. Each match counts in three directions, and all points on a trunk
+# share its error; larger than the scale above because many more points are used.
+_POINT_VARIANCE_SCALE = 20.0
+_POINT_START_M = 0.1  # either side of the minimum from which point matches must find the same pose; its usual error
+_SELF_MATCH_M = 0.5  # from the only other scan, as far as PROBE_STEP_M: beyond it, points have other neighbours
 
 
 @dataclass(frozen=True, eq=False)
-class Observed:
-    """A registration, and what its points say of the directions that they constrain little.
+class RegistrationProblem:
+    """What is registered to what.
 
     Attributes:
-        found: the registration. Along what is not seen its pose is as it was guessed.
-        basis: ``(6, D)`` the weak directions, orthonormal in the units of
-            :func:`hybridlio.registration.information.scaled_spectrum`; mostly there are none.
-        along: ``(D, 6)`` tangent vectors: how the pose changes for each metre that it is taken along one. Between walls
-            that bend it turns.
-        seen: ``(D,)`` of which of them the points surely say something.
-        sigmas_m: ``(D,)`` standard deviation along each, 10 m where nothing is known.
-        normal_noise: how much of a point's information, per point, its normal's noise pretends.
+        surface: a map, or another scan.
+        source: ``(N, 3)`` the scan's points that are registered, scan frame, metres.
+        settings: of the registration.
+        dense_source: ``(M, 3)`` more of the scan's points, for point-to-point matches; None for ``source``.
+        only_scan_pose: ``(4, 4)`` pose of the single scan of which the surface is made; None for several scans.
     """
-
-    found: Registration
-    basis: Array
-    along: Array
-    seen: NDArray[np.bool_]
-    sigmas_m: Array
-    normal_noise: float
-
-    @property
-    def degenerate(self) -> Array:
-        """``(U, 6)`` unit tangent directions that they say nothing of."""
-        unseen = self.along[~self.seen]
-        return np.asarray(unseen / np.linalg.norm(unseen, axis=1, keepdims=True))
-
-    def covariance(self, scale: float) -> Array:
-        """``(6, 6)`` rad² and m², rotation first: of the strong directions, and along the weak ones.
-
-        Args:
-            scale: how much larger that of the strong directions is than independent points would make it.
-        """
-        found = self.found
-        strong = covariance_of(found.hessian, found.sigma_m, scale, found.levers_m, self.normal_noise, held=self.basis)
-        weak = self.along * np.minimum(self.sigmas_m, UNKNOWN_SIGMA_M)[:, None]
-        return np.asarray(strong + weak.T @ weak)
-
-
-def observe(
-    surface: Surface,
-    source: Array,
-    initial: Array,
-    settings: RegistrationSettings,
-    kernel_start_m: float = 0.0,
-    far: bool = False,
-    alone: Array | None = None,
-    points: Array | None = None,
-) -> Observed:
-    """Register by the strong directions; along a weak one go to the parabola's minimum, where the points see it at all.
-
-    From there what thin things there are says more, point by point, under a kernel too narrow to find the way there.
-
-    Args:
-        surface, source, initial, settings, kernel_start_m: as of :func:`hybridlio.registration.icp.register`.
-        far: nobody knows ``initial`` to a few decimetres: along what is not seen, weigh the costs farther off.
-        alone: ``(4, 4)`` where the one scan was that ``surface`` is made of; None for several.
-        points: ``(M, 3)`` more of the scan's, which tell more of thin things; by default ``source``.
-    """
-    found = register(surface, source, initial, settings, kernel_start_m)
-    noise = surface.normal_noise
-    basis, to_tangent = weak_basis(found.hessian, found.levers_m, noise.most)
-    if not basis.shape[1]:
-        return Observed(found, basis, np.empty((0, 6)), np.empty(0, dtype=bool), np.empty(0), noise.mean)
-    beside = _Beside(surface, source, settings, basis, to_tangent, alone)
-    weak = beside.look(found)
-    for _ in range(_ROUNDS):
-        if not weak.way_m.any():
-            break
-        found = beside.register(found.pose @ se3.exp(weak.way_m @ weak.along), settings)
-        if np.abs(weak.way_m).max() < _NEAR_M:
-            break
-        weak = beside.look(found)
-    seen = np.isfinite(weak.sigmas_m) & (not beside.may_match_itself(found.pose))
-    found, sigmas_m = beside.closer(found, weak.sigmas_m, seen, source if points is None else points)
-    sigmas_m = np.where(seen, sigmas_m, UNKNOWN_SIGMA_M)
-    if far and not seen.all():
-        ways_m, here = np.zeros(len(seen)), beside.costs(found.pose)
-        for i in np.flatnonzero(~seen):
-            ways_m[i], sigmas_m[i] = beside.weigh(found, here, weak.along[i])
-        found = beside.register(found.pose @ se3.exp(ways_m @ weak.along), settings)
-    return Observed(found, basis, weak.along, seen, sigmas_m, noise.mean)
-
-
-@dataclass(frozen=True, eq=False)
-class _Weak:
-    """What was seen beside a pose: ways to the minima ``(D,)``, and as in :class:`Observed`."""
-
-    way_m: Array
-    along: Array
-    sigmas_m: Array
-
-
-@dataclass(frozen=True, eq=False)
-class _Beside:
-    """Looks at the costs beside a pose along ``basis``, where the strong directions have found their minimum anew."""
 
     surface: Surface
     source: Array
     settings: RegistrationSettings
+    dense_source: Array | None = None
+    only_scan_pose: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedRegistration:
+    """A registration, and which of its weak directions are observed.
+
+    Attributes:
+        registration: along unobserved directions its pose is the initial one.
+        weak_basis: ``(6, D)`` the weak directions, orthonormal in the units of
+            :func:`hybridlio.registration.information.scaled_spectrum`; D is 0 in most scenes.
+        weak_tangents: ``(D, 6)`` tangent vectors: change of the pose for each metre along a weak direction. Between
+            curved walls it includes a rotation.
+        is_observed: ``(D,)``.
+        weak_sigmas_m: ``(D,)`` standard deviations along them, 10 m where unknown.
+        normal_noise: spurious share of the surface's information.
+    """
+
+    registration: Registration
+    weak_basis: Array
+    weak_tangents: Array
+    is_observed: NDArray[np.bool_]
+    weak_sigmas_m: Array
+    normal_noise: float
+
+    @property
+    def degenerate(self) -> Array:
+        """``(U, 6)`` unit tangent directions that are not observed."""
+        unobserved = self.weak_tangents[~self.is_observed]
+        return np.asarray(unobserved / np.linalg.norm(unobserved, axis=1, keepdims=True))
+
+    def covariance(self, scale: float) -> Array:
+        """Return ``(6, 6)`` rad² and m², rotation first: from the Hessian in strong directions, from costs in weak
+        ones.
+
+        Args:
+            scale: ratio of the strong directions' covariance to that of independent residuals.
+        """
+        found = self.registration
+        strong = covariance_of(
+            found.hessian, found.sigma_m, scale, found.lever_arms_m, self.normal_noise, fixed=self.weak_basis
+        )
+        weak = self.weak_tangents * np.minimum(self.weak_sigmas_m, UNKNOWN_SIGMA_M)[:, None]
+        return np.asarray(strong + weak.T @ weak)
+
+
+def register_with_degeneracy(
+    problem: RegistrationProblem, initial: Array, kernel_start_m: float = 0.0, is_start_vague: bool = False
+) -> ObservedRegistration:
+    """Register along strong directions by Gauss-Newton, and along weak ones by the costs around the pose.
+
+    Args:
+        problem: what is registered to what.
+        initial: ``(4, 4)`` pose to start from.
+        kernel_start_m: see :func:`hybridlio.registration.icp.register`.
+        is_start_vague: ``initial`` is not known to a decimetre: along unobserved directions weigh costs up to 2 m away.
+    """
+    surface = problem.surface
+    found = register(surface, problem.source, initial, problem.settings, kernel_start_m)
+    noise = surface.normal_noise
+    basis, to_tangent = weak_basis(found.hessian, found.lever_arms_m, noise.largest)
+    if not basis.shape[1]:
+        return ObservedRegistration(found, basis, np.empty((0, 6)), np.empty(0, dtype=bool), np.empty(0), noise.mean)
+    probe = _Probe(problem, basis, to_tangent)
+    found, minima = probe.descend(found)
+    is_observed = np.isfinite(minima.sigmas_m) & (not probe.may_match_itself(found.pose))
+    found, sigmas_m = probe.refine_by_points(found, minima.sigmas_m, is_observed)
+    sigmas_m = np.where(is_observed, sigmas_m, UNKNOWN_SIGMA_M)
+    if is_start_vague and not is_observed.all():
+        found, sigmas_m = probe.weigh_costs(found, minima.tangents, sigmas_m, is_observed)
+    return ObservedRegistration(found, basis, minima.tangents, is_observed, sigmas_m, noise.mean)
+
+
+@dataclass(frozen=True, eq=False)
+class _Minima:
+    """Minima of the parabolas along the weak directions: offsets and deviations ``(D,)``, tangents ``(D, 6)``."""
+
+    offsets_m: Array
+    tangents: Array
+    sigmas_m: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Probe:
+    """Evaluates costs beside a pose along the weak directions, where the strong ones have been minimised again."""
+
+    problem: RegistrationProblem
     basis: Array
     to_tangent: Array
-    alone: Array | None
 
-    def look(self, found: Registration) -> _Weak:
-        """At both sides of ``found``, along each weak direction."""
-        here, count = self.costs(found.pose), self.basis.shape[1]
-        weak = _Weak(np.empty(count), np.empty((count, 6)), np.empty(count))
-        for i, direction in enumerate((self.to_tangent[:, None] * self.basis).T):
-            back, rises_back = self._step(found.pose, here, -_STEP_M * direction)
-            ahead, rises_ahead = self._step(found.pose, here, _STEP_M * direction)
-            weak.along[i] = se3.log(se3.between(back, ahead)) / (2 * _STEP_M)
-            weak.way_m[i], weak.sigmas_m[i] = _minimum(rises_back, rises_ahead)
-        return weak
+    def descend(self, found: Registration) -> tuple[Registration, _Minima]:
+        """Move to the parabolas' minimum until it is near, and return the pose there with the last parabolas."""
+        minima = self._parabolas(found)
+        for _ in range(_MAX_ROUNDS):
+            if not minima.offsets_m.any():
+                break
+            found = self._register_strong(found.pose @ se3.exp(minima.offsets_m @ minima.tangents))
+            if np.abs(minima.offsets_m).max() < _SETTLED_M:
+                break
+            minima = self._parabolas(found)
+        return found, minima
 
-    def weigh(self, found: Registration, here: Array, direction: Array) -> tuple[float, float]:
-        """Metres along ``direction`` to where the costs make it likely to be, and their standard deviation.
-
-        ``here`` are the costs at the pose found. Each offset's likelihood falls with its rise over the rise's scatter.
-        What the choice of offsets pretends to know is taken out again, as of a product of two normal distributions.
-        """
-        tries = [self._step(found.pose, here, offset_m * direction) for offset_m in _OFFSETS_M]
-        depth = np.array([r.sum() / np.sqrt(r @ r + 1e-12) for _, r in tries]) / _TEMPER
-        trusted = np.array([not self.may_match_itself(pose) for pose, _ in tries])
-        if not trusted.any():
-            return 0.0, UNKNOWN_SIGMA_M
-        between = np.interp(_OFFSETS_M, _OFFSETS_M[trusted], depth[trusted])
-        depth = np.where(trusted, depth, np.maximum(depth, between))
-        weights = np.exp(depth.min() - depth)
-        weights /= weights.sum()
-        mean = float(weights @ _OFFSETS_M)
-        apart_m = _OFFSETS_M[1] - _OFFSETS_M[0]
-        variance = float(weights @ (_OFFSETS_M - mean) ** 2) + apart_m**2 / 12
-        unknown = float((_OFFSETS_M**2).mean())
-        if variance > _TOLD * unknown:
-            return 0.0, UNKNOWN_SIGMA_M
-        told = 1 / (1 / variance - 1 / unknown)
-        return mean / variance * told, float(np.sqrt(_SHARED * told))
+    def weigh_costs(
+        self, found: Registration, tangents: Array, sigmas_m: Array, is_observed: NDArray[np.bool_]
+    ) -> tuple[Registration, Array]:
+        """Move along the unobserved directions to where costs within 2 m make the pose likely, with its deviations."""
+        offsets_m, costs_here = np.zeros(len(is_observed)), self._costs(found.pose)
+        sigmas_m = sigmas_m.copy()
+        for i in np.flatnonzero(~is_observed):
+            probes = [self._displace(found.pose, costs_here, offset_m * tangents[i]) for offset_m in OFFSETS_M]
+            trusted = np.array([not self.may_match_itself(pose) for pose, _ in probes])
+            offsets_m[i], sigmas_m[i] = weigh_offsets([rises for _, rises in probes], trusted)
+        return self._register_strong(found.pose @ se3.exp(offsets_m @ tangents)), sigmas_m
 
     def may_match_itself(self, pose: Array) -> bool:
-        """Whether the scan would lie so near to the only other one that its pattern falls on that one's."""
-        if self.alone is None:
-            return False
-        return bool(np.linalg.norm(pose[:3, 3] - self.alone[:3, 3]) < _OWN_PATTERN_M)
+        """Whether a scan at this pose is so near the only other scan that the lidar's pattern matches itself."""
+        only = self.problem.only_scan_pose
+        return only is not None and bool(np.linalg.norm(pose[:3, 3] - only[:3, 3]) < _SELF_MATCH_M)
 
-    def closer(
-        self, found: Registration, wide_sigmas_m: Array, seen: NDArray[np.bool_], points: Array
+    def refine_by_points(
+        self, found: Registration, sigmas_m: Array, is_observed: NDArray[np.bool_]
     ) -> tuple[Registration, Array]:
-        """``found``, at where ``points`` lie nearest, and standard deviations ``(D,)`` along what is ``seen``.
+        """Register once more with thick objects matched by points, and return standard deviations ``(D,)``.
 
-        ``wide_sigmas_m`` are those of the minimum seen, as of independent points. It stands but in the open, where all
-        of the ground is seen: beside walls what makes no plane is mostly their edges, along which points lie near by
-        chance. And it stands where one does not come to the same place from either side.
+        Only on open ground, where all horizontal directions are weak and observed: beside walls, thick planes are
+        mostly the walls' edges, along which points are near each other by chance. The parabola's result, with
+        ``sigmas_m`` of independent points, is kept otherwise, and where two starts on either side do not lead to the
+        same pose.
         """
-        if len(seen) < _OPEN or not seen.all():
-            return found, np.sqrt(_SEEN_SCALE) * wide_sigmas_m
-        held, narrow = np.empty((6, 0)), replace(self.settings, kernel_m=_NARROW * self.settings.kernel_m)
-        beside = _NEAR_M * self.to_tangent * self.basis.sum(axis=1)
-        near, other = (
-            register(
-                self.surface, points, found.pose @ se3.exp(way), narrow, self.settings.kernel_m, held,
-                thick_as_points=True,
-            )
-            for way in (beside, -beside)
-        )  # fmt: skip
+        of_parabola = found, np.sqrt(_OBSERVED_VARIANCE_SCALE) * sigmas_m
+        if len(is_observed) < _OPEN_GROUND_DIRECTIONS or not is_observed.all():
+            return of_parabola
+        narrow_m = _POINT_KERNEL_RATIO * self.problem.settings.kernel_m
+        near, other = (self._register_by_points(found.pose, way, narrow_m) for way in (1.0, -1.0))
         to_weak = (self.basis / self.to_tangent[:, None]).T
-        apart_m, way_m = (to_weak @ se3.log(se3.between(near.pose, pose)) for pose in (other.pose, found.pose))
-        if np.abs(apart_m).max() > narrow.kernel_m or np.abs(way_m).max() > _STEP_M:
-            return found, np.sqrt(_SEEN_SCALE) * wide_sigmas_m
-        noise = self.surface.normal_noise.mean
-        covariance = covariance_of(near.hessian, near.sigma_m, _NEAR_SCALE, found.levers_m, noise)
-        sigmas_m = np.sqrt(np.einsum("ij,jk,ik->i", to_weak, covariance, to_weak))
-        return replace(found, pose=near.pose), sigmas_m
+        apart_m, moved_m = (to_weak @ se3.log(se3.between(near.pose, pose)) for pose in (other.pose, found.pose))
+        if np.abs(apart_m).max() > narrow_m or np.abs(moved_m).max() > PROBE_STEP_M:
+            return of_parabola
+        noise = self.problem.surface.normal_noise.mean
+        covariance = covariance_of(near.hessian, near.sigma_m, _POINT_VARIANCE_SCALE, found.lever_arms_m, noise)
+        return replace(found, pose=near.pose), np.sqrt(np.einsum("ij,jk,ik->i", to_weak, covariance, to_weak))
 
-    def register(self, pose: Array, settings: RegistrationSettings) -> Registration:
-        """Down the strong directions alone."""
-        return register(self.surface, self.source, pose, settings, held=self.basis)
+    def _register_by_points(self, pose: Array, side: float, kernel_m: float) -> Registration:
+        """Register in all directions from beside a pose, on the side +1 or −1 of all weak directions."""
+        problem, nothing = self.problem, np.empty((6, 0))
+        points = problem.source if problem.dense_source is None else problem.dense_source
+        start = pose @ se3.exp(side * (_POINT_START_M * self.to_tangent * self.basis.sum(axis=1)))
+        settings = replace(problem.settings, kernel_m=kernel_m)
+        return register(problem.surface, points, start, settings, problem.settings.kernel_m, nothing, True)
 
-    def _step(self, pose: Array, here: Array, step: Array) -> tuple[Array, Array]:
-        """The pose a step away, and by how much the points' costs are higher there."""
-        there = self.register(pose @ se3.exp(step), replace(self.settings, max_iterations=_STEPS)).pose
-        rises = self.costs(there) - here
-        return there, np.asarray(rises[~np.isnan(rises)])
+    def _parabolas(self, found: Registration) -> _Minima:
+        costs_here, count = self._costs(found.pose), self.basis.shape[1]
+        minima = _Minima(np.empty(count), np.empty((count, 6)), np.empty(count))
+        for i, direction in enumerate((self.to_tangent[:, None] * self.basis).T):
+            back, rises_back = self._displace(found.pose, costs_here, -PROBE_STEP_M * direction)
+            ahead, rises_ahead = self._displace(found.pose, costs_here, PROBE_STEP_M * direction)
+            minima.tangents[i] = se3.log(se3.between(back, ahead)) / (2 * PROBE_STEP_M)
+            minima.offsets_m[i], minima.sigmas_m[i] = parabola_minimum(rises_back, rises_ahead)
+        return minima
 
-    def costs(self, pose: Array) -> Array:
-        """``(N,)`` robust cost of each point, between 0 and 1; NaN without a neighbour."""
-        moved = se3.transform(pose, self.source)
-        index, distance2 = self.surface.nearest(moved, self.settings.threads)
-        r2 = np.einsum("ij,ij->i", moved - self.surface.points[index], self.surface.normals[index]) ** 2
-        return np.where(distance2 < self.settings.max_distance_m**2, r2 / (self.settings.kernel_m**2 + r2), np.nan)
+    def _register_strong(self, pose: Array, settings: RegistrationSettings | None = None) -> Registration:
+        """Register with the weak directions fixed."""
+        problem = self.problem
+        return register(problem.surface, problem.source, pose, settings or problem.settings, fixed=self.basis)
 
+    def _displace(self, pose: Array, costs_here: Array, xi: Array) -> tuple[Array, Array]:
+        """Return the pose displaced by ``xi`` and minimised in the strong directions, and the points' rises in cost."""
+        settings = replace(self.problem.settings, max_iterations=_PROBE_ITERATIONS)
+        there = self._register_strong(pose @ se3.exp(xi), settings).pose
+        rises = self._costs(there) - costs_here
+        return there, np.asarray(rises[~np.isnan(rises)])  # points matched at both poses
 
-def _minimum(back: Array, ahead: Array) -> tuple[float, float]:
-    """Metres to the parabola's minimum and their standard deviation; infinite where points do not see it.
-
-    Then, where costs clearly fall to one side, that side is where to look on.
-    """
-    rise, scatter = float(back.sum() + ahead.sum()), float(np.sqrt(back @ back + ahead @ ahead))
-    if rise <= _SEEN * scatter:
-        return _STEP_M * (_falls(ahead) - _falls(back)), np.inf
-    way_m = _STEP_M * float(back.sum() - ahead.sum()) / (2 * rise)
-    return float(np.clip(way_m, -_STEP_M, _STEP_M)), _STEP_M * scatter / (2 * rise)
-
-
-def _falls(rises: Array) -> bool:
-    return bool(rises.sum() < -_SEEN * np.sqrt(rises @ rises))
+    def _costs(self, pose: Array) -> Array:
+        """Return the robust cost of each point ``(N,)``, between 0 and 1; NaN where it has no neighbour."""
+        surface, settings = self.problem.surface, self.problem.settings
+        moved = se3.transform(pose, self.problem.source)
+        index, distance2 = surface.nearest(moved, settings.threads)
+        r2 = np.einsum("ij,ij->i", moved - surface.points[index], surface.normals[index]) ** 2
+        return np.where(distance2 < settings.max_distance_m**2, r2 / (settings.kernel_m**2 + r2), np.nan)

@@ -1,10 +1,13 @@
 """Point-to-plane registration of one scan to a surface, by robust Gauss-Newton steps.
 
-The cost is the unsupervised loss's first term (UnDeepLIO §3.3, ``L_po2pl``) in a robust squared form: with it the
-residual network is trained, and its Hessian weighs the between-factor. Correspondences are nearest neighbours.
+The cost is the point-to-plane term of the unsupervised loss (UnDeepLIO §3.3, ``L_po2pl``) in a robust squared form:
+residuals, derivatives and kernel are derived in :mod:`hybridlio.registration.surface`. The same cost trains the
+residual network, and its Hessian weighs the between-factor.
 
-Matches take longer than a step, so that each are followed by as many steps as they are good for, along which the
-distances are linear.
+This is ICP with two departures. Matching costs more than a step, so each set of matches serves several steps, along
+which distances are extrapolated linearly, until the pose has moved so far that neighbours may change. And the kernel
+may start wide and be halved at every step (graduated non-convexity): a poor start then sees distant planes, and the
+minimum is found under the narrow kernel, which wrong matches hardly influence.
 """
 
 from __future__ import annotations
@@ -19,23 +22,27 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.setting_checks import check_positive
 from hybridlio.registration.information import newton_step
 from hybridlio.registration.point_to_point import MixedMatches, MixedNeighbours
-from hybridlio.registration.surface import Matches, Neighbours, Surface, System
+from hybridlio.registration.surface import LinearSystem, Neighbours, PlaneMatches, Surface
 
+# A step below both has converged: 1 mm at 50 m and 0.3 mm, less than the standard deviation of any registration.
 _ROTATION_CONVERGED_RAD = 2e-5
 _TRANSLATION_CONVERGED_M = 3e-4
-_REMATCH_ROTATION_RAD = 2e-4  # a centimetre at 50 m
+# A pose that has moved by either is matched again: 1 cm at 50 m and 5 mm, a few per cent of the spacing of map points.
+_REMATCH_ROTATION_RAD = 2e-4
 _REMATCH_TRANSLATION_M = 5e-3
-_MOST_MATCHES = 8  # points between two equally near neighbours would have the pose go to and fro for ever
-_FAR = 10.0  # times the way after which neighbours may be others: no second step by those from before
+_MAX_MATCHINGS = 8  # points midway between two neighbours can make the pose alternate without end; 3 to 5 are usual
+_LONG_STEP = 10.0  # times the way to a rematch: 5 cm or 2 mrad. After such a step most matches are wrong: match at once
+_MATCH_KERNELS = 3  # kernel widths within which neighbours count; the weight of a residual beyond is below 1 %
+_MIN_MATCHES = 6  # as many as unknowns; with fewer the Hessian is singular and the pose stays
 
 
 @dataclass(frozen=True)
 class RegistrationSettings:
-    """How scans are registered.
+    """Settings of a registration.
 
     Attributes:
-        kernel_m: residual at which the Geman-McClure kernel has pushed a point's weight down to a quarter.
-        max_distance_m: nearest neighbours farther away do not count.
+        kernel_m: width of the Geman-McClure kernel: the residual at which a match has a quarter of its weight.
+        max_distance_m: nearest neighbours farther away are not matched.
         max_iterations: Gauss-Newton steps.
         threads: for the nearest-neighbour search.
 
@@ -59,37 +66,37 @@ class Fit(NamedTuple):
 
     Attributes:
         cost: mean robust cost over all points, between 0 and 1; unmatched points cost 1.
-        matched: share of points with a neighbour near enough.
+        matched: share of points with a neighbour within the matching distance.
     """
 
     cost: float
     matched: float
 
     @property
-    def misfit(self) -> float:
+    def matched_cost(self) -> float:
         """Mean robust cost of the matched points alone."""
         return (self.cost - (1 - self.matched)) / max(self.matched, 1e-12)
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """The outcome.
+    """Result of a registration.
 
     Attributes:
         pose: ``(4, 4)``; maps the scan's points to the surface's frame.
-        hessian: ``(6, 6)`` of half the weighted squared residuals at the answer, right perturbation, 1/m² units removed
-            (multiply by 1/σ² for information).
-        levers_m: ``(3,)`` of the matched points about the scan's axes.
+        hessian: ``(6, 6)`` of half the weighted squared residuals at the result, for a right perturbation. The
+            information is ``hessian / σ²``.
+        lever_arms_m: ``(3,)`` of the matched points about the scan's axes.
         sigma_m: robust standard deviation of the residuals.
-        matched: share of points with a neighbour near enough.
+        matched: share of points with a neighbour within the matching distance.
         cost: mean robust cost over all points, between 0 and 1; unmatched points cost 1.
         iterations: steps taken.
-        converged: whether the last step was small.
+        converged: whether the last step was below the convergence limits.
     """
 
     pose: Array
     hessian: Array
-    levers_m: Array
+    lever_arms_m: Array
     sigma_m: float
     matched: float
     cost: float
@@ -98,7 +105,7 @@ class Registration:
 
     @property
     def fit(self) -> Fit:
-        """How well the points lie there."""
+        """How well the points lie on the surface at the result."""
         return Fit(self.cost, self.matched)
 
 
@@ -108,81 +115,84 @@ def register(
     initial: Array,
     settings: RegistrationSettings,
     kernel_start_m: float = 0.0,
-    held: Array | None = None,
-    thick_as_points: bool = False,
+    fixed: Array | None = None,
+    match_thick_as_points: bool = False,
 ) -> Registration:
-    """Find the pose that lays ``source`` on ``surface``.
+    """Find the pose at which ``source`` lies on ``surface``.
 
-    Directions that the points constrain little stay as in ``initial``;
-    :func:`hybridlio.registration.degeneracy.observe` finds out which of them the points see nevertheless.
+    Directions with too little information stay as in ``initial``; whether they are observed nevertheless is decided by
+    :func:`hybridlio.registration.degeneracy.register_with_degeneracy`.
 
     Args:
-        surface: points with normals.
+        surface: points with planes.
         source: ``(N, 3)`` points of the scan, metres.
         initial: ``(4, 4)`` pose to start from.
         settings: kernel, distances, limits.
-        kernel_start_m: a wider kernel to begin with, halved at every step; for an uncertain ``initial``.
-        held: ``(6, D)`` directions that stay, of :func:`hybridlio.registration.information.newton_step`,
-            instead of the weak ones.
-        thick_as_points: bring scan points to the surface's where those make no plane, see
+        kernel_start_m: width of a wider kernel to begin with, halved at every step; for an uncertain ``initial``.
+        fixed: ``(6, D)`` directions along which the pose stays, in the units of
+            :func:`hybridlio.registration.information.newton_step`; by default the weak ones of each step.
+        match_thick_as_points: match scan points with points of the surface where its planes are thick, see
             :mod:`hybridlio.registration.point_to_point`.
     """
     kernel_m, threads = max(settings.kernel_m, kernel_start_m), settings.threads
-    descent = _Descent(settings, initial, kernel_m, held, surface.normal_noise.most)
+    descent = _Descent(settings, initial, kernel_m, fixed, surface.normal_noise.largest)
     neighbours = MixedNeighbours(surface, source, threads)
-    look = neighbours.mixed if thick_as_points else neighbours.matches
-    for _ in range(_MOST_MATCHES):
-        again = descent.by(look(descent.pose, max(settings.max_distance_m, 3 * descent.kernel_m)))
-        if not again:
+    match = neighbours.mixed if match_thick_as_points else neighbours.matches
+    for _ in range(_MAX_MATCHINGS):
+        matches = match(descent.pose, max(settings.max_distance_m, _MATCH_KERNELS * descent.kernel_m))
+        if not descent.follow(matches):
             break
-    return descent.outcome(len(source))
+    return descent.result(len(source))
 
 
 class _Descent:
-    """Steps down from a pose, by matches that are made anew once the pose has moved too far."""
+    """Gauss-Newton steps from a pose; the caller supplies new matches whenever the pose has moved too far."""
 
     def __init__(
-        self, settings: RegistrationSettings, pose: Array, kernel_m: float, held: Array | None, normal_noise: float
+        self, settings: RegistrationSettings, pose: Array, kernel_m: float, fixed: Array | None, normal_noise: float
     ) -> None:
         self.pose, self.kernel_m, self._normal_noise = pose, kernel_m, normal_noise
-        self._settings, self._held = settings, held
+        self._settings, self._fixed = settings, fixed
         self._steps, self._converged = 0, False
-        self._matches: Matches | MixedMatches
-        self._system: System
+        self._matches: PlaneMatches | MixedMatches
+        self._system: LinearSystem
 
-    def by(self, matches: Matches | MixedMatches) -> bool:
-        """Go down as far as the matches are good for; whether others may be better then."""
-        self._matches, levers_m, way, length = matches, matches.levers_m, np.zeros(6), np.inf
+    def follow(self, matches: PlaneMatches | MixedMatches) -> bool:
+        """Step as far as the matches are valid. Return whether new matches could lead farther."""
+        self._matches, way, length = matches, np.zeros(6), np.inf
+        lever_arms_m = matches.lever_arms_m
         while self._steps < self._settings.max_iterations:
             self._system = matches.system(self.kernel_m, way)
             step = np.zeros(6)
-            if len(matches) >= 6:
-                system = self._system
-                step = newton_step(system.hessian, system.gradient, np.inf, levers_m, self._normal_noise, self._held)
+            if len(matches) >= _MIN_MATCHES:
+                hessian, gradient = self._system.hessian, self._system.gradient
+                step = newton_step(hessian, gradient, np.inf, lever_arms_m, self._normal_noise, self._fixed)
             way, self._steps = way + step, self._steps + 1
-            narrow = self.kernel_m == self._settings.kernel_m
+            is_narrow = self.kernel_m == self._settings.kernel_m
             self.kernel_m = max(self._settings.kernel_m, self.kernel_m / 2)
-            length, self._converged = _size(step), narrow and _is_small(step)
-            if self._converged or length > _FAR or (narrow and length < 1 < _size(way)):
+            length, self._converged = _rematch_ratio(step), is_narrow and _is_small(step)
+            # the steps have become short, but together they have gone far enough for other neighbours
+            has_settled_far_off = is_narrow and length < 1 < _rematch_ratio(way)
+            if self._converged or length > _LONG_STEP or has_settled_far_off:
                 break
         self.pose = self.pose @ se3.exp(way)
-        return self._steps < self._settings.max_iterations and _size(way) > 1
+        return self._steps < self._settings.max_iterations and _rematch_ratio(way) > 1
 
-    def outcome(self, points: int) -> Registration:
-        """Where it ended, of so many points."""
+    def result(self, points: int) -> Registration:
+        """Return the registration of a scan with this number of points."""
         system, matches, settings = self._system, self._matches, self._settings
         cost = robust_cost(system.distances, points, settings.kernel_m)
         weight = max(float(system.weights.sum()), 1e-12)
         sigma_m = float(np.sqrt((system.weights @ system.distances**2) / weight))
         pose, matched = se3.orthonormalise(self.pose), len(matches) / max(points, 1)
         return Registration(
-            pose, system.hessian, matches.levers_m, sigma_m, matched, cost, self._steps, self._converged
+            pose, system.hessian, matches.lever_arms_m, sigma_m, matched, cost, self._steps, self._converged
         )
 
 
-def _size(way: Array) -> float:
-    """A way's length, where 1 is so far that other neighbours may be nearer."""
-    turn_rad, shift_m = _largest(way)
+def _rematch_ratio(xi: Array) -> float:
+    """Return the size of a tangent vector over that at which matches have to be made again."""
+    turn_rad, shift_m = _largest(xi)
     return max(turn_rad / _REMATCH_ROTATION_RAD, shift_m / _REMATCH_TRANSLATION_M)
 
 
@@ -191,24 +201,26 @@ def _is_small(step: Array) -> bool:
     return turn_rad < _ROTATION_CONVERGED_RAD and shift_m < _TRANSLATION_CONVERGED_M
 
 
-def _largest(way: Array) -> tuple[float, float]:
-    """The largest component of the turn and of the shift; six floats are quicker than arrays of them."""
-    sizes: list[float] = [abs(part) for part in way.tolist()]
+def _largest(xi: Array) -> tuple[float, float]:
+    """Return the largest component of the rotation and of the translation."""
+    sizes: list[float] = [abs(part) for part in xi.tolist()]  # faster than array operations on six numbers
     return max(sizes[:3]), max(sizes[3:])
 
 
 def fit_at(
-    surface: Surface, source: Array, pose: Array, kernel_m: float, threads: int, reach_m: float | None = None
+    surface: Surface, source: Array, pose: Array, kernel_m: float, threads: int, max_distance_m: float | None = None
 ) -> Fit:
-    """How well ``source`` lies at a pose, without a step from there.
+    """Return how well ``source`` ``(N, 3)`` lies on a surface at a pose ``(4, 4)``, without moving it.
 
-    Neighbours farther than ``reach_m``, by default three times the kernel, do not count.
+    Neighbours farther than ``max_distance_m``, by default three times the kernel, are not matched.
     """
-    matches = Neighbours(surface, source, threads).matches(pose, 3 * kernel_m if reach_m is None else reach_m)
+    if max_distance_m is None:
+        max_distance_m = _MATCH_KERNELS * kernel_m
+    matches = Neighbours(surface, source, threads).matches(pose, max_distance_m)
     return Fit(robust_cost(matches.rows[6], len(source), kernel_m), len(matches) / max(len(source), 1))
 
 
 def robust_cost(distances: Array, points: int, kernel_m: float) -> float:
-    """Mean Geman-McClure cost, between 0 and 1, of so many points, of which those without a distance cost 1."""
+    """Return the mean Geman-McClure cost ``r²/(k² + r²)`` of a number of points; those without a distance cost 1."""
     r2 = distances**2
     return float((r2 / (kernel_m**2 + r2)).sum() + points - len(r2)) / max(points, 1)

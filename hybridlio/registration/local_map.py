@@ -1,4 +1,9 @@
-"""The local map: recent keyframes' points with normals in one voxel map, as a surface to register to."""
+"""The local map: points of recent keyframes with planes, in one voxel map, as a surface to register to.
+
+A new surface with its k-d tree over all points is costly. So each keyframe's new points are appended to the surface,
+and it is rebuilt only when many have been appended or the vehicle has moved far: preferably at a scan that brings no
+keyframe, which has time to spare.
+"""
 
 from __future__ import annotations
 
@@ -6,30 +11,32 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridlio.cloud.plane_fitting import LEAST_NEIGHBOURS
+from hybridlio.cloud.plane_fitting import MIN_NEIGHBOURS
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.setting_checks import check_positive, check_setting
 from hybridlio.registration.surface import Surface
-from hybridlio.registration.voxel_map import MapCells
+from hybridlio.registration.voxel_map import VoxelMap
 
-_FRESH_SHARE = 0.12
-_FAR_SHARE = 0.12  # of the radius
-_WORN_OUT = 2.0  # times that, where no scan came without a keyframe
+# The surface is due for a rebuild when its small tree holds this share of the large one's points (searching both costs
+# more than a rebuild spread over the keyframes saves), or the keyframe has moved by this share of the radius (at 100 m,
+# 12 m: six keyframes).
+_REBUILD_APPENDED_RATIO = 0.12
+_REBUILD_DISTANCE_RATIO = 0.12
+_OVERDUE = 2.0  # times that: rebuilt at a keyframe, if every scan has been one
 
 
 @dataclass(frozen=True)
 class LocalMapSettings:
-    """How the map is kept.
+    """Settings of the local map.
 
     Attributes:
-        keyframe_m, keyframe_deg: a scan this far from the last keyframe becomes one.
-        voxel_m: cells of the map; each holds up to ten points at least 10 cm apart.
-        horizon_keyframes: a cell that so many keyframes have not touched is forgotten, when the surface is next made
-            of all points: after some keyframes.
-        radius_m: points farther from the keyframe are left out of the surface then.
-        neighbours: points to fit a plane to for a normal.
-        threads: for normals and trees.
+        keyframe_m, keyframe_deg: a scan this far from the last keyframe, or turned by this much, becomes a keyframe.
+        voxel_m: side of the map's cells; each holds up to ten points at least 10 cm apart.
+        horizon_keyframes: a cell that this number of keyframes has not hit is dropped at the next rebuild.
+        radius_m: points farther from the keyframe are left out of the surface at a rebuild.
+        neighbours: number of points that a plane is fitted to.
+        threads: for planes and trees.
 
     Raises:
         SettingError: a value is out of range.
@@ -48,63 +55,69 @@ class LocalMapSettings:
     def __post_init__(self) -> None:
         check_positive(self, "keyframe_m", "keyframe_deg", "voxel_m", "horizon_keyframes", "radius_m", "threads")
         check_setting(
-            self, "neighbours", self.neighbours >= LEAST_NEIGHBOURS, f"{LEAST_NEIGHBOURS} or more, as a plane needs"
+            self, "neighbours", self.neighbours >= MIN_NEIGHBOURS, f"{MIN_NEIGHBOURS} or more, as a plane needs"
         )
 
 
 class LocalMap:
-    """Starts empty, in the frame of the first keyframe."""
+    """Keyframes' points as one surface; starts empty, in the frame of the first keyframe.
+
+    Attributes:
+        keyframes: number of keyframes inserted.
+        surface: the current surface, None while no points have planes.
+    """
 
     def __init__(self, settings: LocalMapSettings) -> None:
         self._settings = settings
-        self._cells = MapCells(settings.voxel_m, settings.horizon_keyframes, settings.neighbours, settings.threads)
-        self._keyframe: Array | None = None
-        self._middle: Array = np.zeros(3)  # of the surface when it was last made of all points
+        self._voxels = VoxelMap(settings.voxel_m, settings.horizon_keyframes, settings.neighbours, settings.threads)
+        self._T_map_keyframe: Array | None = None
+        self._centre: Array = np.zeros(3)  # of the surface when it was last rebuilt
         self.keyframes = 0
         self.surface: Surface | None = None
 
     @property
-    def alone(self) -> Array | None:
+    def only_keyframe_pose(self) -> Array | None:
         """``(4, 4)`` pose of the only keyframe; None where there are none or several."""
-        return self._keyframe if self.keyframes == 1 else None
+        return self._T_map_keyframe if self.keyframes == 1 else None
 
-    def wants(self, T_map_lidar: Array) -> bool:
-        """Whether a scan at this pose should become a keyframe."""
-        if self._keyframe is None:
+    def needs_keyframe(self, T_map_lidar: Array) -> bool:
+        """Return whether a scan at this pose should become a keyframe."""
+        if self._T_map_keyframe is None:
             return True
-        step = se3.between(self._keyframe, T_map_lidar)
+        step = se3.between(self._T_map_keyframe, T_map_lidar)
         angle_deg = np.rad2deg(np.arccos(np.clip((np.trace(step[:3, :3]) - 1) / 2, -1.0, 1.0)))
         return bool(np.linalg.norm(step[:3, 3]) > self._settings.keyframe_m or angle_deg > self._settings.keyframe_deg)
 
     def insert(self, points: Array, T_map_lidar: Array) -> None:
-        """Take a scan's points ``(N, 3)``, lidar frame, as a keyframe at this pose into the surface."""
-        new = self._cells.insert(points, T_map_lidar, self.surface)
-        self._keyframe = T_map_lidar
+        """Add a scan's points ``(N, 3)``, lidar frame, as a keyframe at this pose."""
+        new = self._voxels.insert(points, T_map_lidar, self.surface)
+        self._T_map_keyframe = T_map_lidar
         self.keyframes += 1
         if self.surface is not None:
-            self.surface = self.surface.grown(new.points, new.normals, self._settings.threads, new.weights)
-        if self._wear() > _WORN_OUT:
-            self._renew()
+            self.surface = self.surface.extended(new.points, new.normals, self._settings.threads, new.weights)
+        if self._rebuild_ratio() > _OVERDUE:
+            self._rebuild()
 
-    def tidy(self) -> None:
-        """Make the surface anew where that is due: at a scan that brings no keyframe, which takes long enough."""
-        if self.keyframes and self._wear() > 1:
-            self._renew()
+    def rebuild_if_due(self) -> None:
+        """Rebuild the surface where that is due; to be called at scans that bring no keyframe."""
+        if self.keyframes and self._rebuild_ratio() > 1:
+            self._rebuild()
 
-    def _wear(self) -> float:
-        """How much has come since the surface was made of all points, or how far the keyframe is from there; of 1."""
-        if self.surface is None or self._keyframe is None:
+    def _rebuild_ratio(self) -> float:
+        """Return how far the surface is towards being due for a rebuild, which it is at 1."""
+        if self.surface is None or self._T_map_keyframe is None:
             return np.inf
-        way_m = float(np.linalg.norm(self._keyframe[:3, 3] - self._middle))
-        return max(self.surface.fresh_share / _FRESH_SHARE, way_m / (_FAR_SHARE * self._settings.radius_m))
+        moved_m = float(np.linalg.norm(self._T_map_keyframe[:3, 3] - self._centre))
+        moved_ratio = moved_m / (_REBUILD_DISTANCE_RATIO * self._settings.radius_m)
+        return max(self.surface.appended_ratio / _REBUILD_APPENDED_RATIO, moved_ratio)
 
-    def _renew(self) -> None:
-        """Make the surface of what is remembered within the radius; of nothing there is none."""
-        assert self._keyframe is not None
-        self._middle = self._keyframe[:3, 3]
-        planes = self._cells.remembered()
-        away = planes.points - self._middle
-        near = np.flatnonzero(np.einsum("ij,ij->i", away, away) < self._settings.radius_m**2)
+    def _rebuild(self) -> None:
+        """Build the surface of the retained points within the radius; without points there is none."""
+        assert self._T_map_keyframe is not None
+        self._centre = self._T_map_keyframe[:3, 3]
+        planes = self._voxels.drop_expired()
+        offsets = planes.points - self._centre
+        near = np.flatnonzero(np.einsum("ij,ij->i", offsets, offsets) < self._settings.radius_m**2)
         self.surface = None
         if len(near):
             points, normals, weights = (column.take(near, axis=0) for column in planes)

@@ -1,7 +1,8 @@
-"""Which way to start where nobody knows how fast the vehicle goes: the motion under which a scan lies best.
+"""Search for the motion of a scan when its speed is unknown: of many candidates, the one at which it fits best.
 
-Where two scans see ground along other rings, most of it has no neighbour or has one by chance. What counts is how well
-those points lie that have.
+Two scans see the ground along different rings, so most ground points of a moving vehicle have no neighbour, or one by
+chance. Candidates are therefore compared by the cost of their matched points alone, among those with about as many
+matches.
 """
 
 from __future__ import annotations
@@ -17,15 +18,17 @@ from hybridlio.core.arrays import Array
 from hybridlio.registration.icp import Fit, RegistrationSettings, fit_at, register
 from hybridlio.registration.surface import Surface
 
+# Candidates' speeds are 2.5 m/s apart: 0.25 m at 10 Hz and 0.5 m at 5 Hz. A kernel of that size reaches from one to the
+# next.
 COARSE_KERNEL_M = 0.5
-_SPARSE = 8  # one in so many points is enough to tell a metre from another
-_COARSE_ITERATIONS = 6
-_LIKELY = 12
-_OVERLAP = 0.8  # of the most points that match: to lie on fewer is easier
+_JUDGED_STRIDE = 8  # every eighth point, some hundreds, is enough to compare places a kernel apart
+_COARSE_ITERATIONS = 6  # three while the kernel is halved from 0.5 to 0.1 m, and three under the narrow one
+_REFINED_CANDIDATES = 12  # of 18 speeds and 5 rates of turn by default: the best one and those beside it in both
+_MIN_MATCHED_RATIO = 0.8  # to the most matches of any candidate; with few matches a low cost is easy to have
 
 
 def motions(speeds_m_s: Iterable[float], rates_deg_s: Iterable[float], dt_s: float) -> list[Array]:
-    """``(4, 4)`` each, of every speed ahead with every rate of turn, kept for ``dt_s``."""
+    """Return poses ``(4, 4)`` after ``dt_s`` seconds, for every forward speed with every rate of turn."""
     pairs = product(speeds_m_s, np.deg2rad(list(rates_deg_s)))
     return [se3.exp(np.array([0, 0, rate, speed, 0, 0]) * dt_s) for speed, rate in pairs]
 
@@ -33,30 +36,33 @@ def motions(speeds_m_s: Iterable[float], rates_deg_s: Iterable[float], dt_s: flo
 def best_start(
     surface: Surface, source: Array, points: Array, starts: Sequence[Array], settings: RegistrationSettings
 ) -> Array:
-    """The best of ``starts`` after some steps: all are judged by few points, the likelier ones by all of them.
+    """Return the best start, after some Gauss-Newton steps.
+
+    All starts are compared by a few points; the best of them are refined and compared by all points.
 
     Args:
         surface: what the scan is registered to.
-        source: ``(M, 3)`` the scan's points for registration.
-        points: ``(N, 3)`` more of them, to judge by.
+        source: ``(M, 3)`` the scan's points for registration, scan frame.
+        points: ``(N, 3)`` more of them, for the last comparison.
         starts: ``(4, 4)`` poses in the surface's frame.
         settings: of the registration.
     """
-    fits = [fit_at(surface, source[::_SPARSE], T, COARSE_KERNEL_M, settings.threads) for T in starts]
-    coarse, likely = replace(settings, max_iterations=_COARSE_ITERATIONS), _best(fits)[:_LIKELY]
-    tries = [register(surface, source, starts[i], coarse, COARSE_KERNEL_M).pose for i in likely]
-    reach_m = settings.max_distance_m
-    fits = [fit_at(surface, points, T, settings.kernel_m, settings.threads, reach_m) for T in tries]
-    return tries[_best(fits)[0]]
+    fits = [fit_at(surface, source[::_JUDGED_STRIDE], T, COARSE_KERNEL_M, settings.threads) for T in starts]
+    coarse, candidates = replace(settings, max_iterations=_COARSE_ITERATIONS), _ranked(fits)[:_REFINED_CANDIDATES]
+    refined = [register(surface, source, starts[i], coarse, COARSE_KERNEL_M).pose for i in candidates]
+    max_distance_m = settings.max_distance_m
+    fits = [fit_at(surface, points, T, settings.kernel_m, settings.threads, max_distance_m) for T in refined]
+    return refined[_ranked(fits)[0]]
 
 
-def lies_better(surface: Surface, source: Array, one: Array, other: Array, kernel_m: float, threads: int) -> bool:
-    """Whether ``source`` ``(M, 3)`` lies better on the surface at one pose ``(4, 4)`` than at the other."""
-    here, there = (fit_at(surface, source[::_SPARSE], T, kernel_m, threads).cost for T in (one, other))
+def fits_better(surface: Surface, source: Array, one: Array, other: Array, kernel_m: float, threads: int) -> bool:
+    """Return whether ``source`` ``(M, 3)`` has a lower cost at the first pose ``(4, 4)`` than at the other."""
+    here, there = (fit_at(surface, source[::_JUDGED_STRIDE], T, kernel_m, threads).cost for T in (one, other))
     return here < there
 
 
-def _best(fits: Sequence[Fit]) -> list[int]:
-    """Their numbers, the best first; those of much fewer points are left out."""
+def _ranked(fits: Sequence[Fit]) -> list[int]:
+    """Return indices of the fits with enough matches, the lowest cost of matched points first."""
     most = max(fit.matched for fit in fits)
-    return sorted((i for i, fit in enumerate(fits) if fit.matched >= _OVERLAP * most), key=lambda i: fits[i].misfit)
+    enough = (i for i, fit in enumerate(fits) if fit.matched >= _MIN_MATCHED_RATIO * most)
+    return sorted(enough, key=lambda i: fits[i].matched_cost)

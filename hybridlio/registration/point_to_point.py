@@ -1,8 +1,14 @@
-"""Matches that take for points what is too thick for a plane: trunks, bushes, leaves.
+"""Point-to-point matches where a surface has no plane: trunks, bushes, leaves.
 
-A plane through ten points on a trunk leans anywhere, and all that its distances can tell is a decimetre. Where two
-scans hit the same trunk, their points lie centimetres apart, in all directions at once; a kernel over the whole
-distance tells them from those that lie beside others by chance, which one over each direction's would not.
+A plane fitted to ten points on a trunk has an arbitrary normal, and distances to it are accurate to a decimetre at
+best. Two scans that hit the same trunk have points within centimetres of each other, in all three directions. So for a
+thick plane the residual is the whole difference to the neighbour, in the scan's frame (rotating it does not change its
+length):
+
+    ``r(ξ) = Rᵀ(T·Exp(ξ)·p − q)``,  ``∂r/∂ω = −[p]ₓ``,  ``∂r/∂v = I``  at ``ξ = 0``.
+
+The kernel is over the length of the difference. One kernel per component would accept a chance neighbour that is near
+in one direction and far in another.
 """
 
 from __future__ import annotations
@@ -13,30 +19,32 @@ import numpy as np
 
 from hybridlio.core.arrays import Array
 from hybridlio.registration.information import lever_arms
-from hybridlio.registration.surface import Matches, Neighbours, System
+from hybridlio.registration.surface import LinearSystem, Neighbours, PlaneMatches
 
-_A_PLANE = 0.9  # counts so much and more: it is less than 5 cm thick
+# Planes of this weight or more are matched as planes: their thickness is below 5 cm, about twice the noise of a range
+# (see the weight in hybridlio/cloud/plane_fitting.py).
+_PLANE_WEIGHT = 0.9
 
 
 @dataclass(frozen=True, eq=False)
 class MixedMatches:
-    """Points of a scan with the planes or the points that they lie nearest to.
+    """Scan points matched with planes where those are thin, else with points.
 
     Attributes:
-        planes: those with planes.
-        source: ``(M, 3)`` the others, scan frame.
-        rows: ``(7, 3, M)`` derivatives by a right perturbation of what they are off, scan frame, and what they are off.
-        weights: ``(M,)`` how much each counts.
+        planes: matches with planes.
+        source: ``(M, 3)`` the points that are matched with points, scan frame.
+        rows: ``(7, 3, M)`` the six derivatives of each difference, and the difference, metres, scan frame.
+        weights: ``(M,)`` of the points' neighbours.
     """
 
-    planes: Matches
+    planes: PlaneMatches
     source: Array
     rows: Array
     weights: Array
 
     @classmethod
-    def of(cls, planes: Matches, source: Array, targets: Array, weights: Array) -> MixedMatches:
-        """Linearised at the pose of ``planes``; ``targets`` ``(M, 3)`` are the other points' neighbours."""
+    def linearised(cls, planes: PlaneMatches, source: Array, targets: Array, weights: Array) -> MixedMatches:
+        """Compute differences to ``targets`` ``(M, 3)`` and their derivatives at the pose of ``planes``."""
         x, y, z = source.T
         rows = np.zeros((7, 3, len(source)))
         rows[0, 1], rows[0, 2] = -z, y
@@ -50,33 +58,38 @@ class MixedMatches:
         return len(self.planes) + len(self.source)
 
     @property
-    def levers_m(self) -> Array:
+    def lever_arms_m(self) -> Array:
         """``(3,)`` of all points about the scan's axes, see :func:`hybridlio.registration.information.lever_arms`."""
         return lever_arms(np.concatenate([self.planes.source, self.source]))
 
-    def system(self, kernel_m: float, xi: Array | None = None) -> System:
-        """The step's equations, as of :meth:`Matches.system`; the thick may be off by more."""
+    def system(self, kernel_m: float, xi: Array | None = None) -> LinearSystem:
+        """Return the step's system, like :meth:`hybridlio.registration.surface.PlaneMatches.system`.
+
+        The kernel takes the weighted squared difference, so it is wider for a thick neighbourhood, whose points
+        scatter.
+        """
         flat = self.planes.system(kernel_m, xi)
-        off = self.rows[6] if xi is None else self.rows[6] + np.tensordot(xi, self.rows[:6], 1)
-        squares = np.einsum("ij,ij->j", off, off)
+        differences = self.rows[6] if xi is None else self.rows[6] + np.tensordot(xi, self.rows[:6], 1)
+        squares = np.einsum("ij,ij->j", differences, differences)
         weights = self.weights * (kernel_m**2 / (kernel_m**2 + self.weights * squares)) ** 2
         derivatives = self.rows[:6].reshape(6, -1)
         weighted = derivatives * np.tile(weights, 3)
-        return System(
+        return LinearSystem(
             flat.hessian + weighted @ derivatives.T,
-            flat.gradient + weighted @ off.ravel(),
+            flat.gradient + weighted @ differences.ravel(),
             np.concatenate([flat.distances, np.sqrt(squares)]),
             np.concatenate([flat.weights, weights]),
         )
 
 
 class MixedNeighbours(Neighbours):
-    """As :class:`hybridlio.registration.surface.Neighbours`, of planes or points."""
+    """Neighbours that are matched as planes or as points, depending on the plane's weight."""
 
-    def mixed(self, pose: Array, reach_m: float) -> MixedMatches:
-        """The planes or points of the points at a pose; points without a neighbour within reach are left out."""
-        index, source = self.within(pose, reach_m)
+    def mixed(self, pose: Array, max_distance_m: float) -> MixedMatches:
+        """Match the points at a pose; points without a neighbour within ``max_distance_m`` are left out."""
+        index, source = self.within(pose, max_distance_m)
         planes = self._surface.planes(index)
-        flat = planes[:, 4] >= _A_PLANE
+        flat = planes[:, 4] >= _PLANE_WEIGHT
         targets = self._surface.points.take(index[~flat], axis=0)
-        return MixedMatches.of(Matches.of(pose, source[flat], planes[flat]), source[~flat], targets, planes[~flat, 4])
+        plane_matches = PlaneMatches.linearised(pose, source[flat], planes[flat])
+        return MixedMatches.linearised(plane_matches, source[~flat], targets, planes[~flat, 4])

@@ -1,7 +1,8 @@
-"""Planes across keyframes, for points whose neighbours in their own scan are all of one beam.
+"""Planes across keyframes, for points whose neighbours in their own scan all belong to one ring.
 
-A sensor of 16 beams sees the ground beyond 10 m in rings that lie metres apart. In its own scan such a ring has no
-plane, and without it little tells the pitch. The next keyframes' rings lie between them: two metres on, so far apart.
+A ring is what one beam draws on a surface. A 16-beam sensor sees the ground beyond 10 m in rings that are metres apart.
+In its own scan such a ring has no plane, and without distant ground the pitch is poorly constrained. The rings of the
+next keyframes, each 2 m farther on, fall between them, and together they make planes.
 """
 
 from __future__ import annotations
@@ -9,34 +10,39 @@ from __future__ import annotations
 import numpy as np
 
 from hybridlio.cloud.kd_tree import build_tree, threads_for
-from hybridlio.cloud.plane_fitting import LEAST_NEIGHBOURS, Fitted, fit_planes
+from hybridlio.cloud.plane_fitting import MIN_NEIGHBOURS, FittedPlanes, fit_planes
 from hybridlio.core.arrays import Array, Index
 
-_KEYFRAMES = 5
-_NEIGHBOURS = 15
-_REACH_M = 4.0  # of neighbours: a ring alone has fewer so near, and a larger piece of ground is not plane
-_BREADTH_M = 0.25  # of several rings; a single one is as broad as the noise of a range
+_KEYFRAMES = 5  # whose points are kept: at 2 m each, their rings cover the gap between two rings at 20 m
+_NEIGHBOURS = 15  # half more than for a plane in one scan, so that a ring's own points do not fill them all
+# Distance of the farthest neighbour. A single ring has fewer points within it, and larger pieces of ground are not
+# plane.
+_MAX_DISTANCE_M = 4.0
+# Smallest root mean square width of a plane. Points of one ring spread across it only by the noise of a range, about
+# 0.03 m; two rings 1 m apart spread by 0.5 m.
+_MIN_WIDTH_M = 0.25
 
 
-class LoosePoints:
-    """The last keyframes' points without planes of their own scan, map frame; starts empty."""
+class RingPlanes:
+    """Fits planes to ring points of the last keyframes, map frame; starts empty."""
 
     def __init__(self) -> None:
         self._recent: list[Array] = []
 
-    def take_in(self, points: Array, threads: int) -> tuple[Index, Fitted]:
-        """Add a keyframe's points ``(N, 3)``.
+    def add_keyframe(self, points: Array, threads: int) -> tuple[Index, FittedPlanes]:
+        """Add the ring points ``(N, 3)`` of a keyframe, map frame.
 
         Returns:
-            which of them have neighbours, of this keyframe or of the last ones, that make a plane; and their planes.
+            indices ``(M,)`` of those whose neighbours, in this keyframe and the last ones, make a plane; and the
+            planes.
         """
         self._recent = [*self._recent, points][-_KEYFRAMES:]
         everything = np.concatenate(self._recent)
-        if len(everything) < LEAST_NEIGHBOURS or not len(points):
-            return np.empty(0, np.intp), fit_planes(np.empty((0, LEAST_NEIGHBOURS, 3)))
-        count, worth = min(_NEIGHBOURS, len(everything)), threads_for(2 * len(points), threads)
-        index, distance2 = build_tree(everything, threads).batch_knn_search(points, count, worth)
-        near = np.flatnonzero(distance2[:, -1] < _REACH_M**2)
-        fitted = fit_planes(everything.take(index[near], axis=0))
-        broad = fitted.breadth_m > _BREADTH_M
-        return near[broad], Fitted(*(column[broad] for column in fitted))
+        if len(everything) < MIN_NEIGHBOURS or not len(points):
+            return np.empty(0, np.intp), fit_planes(np.empty((0, MIN_NEIGHBOURS, 3)))
+        count, useful = min(_NEIGHBOURS, len(everything)), threads_for(2 * len(points), threads)
+        index, distance2 = build_tree(everything, threads).batch_knn_search(points, count, useful)
+        near = np.flatnonzero(distance2[:, -1] < _MAX_DISTANCE_M**2)
+        planes = fit_planes(everything.take(index[near], axis=0))
+        wide = planes.width_m > _MIN_WIDTH_M
+        return near[wide], FittedPlanes(*(column[wide] for column in planes))

@@ -1,7 +1,7 @@
-"""The local map's points in cubic cells that take in a few each, and are forgotten when no scan has hit them for long.
+"""Points with planes in cubic cells of limited capacity, dropped when no scan has hit their cell for long.
 
-A scan of a place that was seen before mostly hits cells that are full. Planes are fitted only to its points that a cell
-takes in, one in ten: fitting them to all would take longer than anything else that a keyframe needs.
+A scan of a place that has been seen before mostly hits full cells, and only about one point in ten is added. Planes are
+fitted to added points only: fitting them to all would be the most expensive part of a keyframe.
 """
 
 from __future__ import annotations
@@ -10,152 +10,164 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.cloud.kd_tree import build_tree, threads_for
-from hybridlio.cloud.plane_fitting import LEAST_NEIGHBOURS, Fitted, Planes, fit_planes, of_several_rings
+from hybridlio.cloud.plane_fitting import MIN_NEIGHBOURS, FittedPlanes, Planes, fit_planes, span_several_rings
 from hybridlio.cloud.voxel import voxel_labels
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Index
-from hybridlio.registration.ring_planes import LoosePoints
+from hybridlio.registration.ring_planes import RingPlanes
 from hybridlio.registration.surface import Surface
 
 Keys = NDArray[np.int64]
 
-_BITS = 21  # of a cell's place along an axis
-_MIDDLE = 1 << (_BITS - 1)
-MOST = 10  # points a cell
-_APART_M = 0.1
-_SPARSE_RANGE_M = 20.0  # within it 64 beams leave no point without another beam's beside it; 16 beams one in six
-_SPARSE = 0.05
+_KEY_BITS = 21  # per axis, so that three fit into 63 bits of an int64: ±2000 km with cells of 2 m
+_KEY_ORIGIN = 1 << (_KEY_BITS - 1)
+
+MAX_POINTS_PER_CELL = 10  # of a cell of 2 m: enough for a plane on each of two surfaces, few enough for quick searches
+_MIN_SPACING_M = (
+    0.1  # between points of different scans, about three times the noise of a range: nearer ones add nothing
+)
+# A sensor is sparse if more than this share of its points within this range have neighbours of a single ring. Of 64
+# beams none has, of 16 beams one in six.
+_SPARSE_RANGE_M = 20.0
+_SPARSE_SHARE = 0.05
 
 
-class MapCells:
-    """Points with normals, map frame; starts empty.
+class VoxelMap:
+    """Points with planes, map frame; starts empty.
 
     Args:
         side_m: of the cells.
-        horizon: a cell that so many insertions have not hit is forgotten.
-        neighbours: points of a scan to fit a plane to for a normal.
+        horizon: number of insertions after which a cell that none of them has hit is dropped.
+        neighbours: points of a scan that a plane is fitted to.
         threads: for trees.
     """
 
     def __init__(self, side_m: float, horizon: int, neighbours: int, threads: int) -> None:
         self._side_m, self._horizon, self._neighbours, self._threads = side_m, horizon, neighbours, threads
-        self._table, self._loose = CellTable(), LoosePoints()
-        self._parts: list[Planes] = []  # of every insertion since what was forgotten was dropped
+        self._cells, self._ring_planes = CellTable(), RingPlanes()
+        self._parts: list[Planes] = []  # of every insertion since cells were last dropped
         self._insertions = 0
 
-    def insert(self, points: Array, T_map_lidar: Array, known: Surface | None) -> Planes:
-        """Take in what there is room for of a scan's points ``(N, 3)``, lidar frame; ``known`` is of the points so far.
+    def insert(self, points: Array, T_map_lidar: Array, surface: Surface | None) -> Planes:
+        """Add those of a scan's points for which there is room.
 
-        Points that lie beside one of ``known``, or that have no neighbours to make a plane, are left out. Where the
-        neighbours of a sparse scan's are of one beam, the last keyframes' are asked.
+        Points within 10 cm of the surface's and points whose neighbours make no plane are left out. For a sparse
+        sensor, points whose neighbours belong to one ring get a plane from the last keyframes' points.
+
+        Args:
+            points: ``(N, 3)`` lidar frame.
+            T_map_lidar: ``(4, 4)``.
+            surface: of the points added so far; None if there are none.
 
         Returns:
-            those taken in.
+            the points that were added, with their planes.
         """
         moved = se3.transform(T_map_lidar, points)
         labels, cells = cells_of(moved, self._side_m)
-        taken = _with_room(MOST - self._table.held(cells), labels)
-        if known is not None and len(taken):
-            taken = taken[known.nearest(moved[taken], self._threads)[1] >= _APART_M**2]
-        own, planes, alone = _with_planes(points, taken, self._neighbours, self._threads)
-        if not _are_sparse(points[taken], points[alone]):
-            alone = alone[:0]  # what is farther away needs no help, and planes of several scans are less sure
-        helped, others = self._loose.take_in(moved[alone], self._threads)
-        taken = np.concatenate([own, alone[helped]])
-        self._table.hit(cells, np.bincount(labels[taken], minlength=len(cells)), self._insertions)
+        chosen = _fit_capacity(MAX_POINTS_PER_CELL - self._cells.counts(cells), labels)
+        if surface is not None and len(chosen):
+            chosen = chosen[surface.nearest(moved[chosen], self._threads)[1] >= _MIN_SPACING_M**2]
+        in_scan, planes, on_one_ring = _split_by_plane(points, chosen, self._neighbours, self._threads)
+        if not _is_sparse(points[chosen], points[on_one_ring]):
+            on_one_ring = on_one_ring[
+                :0
+            ]  # distant rings of a dense sensor are not needed, and such planes are less exact
+        across_scans, ring_planes = self._ring_planes.add_keyframe(moved[on_one_ring], self._threads)
+        added = np.concatenate([in_scan, on_one_ring[across_scans]])
+        self._cells.record_hits(cells, np.bincount(labels[added], minlength=len(cells)), self._insertions)
         self._insertions += 1
-        normals = np.concatenate([planes.normals @ T_map_lidar[:3, :3].T, others.normals])
-        new = Planes(moved[taken], normals, np.concatenate([planes.weights, others.weights]))
+        normals = np.concatenate([planes.normals @ T_map_lidar[:3, :3].T, ring_planes.normals])
+        new = Planes(moved[added], normals, np.concatenate([planes.weights, ring_planes.weights]))
         self._parts.append(new)
         return new
 
-    def remembered(self) -> Planes:
-        """All but those of cells that are forgotten, which are dropped."""
+    def drop_expired(self) -> Planes:
+        """Drop the cells that the last insertions have not hit, and return all remaining points."""
         everything = Planes(*(np.concatenate(column) for column in zip(*self._parts, strict=True)))
-        self._table.forget(self._insertions - self._horizon)
+        self._cells.drop_before(self._insertions - self._horizon)
         labels, cells = cells_of(everything.points, self._side_m)
-        kept = self._table.has(cells)
+        kept = self._cells.contains(cells)
         if not kept.all():
             everything = Planes(*(column[kept[labels]] for column in everything))
         self._parts = [everything]
         return everything
 
 
-def _are_sparse(points: Array, alone: Array) -> bool:
-    """Whether of the points near the lidar too many are ``alone``, with none of another beam beside them."""
-    near, near_alone = (np.einsum("ij,ij->i", p, p) < _SPARSE_RANGE_M**2 for p in (points, alone))
-    return bool(near_alone.sum() > _SPARSE * near.sum())
+def _is_sparse(points: Array, on_one_ring: Array) -> bool:
+    """Return whether many of the points near the lidar have neighbours of one ring only."""
+    near, near_on_one_ring = (np.einsum("ij,ij->i", p, p) < _SPARSE_RANGE_M**2 for p in (points, on_one_ring))
+    return bool(near_on_one_ring.sum() > _SPARSE_SHARE * near.sum())
 
 
-def _with_room(room: NDArray[np.int64], cells: Index) -> Index:
-    """Which points find room, where ``cells`` ``(N,)`` they lie in have ``room`` for so many each."""
-    candidates = np.flatnonzero(room[cells] > 0)
-    order = candidates[np.argsort(cells[candidates], kind="stable")]
-    ordered = cells[order]
+def _fit_capacity(room: NDArray[np.int64], labels: Index) -> Index:
+    """Return the points that fit into their cells, which have ``room`` ``(C,)`` and hold points ``labels`` ``(N,)``."""
+    candidates = np.flatnonzero(room[labels] > 0)
+    order = candidates[np.argsort(labels[candidates], kind="stable")]
+    ordered = labels[order]
     rank = np.arange(len(ordered)) - np.searchsorted(ordered, ordered)  # among those of the same cell
     return np.sort(order[rank < room[ordered]])
 
 
-def _with_planes(points: Array, wanted: Index, neighbours: int, threads: int) -> tuple[Index, Fitted, Index]:
-    """Those of ``wanted`` whose nearest points make a plane, the planes, and those whose nearest are of one beam."""
+def _split_by_plane(points: Array, chosen: Index, neighbours: int, threads: int) -> tuple[Index, FittedPlanes, Index]:
+    """Return those of ``chosen`` with neighbours of several rings, their planes, and those of one ring."""
     neighbours = min(neighbours, len(points))
-    if neighbours < LEAST_NEIGHBOURS or not len(wanted):
-        return wanted[:0], fit_planes(np.empty((0, LEAST_NEIGHBOURS, 3))), wanted[:0]
-    worth = threads_for(2 * len(wanted), threads)  # ten neighbours take twice as long as one or two
-    index, _ = build_tree(points, threads).batch_knn_search(points[wanted], neighbours, worth)
-    several = of_several_rings(points, index)
-    return wanted[several], fit_planes(points.take(index[several], axis=0)), wanted[~several]
+    if neighbours < MIN_NEIGHBOURS or not len(chosen):
+        return chosen[:0], fit_planes(np.empty((0, MIN_NEIGHBOURS, 3))), chosen[:0]
+    useful = threads_for(2 * len(chosen), threads)  # ten neighbours take twice as long as one or two
+    index, _ = build_tree(points, threads).batch_knn_search(points[chosen], neighbours, useful)
+    several = span_several_rings(points, index)
+    return chosen[several], fit_planes(points.take(index[several], axis=0)), chosen[~several]
 
 
 def cells_of(points: Array, side_m: float) -> tuple[Index, Keys]:
-    """Which cell each of the points ``(N, 3)`` is in: numbers ``(N,)`` from 0, and the keys ``(C,)`` of those cells.
+    """Return the cell of each of the points ``(N, 3)``: labels ``(N,)`` from 0, and the keys ``(C,)`` of the cells.
 
-    Keys ascend, and a cell has the same one whatever the points.
+    Keys ascend, and a cell has the same key whatever other points there are.
     """
     single = points.astype(np.float32)
     labels, count = voxel_labels(single, side_m)
-    one = np.empty(count, np.intp)
-    one[labels] = np.arange(len(labels))  # some point of each cell
-    x, y, z = np.floor(single[one] / np.float32(side_m)).astype(np.int64).T + _MIDDLE
-    return labels, ((z << _BITS | y) << _BITS) | x
+    member = np.empty(count, np.intp)
+    member[labels] = np.arange(len(labels))  # any point of each cell
+    x, y, z = np.floor(single[member] / np.float32(side_m)).astype(np.int64).T + _KEY_ORIGIN
+    return labels, ((z << _KEY_BITS | y) << _KEY_BITS) | x
 
 
 class CellTable:
-    """Starts empty. A cell is in it as long as it may hold points."""
+    """Number of points in each cell, and when a scan last hit it, as arrays sorted by key; starts empty."""
 
     def __init__(self) -> None:
         self._keys: Keys = np.empty(0, np.int64)  # ascending
-        self._held = np.empty(0, np.int64)
-        self._hit = np.empty(0, np.int64)
+        self._counts = np.empty(0, np.int64)
+        self._last_hits = np.empty(0, np.int64)
 
-    def held(self, keys: Keys) -> NDArray[np.int64]:
-        """How many points ``(C,)`` each of the cells holds."""
+    def counts(self, keys: Keys) -> NDArray[np.int64]:
+        """Return the number of points ``(C,)`` in each of the cells."""
         at, known = self._find(keys)
-        held = np.zeros(len(keys), np.int64)
-        held[known] = self._held[at[known]]
-        return held
+        counts = np.zeros(len(keys), np.int64)
+        counts[known] = self._counts[at[known]]
+        return counts
 
-    def hit(self, keys: Keys, added: NDArray[np.int64], time: int) -> None:
-        """Note that a scan hit these cells at a time, and how many points ``(C,)`` they took in."""
+    def record_hits(self, keys: Keys, added: NDArray[np.int64], time: int) -> None:
+        """Record that a scan hit these cells at a time, and the number of points ``(C,)`` added to each."""
         at, known = self._find(keys)
-        self._held[at[known]] += added[known]
-        self._hit[at[known]] = time
+        self._counts[at[known]] += added[known]
+        self._last_hits[at[known]] = time
         new = ~known & (added > 0)
         self._keys = np.insert(self._keys, at[new], keys[new])
-        self._held = np.insert(self._held, at[new], added[new])
-        self._hit = np.insert(self._hit, at[new], time)
+        self._counts = np.insert(self._counts, at[new], added[new])
+        self._last_hits = np.insert(self._last_hits, at[new], time)
 
-    def forget(self, before: int) -> None:
+    def drop_before(self, time: int) -> None:
         """Drop the cells that were last hit before a time."""
-        kept = self._hit >= before
-        self._keys, self._held, self._hit = self._keys[kept], self._held[kept], self._hit[kept]
+        kept = self._last_hits >= time
+        self._keys, self._counts, self._last_hits = self._keys[kept], self._counts[kept], self._last_hits[kept]
 
-    def has(self, keys: Keys) -> NDArray[np.bool_]:
-        """Which of the cells ``(C,)`` are in the table."""
+    def contains(self, keys: Keys) -> NDArray[np.bool_]:
+        """Return which of the cells ``(C,)`` are in the table."""
         return self._find(keys)[1]
 
     def _find(self, keys: Keys) -> tuple[Index, NDArray[np.bool_]]:
-        """Where each key is or would be, and whether it is there."""
+        """Return where each key is or would be inserted, and whether it is there."""
         at = np.searchsorted(self._keys, keys)
         known = np.zeros(len(keys), bool)
         inside = at < len(self._keys)

@@ -15,7 +15,7 @@ from itertools import product
 import numpy as np
 import small_gicp
 
-from hybridlio.cloud.plane_fitting import LEAST_NEIGHBOURS
+from hybridlio.cloud.plane_fitting import MIN_NEIGHBOURS
 from hybridlio.cloud.voxel import voxel_average, voxel_pick
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Index
@@ -69,7 +69,7 @@ class VerificationSettings:
         check_not_negative(self, "reach_m", "min_standing")
         check_fraction(self, "min_matched", "max_cost")
         check_setting(
-            self, "neighbours", self.neighbours >= LEAST_NEIGHBOURS, f"{LEAST_NEIGHBOURS} or more, as a plane needs"
+            self, "neighbours", self.neighbours >= MIN_NEIGHBOURS, f"{MIN_NEIGHBOURS} or more, as a plane needs"
         )
 
 
@@ -212,7 +212,7 @@ class Verifier:
             return f"only {fit.matched:.0%} of the points match"
         if fit.cost > self._settings.max_cost:
             return f"the surfaces do not fit (cost {fit.cost:.2f})"
-        loose = degenerate_directions(found.hessian, found.levers_m, NORMAL_NOISE.most)
+        loose = degenerate_directions(found.hessian, found.lever_arms_m, NORMAL_NOISE.largest)
         return "a direction is not held" if len(loose) else ""
 
     def _differ(self, there: Registration, back: Registration) -> str:

@@ -19,10 +19,10 @@ from hybridlio.core.motion_limits import (
     VAGUE_TRANSLATION_SIGMA_M,
 )
 from hybridlio.core.sensors import NS_PER_S, Frame, Scan
-from hybridlio.registration.degeneracy import Observed, observe
+from hybridlio.registration.degeneracy import ObservedRegistration, RegistrationProblem, register_with_degeneracy
 from hybridlio.registration.icp import Registration
 from hybridlio.registration.local_map import LocalMap, LocalMapSettings
-from hybridlio.registration.motion_search import COARSE_KERNEL_M, best_start, lies_better, motions
+from hybridlio.registration.motion_search import COARSE_KERNEL_M, best_start, fits_better, motions
 from hybridlio.registration.surface import Surface
 from hybridlio.sources.scan_matching_settings import ScanMatchingSettings
 
@@ -118,11 +118,11 @@ class ScanMatching:
         self._stamp_ns = frame.scan.stamp_ns
         usable = len(seen.points) >= self._settings.min_points and self._map.surface is not None
         observed = self._register(seen, initial, dt_s) if usable else None
-        if observed is None or observed.found.matched < self._settings.min_matched:
+        if observed is None or observed.registration.matched < self._settings.min_matched:
             if self._map.surface is None:  # nothing could be made of the scans so far
                 self._waiting = seen.points
             return self._bridge(initial, len(seen.points), observed)
-        found = observed.found
+        found = observed.registration
         before, self._before = self._path, self._path
         step = se3.between(before.T_map_lidar, found.pose)
         left_open = bool(len(observed.degenerate))
@@ -130,7 +130,7 @@ class ScanMatching:
         twist = None if last is None or left_open else se3.log(se3.between(last.T_map_lidar, found.pose)) / dt_s
         self._path, self._doubted = _Path(found.pose, twist), None
         self._adrift = left_open and _is_vague(initial)
-        if self._settings.target == "last-scan" or self._adrift or self._map.wants(found.pose):
+        if self._settings.target == "last-scan" or self._adrift or self._map.needs_keyframe(found.pose):
             self._waiting, self._path.map_changed = seen.points, True
         return self._answer(step, observed, before, len(seen.points))
 
@@ -146,15 +146,14 @@ class ScanMatching:
             return replace(initial, ok=False)
         settings, sigma_m = self._settings.registration, initial.translation_sigma_m
         wide = min(max(settings.kernel_m, sigma_m), 1.0)
-        observed = observe(
-            earlier.surface, current.source, initial.pose, settings, wide, alone=np.eye(4), points=current.points
-        )
-        if observed.found.matched < self._settings.min_matched:
+        problem = RegistrationProblem(earlier.surface, current.source, settings, current.points, np.eye(4))
+        observed = register_with_degeneracy(problem, initial.pose, wide)
+        if observed.registration.matched < self._settings.min_matched:
             return replace(initial, ok=False)
         covariance = self._covariance(observed, 1)
-        return RelativePose(observed.found.pose, covariance, self.name, degenerate=observed.degenerate)
+        return RelativePose(observed.registration.pose, covariance, self.name, degenerate=observed.degenerate)
 
-    def _answer(self, step: Array, observed: Observed, before: _Path, points: int) -> RelativePose:
+    def _answer(self, step: Array, observed: ObservedRegistration, before: _Path, points: int) -> RelativePose:
         covariance = self._covariance(observed, self._keyframes)
         drift = self._drift(covariance, before.map_changed)
         if drift is None:
@@ -165,7 +164,7 @@ class ScanMatching:
             source=self.name,
             drift=drift,
             degenerate=observed.degenerate,
-            details=_details(observed.found, points),
+            details=_details(observed.registration, points),
         )
 
     @property
@@ -175,7 +174,7 @@ class ScanMatching:
             return 1
         return self._map.keyframes + (self._waiting is not None)
 
-    def _covariance(self, observed: Observed, keyframes: int) -> Array:
+    def _covariance(self, observed: ObservedRegistration, keyframes: int) -> Array:
         return observed.covariance(self._settings.covariance_scale * (1 + _YOUNG_MAP / keyframes))
 
     def _drift(self, covariance: Array, map_changed: bool) -> Array | None:
@@ -210,14 +209,14 @@ class ScanMatching:
     def _take_in_keyframe(self) -> None:
         """Put a keyframe that was not taken back into the map."""
         if self._waiting is None:
-            self._map.tidy()
+            self._map.rebuild_if_due()
             return
         if self._settings.target == "last-scan" or self._adrift:
             self._map = LocalMap(self._settings.local_map)
         self._map.insert(self._waiting, self._path.T_map_lidar)
         self._waiting = None
 
-    def _register(self, seen: SeenScan, initial: RelativePose, dt_s: float) -> Observed:
+    def _register(self, seen: SeenScan, initial: RelativePose, dt_s: float) -> ObservedRegistration:
         surface, settings = self._map.surface, self._settings.registration
         assert surface is not None
         sigma_m = initial.translation_sigma_m
@@ -233,35 +232,40 @@ class ScanMatching:
             starts = [start @ step for step in motions(self._settings.start_speeds_m_s, rates_deg_s, dt_s)]
             start = best_start(surface, seen.source, seen.points, starts, settings)
         observed = self._from_the_better(seen, start, initial, kernel_start_m)
-        if observed.found.matched < self._settings.min_matched:  # such as by an IMU that is wrong
+        if observed.registration.matched < self._settings.min_matched:  # such as by an IMU that is wrong
             return self._going_on(self._doubted or self._path, seen, dt_s) or observed
         return observed
 
-    def _going_on(self, last: _Path, seen: SeenScan, dt_s: float) -> Observed | None:
+    def _going_on(self, last: _Path, seen: SeenScan, dt_s: float) -> ObservedRegistration | None:
         """Registered from where the last motion leads; None where that is not known, or the scan lies badly there."""
-        surface, settings = self._map.surface, self._settings
-        if last.twist is None or surface is None:
+        settings = self._settings
+        if last.twist is None or self._map.surface is None:
             return None
         moving = last.T_map_lidar @ se3.exp(last.twist * dt_s)
-        alone, points = self._map.alone, seen.points
-        observed = observe(surface, seen.source, moving, settings.registration, COARSE_KERNEL_M, True, alone, points)
-        lies_well = observed.found.matched >= settings.min_matched and observed.found.cost < _LOST_COST
+        observed = register_with_degeneracy(self._problem(seen), moving, COARSE_KERNEL_M, is_start_vague=True)
+        lies_well = observed.registration.matched >= settings.min_matched and observed.registration.cost < _LOST_COST
         return observed if lies_well else None
 
-    def _from_the_better(self, seen: SeenScan, start: Array, initial: RelativePose, kernel_start_m: float) -> Observed:
+    def _from_the_better(
+        self, seen: SeenScan, start: Array, initial: RelativePose, kernel_start_m: float
+    ) -> ObservedRegistration:
         """Register from ``start``, or from what was proposed, where the points lie better on the map there."""
-        surface, settings = self._map.surface, self._settings.registration
-        far, alone = _is_vague(initial), self._map.alone
-        assert surface is not None
+        problem, is_vague = self._problem(seen), _is_vague(initial)
         if initial.proposed is not None:
-            proposed = self._path.T_map_lidar @ initial.proposed
-            if lies_better(surface, seen.source, proposed, start, kernel_start_m, settings.threads):
-                observed = observe(surface, seen.source, proposed, settings, kernel_start_m, far, alone, seen.points)
-                if not observed.basis.shape[1]:  # the initial pose knows more of what the points hardly see
+            proposed, threads = self._path.T_map_lidar @ initial.proposed, problem.settings.threads
+            if fits_better(problem.surface, seen.source, proposed, start, kernel_start_m, threads):
+                observed = register_with_degeneracy(problem, proposed, kernel_start_m, is_vague)
+                if not observed.weak_basis.shape[1]:  # the initial pose knows more of what the points hardly see
                     return observed
-        return observe(surface, seen.source, start, settings, kernel_start_m, far, alone, seen.points)
+        return register_with_degeneracy(problem, start, kernel_start_m, is_vague)
 
-    def _bridge(self, initial: RelativePose, points: int, observed: Observed | None) -> RelativePose:
+    def _problem(self, seen: SeenScan) -> RegistrationProblem:
+        surface = self._map.surface
+        assert surface is not None
+        settings, only = self._settings.registration, self._map.only_keyframe_pose
+        return RegistrationProblem(surface, seen.source, settings, seen.points, only)
+
+    def _bridge(self, initial: RelativePose, points: int, observed: ObservedRegistration | None) -> RelativePose:
         self._before, self._path, self._doubted = self._path, self._path.carried_on(initial), None
         return RelativePose(
             initial.pose,
@@ -270,7 +274,7 @@ class ScanMatching:
             ok=False,
             drift=self._drift(_FLOOR_COVARIANCE, map_changed=False),  # the map has not moved
             from_imu=initial.from_imu,
-            details=_details(observed.found, points) if observed else {"points": float(points)},
+            details=_details(observed.registration, points) if observed else {"points": float(points)},
         )
 
 

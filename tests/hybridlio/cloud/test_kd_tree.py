@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from hybridlio.cloud.kd_tree import PointTree
+from hybridlio.cloud.kd_tree import GrowingKdTree
 from hybridlio.registration.surface import Surface
 
 
@@ -12,10 +12,10 @@ def brute(points: np.ndarray, queries: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return order, np.take_along_axis(distance2, order, axis=1)
 
 
-def grown_by_steps(points: np.ndarray, sizes: list[int]) -> PointTree:
-    tree = PointTree(points[: sizes[0]], 1)
+def grown_by_steps(points: np.ndarray, sizes: list[int]) -> GrowingKdTree:
+    tree = GrowingKdTree(points[: sizes[0]], 1)
     for size in sizes[1:]:
-        tree = tree.grown(points[:size], 1)
+        tree = tree.extended(points[:size], 1)
     return tree
 
 
@@ -40,15 +40,15 @@ def test_points_that_come_later_are_found_as_if_they_had_been_there(
 
 def test_a_tree_stays_as_it_was_when_another_grows_from_it(rng: np.random.Generator):
     points, queries = rng.uniform(-10, 10, (300, 3)), rng.uniform(-10, 10, (50, 3))
-    first = PointTree(points[:200], 1)
-    once = first.grown(points[:250], 1)
+    first = GrowingKdTree(points[:200], 1)
+    once = first.extended(points[:250], 1)
     before = [tree.two_nearest(queries, 1) for tree in (first, once)]
-    once.grown(points, 1)
+    once.extended(points, 1)
     for tree, found in zip((first, once), before, strict=True):
         for now, then in zip(tree.two_nearest(queries, 1), found, strict=True):
             np.testing.assert_array_equal(now, then)
-    assert [len(first), len(once), len(once.grown(points, 1))] == [200, 250, 300]
-    assert [tree.fresh_share for tree in (first, once)] == [0.0, 0.25]
+    assert [len(first), len(once), len(once.extended(points, 1))] == [200, 250, 300]
+    assert [tree.appended_ratio for tree in (first, once)] == [0.0, 0.25]
 
 
 def test_a_surface_that_grew_is_the_one_made_of_all(rng: np.random.Generator):
@@ -56,12 +56,12 @@ def test_a_surface_that_grew_is_the_one_made_of_all(rng: np.random.Generator):
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     whole, grown = Surface(points, normals), Surface(points[:400], normals[:400])
     for start, end in ((400, 450), (450, 500)):
-        grown = grown.grown(points[start:end], normals[start:end])
+        grown = grown.extended(points[start:end], normals[start:end])
     np.testing.assert_array_equal(grown.points, points)
     np.testing.assert_array_equal(grown.normals, normals)
     np.testing.assert_array_equal(grown.planes(np.arange(500)), whole.planes(np.arange(500)))
     queries = points + 0.1 * rng.standard_normal((500, 3))
-    (index, free), (grown_index, grown_free) = (surface.two_nearest(queries, 1) for surface in (whole, grown))
+    (index, free), (grown_index, grown_free) = (surface.nearest_with_margin(queries, 1) for surface in (whole, grown))
     np.testing.assert_array_equal(index, grown_index)
     assert (grown_free <= free + 1e-12).all()
     assert np.mean(grown_free > free - 1e-12) > 0.5

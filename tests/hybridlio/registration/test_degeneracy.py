@@ -4,13 +4,27 @@ import numpy as np
 import pytest
 
 from hybridlio.core import se3
-from hybridlio.registration.degeneracy import Observed, observe
+from hybridlio.registration.degeneracy import ObservedRegistration, RegistrationProblem, register_with_degeneracy
 from hybridlio.registration.icp import RegistrationSettings
 from hybridlio.registration.surface import Surface
 
 SETTINGS = RegistrationSettings(threads=1)
 TRUTH = se3.exp(np.array([0.002, -0.001, 0.01, 0.2, 0.1, 0.03]))
 Cloud = tuple[np.ndarray, np.ndarray]
+
+
+def observe(
+    surface: Surface,
+    source: np.ndarray,
+    initial: np.ndarray,
+    kernel_start_m: float = 0.0,
+    *,
+    vague: bool = False,
+    only_scan: np.ndarray | None = None,
+    dense: np.ndarray | None = None,
+) -> ObservedRegistration:
+    problem = RegistrationProblem(surface, source, SETTINGS, dense, only_scan)
+    return register_with_degeneracy(problem, initial, kernel_start_m, vague)
 
 
 def ground(rng: np.random.Generator, count: int) -> Cloud:
@@ -58,29 +72,29 @@ def off_by(ahead_m: float, left_m: float = 0.0) -> np.ndarray:
     return TRUTH @ se3.exp(np.array([0.0, 0.0, 0.0, ahead_m, left_m, 0.0]))
 
 
-def error(observed: Observed) -> np.ndarray:
-    return se3.log(se3.between(TRUTH, observed.found.pose))
+def error(observed: ObservedRegistration) -> np.ndarray:
+    return se3.log(se3.between(TRUTH, observed.registration.pose))
 
 
-def in_a_field(rng: np.random.Generator, ahead_m: float, left_m: float = 0.0) -> Observed:
+def in_a_field(rng: np.random.Generator, ahead_m: float, left_m: float = 0.0) -> ObservedRegistration:
     where = rng.uniform(-25, 25, (20, 2))
     surface = leaning(rng, joined(ground(rng, 8000), bushes(rng, where, 60)), 0.03)
     source = scan(rng, joined(ground(rng, 7000), bushes(rng, where, 16)))
-    return observe(surface, source, off_by(ahead_m, left_m), SETTINGS, 0.3)
+    return observe(surface, source, off_by(ahead_m, left_m), 0.3)
 
 
 def test_between_bushes_all_around_nothing_is_weak(rng: np.random.Generator):
     where = rng.uniform(-25, 25, (200, 2))
     cloud = joined(ground(rng, 2000), bushes(rng, where, 12))
-    observed = observe(leaning(rng, cloud, 0.03), scan(rng, cloud), TRUTH, SETTINGS)
-    assert observed.basis.shape == (6, 0)
+    observed = observe(leaning(rng, cloud, 0.03), scan(rng, cloud), TRUTH)
+    assert observed.weak_basis.shape == (6, 0)
     assert observed.degenerate.shape == (0, 6)
 
 
 @pytest.mark.parametrize("ahead_m", [0.0, 0.4, -0.4], ids="{} m off".format)
 def test_walls_whose_normals_lean_tell_nothing_of_the_way_along_them(rng: np.random.Generator, ahead_m: float):
     surface = leaning(rng, bend(rng, 1e6, 4000), 0.03)
-    observed = observe(surface, scan(rng, bend(rng, 1e6, 2000)), off_by(ahead_m), SETTINGS)
+    observed = observe(surface, scan(rng, bend(rng, 1e6, 2000)), off_by(ahead_m))
     (direction,) = observed.degenerate
     assert abs(direction[3]) > 0.99
     assert error(observed)[3] == pytest.approx(ahead_m, abs=0.02)  # where it was guessed
@@ -92,8 +106,8 @@ def test_walls_whose_normals_lean_tell_nothing_of_the_way_along_them(rng: np.ran
 @pytest.mark.parametrize("off", [(0.3, -0.2), (-0.2, 0.25)], ids=str)
 def test_a_few_bushes_in_a_field_are_enough(rng: np.random.Generator, off: tuple[float, float]):
     observed = in_a_field(rng, *off)
-    assert observed.basis.shape == (6, 3)  # ahead, sideways, the turn
-    assert observed.seen.all()
+    assert observed.weak_basis.shape == (6, 3)  # ahead, sideways, the turn
+    assert observed.is_observed.all()
     assert np.abs(error(observed)[3:5]).max() < 0.15
     assert (np.sqrt(np.diag(observed.covariance(6.0)))[3:5] < 0.3).all()
 
@@ -115,9 +129,9 @@ def test_a_guess_beyond_the_basin_is_led_into_it(rng: np.random.Generator):
 def test_the_way_along_a_bend_is_a_turn(rng: np.random.Generator, radius_m: float):
     """An unknown way along it is an unknown turn: by 10 m on a radius of 60 m, a sixth of a radian."""
     surface = leaning(rng, bend(rng, radius_m, 6000), 0.02)
-    observed = observe(surface, se3.transform(TRUTH, scan(rng, bend(rng, radius_m, 3000))), np.eye(4), SETTINGS)
-    assert not observed.seen.any()
-    turn = observed.along[0, 2] / observed.along[0, 3]
+    observed = observe(surface, se3.transform(TRUTH, scan(rng, bend(rng, radius_m, 3000))), np.eye(4))
+    assert not observed.is_observed.any()
+    turn = observed.weak_tangents[0, 2] / observed.weak_tangents[0, 3]
     assert turn == pytest.approx(1 / radius_m, rel=0.2)
     covariance = observed.covariance(1.0)
     assert covariance[2, 3] / covariance[3, 3] == pytest.approx(1 / radius_m, rel=0.2)
@@ -128,10 +142,10 @@ def test_who_starts_metres_off_is_told_what_the_costs_farther_off_make_likely(rn
     where = rng.uniform(-25, 25, (20, 2))
     surface = leaning(rng, joined(ground(rng, 8000), bushes(rng, where, 60)), 0.03)
     source = scan(rng, joined(ground(rng, 7000), bushes(rng, where, 16)))
-    near = observe(surface, source, off_by(1.6), SETTINGS)
-    far = observe(surface, source, off_by(1.6), SETTINGS, far=True)
+    near = observe(surface, source, off_by(1.6))
+    far = observe(surface, source, off_by(1.6), vague=True)
     assert abs(error(far)[3]) < 0.7 < abs(error(near)[3])
-    if not far.seen.all():
+    if not far.is_observed.all():
         sigma_m = float(np.sqrt(far.covariance(1.0)[3, 3]))
         assert abs(error(far)[3]) < 3 * sigma_m < 10
 
@@ -141,7 +155,7 @@ def test_where_there_is_nothing_to_be_told_far_off_is_no_better(rng: np.random.G
     surface = leaning(rng, ground(rng, 12000), 0.01)
     source = scan(rng, ground(rng, 3000))
     inside = source[np.abs(source).max(axis=1) < 20]
-    observed = observe(surface, inside, off_by(0.5), SETTINGS, far=True)
+    observed = observe(surface, inside, off_by(0.5), vague=True)
     assert len(observed.degenerate) == 3
     assert (np.sqrt(np.diag(observed.covariance(1.0)))[3:5] > 1.5).all()
 
@@ -155,11 +169,11 @@ def test_a_lidars_own_pattern_is_no_sign_that_it_stood_still_beside_the_only_oth
     walls = bend(rng, 1e6, 6000)
     surface, source = Surface(rings(rng, walls), walls[1], 1), rings(rng, walls)
     start = se3.exp(np.array([0.0, 0.0, 0.0, 0.2, 0.0, 0.0]))
-    deceived = observe(surface, source, start, SETTINGS, far=True)
-    observed = observe(surface, source, start, SETTINGS, far=True, alone=np.eye(4))
-    assert deceived.seen.all()
-    assert abs(deceived.found.pose[0, 3]) < 0.05
-    assert not observed.seen.any()
+    deceived = observe(surface, source, start, vague=True)
+    observed = observe(surface, source, start, vague=True, only_scan=np.eye(4))
+    assert deceived.is_observed.all()
+    assert abs(deceived.registration.pose[0, 3]) < 0.05
+    assert not observed.is_observed.any()
     assert np.sqrt(observed.covariance(1.0)[3, 3]) > 1.0
 
 
@@ -168,7 +182,7 @@ def test_where_it_moved_far_from_the_only_other_scan_it_is_seen_by_bushes(rng: n
     surface = leaning(rng, joined(ground(rng, 8000), bushes(rng, where, 60)), 0.03)
     source = scan(rng, joined(ground(rng, 7000), bushes(rng, where, 16)))
     alone = off_by(1.0)
-    assert observe(surface, source, off_by(0.3), SETTINGS, 0.3, alone=alone).seen.all()
+    assert observe(surface, source, off_by(0.3), 0.3, only_scan=alone).is_observed.all()
 
 
 def tree_points(rng: np.random.Generator, where: np.ndarray, points: int) -> np.ndarray:
@@ -193,9 +207,9 @@ def between_trunks(rng: np.random.Generator) -> tuple[Surface, np.ndarray, np.nd
 
 def test_between_trunks_points_know_the_place_to_two_centimetres(rng: np.random.Generator):
     surface, source, points = between_trunks(rng)
-    observed = observe(surface, source, off_by(0.1, -0.1), SETTINGS, 0.1, points=points)
-    assert observed.basis.shape == (6, 3)
-    assert observed.seen.all()
+    observed = observe(surface, source, off_by(0.1, -0.1), 0.1, dense=points)
+    assert observed.weak_basis.shape == (6, 3)
+    assert observed.is_observed.all()
     assert np.abs(error(observed)[3:5]).max() < 0.02
     assert np.abs(error(observed)[2]) < 1e-3
 
@@ -205,9 +219,9 @@ def test_points_that_lead_nowhere_in_particular_change_nothing(rng: np.random.Ge
     surface, source, points = between_trunks(rng)
     start, kernel_m = off_by(0.1, -0.1), 0.1
     anywhere = np.concatenate([points[:7000], rng.uniform([-25, -25, -1], [25, 25, 1], (600, 3))])
-    lost = observe(surface, source, start, SETTINGS, kernel_m, points=anywhere)
-    close = observe(surface, source, start, SETTINGS, kernel_m, points=points)
-    assert lost.seen.all()
+    lost = observe(surface, source, start, kernel_m, dense=anywhere)
+    close = observe(surface, source, start, kernel_m, dense=points)
+    assert lost.is_observed.all()
     assert np.abs(error(lost)[3:5]).max() < 0.1
     sigmas, close_sigmas = (np.sqrt(np.diag(one.covariance(1.0)))[3:5] for one in (lost, close))
     assert (sigmas > 2 * close_sigmas).all()

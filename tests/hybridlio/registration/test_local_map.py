@@ -4,7 +4,7 @@ import small_gicp
 
 from hybridlio.core import se3
 from hybridlio.registration.local_map import LocalMap, LocalMapSettings
-from hybridlio.registration.voxel_map import MOST
+from hybridlio.registration.voxel_map import MAX_POINTS_PER_CELL
 
 SETTINGS = LocalMapSettings(threads=1)
 
@@ -21,19 +21,19 @@ def floor(rng: np.random.Generator, half_m: float = 10.0, height_m: float = -1.7
 def test_an_empty_map_has_no_surface_and_wants_any_scan():
     local_map = LocalMap(SETTINGS)
     assert local_map.surface is None
-    assert local_map.wants(at(0.0))
+    assert local_map.needs_keyframe(at(0.0))
 
 
 def test_a_scan_becomes_a_keyframe_once_it_is_far_enough_or_turned_enough(rng: np.random.Generator):
     local_map = LocalMap(SETTINGS)
     local_map.insert(floor(rng), at(0.0))
-    assert not local_map.wants(at(0.9 * SETTINGS.keyframe_m))
-    assert local_map.wants(at(1.1 * SETTINGS.keyframe_m))
-    assert not local_map.wants(at(0.0, 0.9 * SETTINGS.keyframe_deg))
-    assert local_map.wants(at(0.0, -1.1 * SETTINGS.keyframe_deg))
+    assert not local_map.needs_keyframe(at(0.9 * SETTINGS.keyframe_m))
+    assert local_map.needs_keyframe(at(1.1 * SETTINGS.keyframe_m))
+    assert not local_map.needs_keyframe(at(0.0, 0.9 * SETTINGS.keyframe_deg))
+    assert local_map.needs_keyframe(at(0.0, -1.1 * SETTINGS.keyframe_deg))
     local_map.insert(floor(rng), at(5.0, 90.0))
-    assert not local_map.wants(at(5.0, 90.0))
-    assert local_map.wants(at(0.0))
+    assert not local_map.needs_keyframe(at(5.0, 90.0))
+    assert local_map.needs_keyframe(at(0.0))
 
 
 def test_the_surface_lies_where_the_scans_were_taken(rng: np.random.Generator):
@@ -103,7 +103,7 @@ def test_a_cell_takes_in_ten_points_and_none_beside_another(rng: np.random.Gener
     local_map.insert(again, at(0.0))
     after = local_map.surface.points
     _, counts = np.unique(np.floor(after / SETTINGS.voxel_m), axis=0, return_counts=True)
-    assert counts.max() == MOST
+    assert counts.max() == MAX_POINTS_PER_CELL
     assert len(after) > len(before)  # there was room
     np.testing.assert_array_equal(after[: len(before)], before)
     apart = np.linalg.norm(after[len(before) :, None] - before, axis=2)
@@ -190,18 +190,18 @@ def test_tidying_changes_how_the_surface_is_kept_and_not_what_it_is(rng: np.rand
         points = floor(rng)
         for local_map in (left, tidied):
             local_map.insert(points, at(float(x)))
-        tidied.tidy()
+        tidied.rebuild_if_due()
         assert left.surface is not None
         assert tidied.surface is not None
         rows = [surface.points[np.lexsort(surface.points.T)] for surface in (left.surface, tidied.surface)]
         np.testing.assert_array_equal(*rows)
-        worn.append(left.surface.fresh_share)
-        assert tidied.surface.fresh_share < 0.13
+        worn.append(left.surface.appended_ratio)
+        assert tidied.surface.appended_ratio < 0.13
     assert (np.diff(worn) < 0).any()
     assert max(worn) < 0.3
 
 
 def test_tidying_an_empty_map_does_nothing():
     local_map = LocalMap(SETTINGS)
-    local_map.tidy()
+    local_map.rebuild_if_due()
     assert local_map.surface is None

@@ -84,7 +84,10 @@ def test_a_bush_is_matched_closer_by_its_points_than_by_planes_through_them(rng:
         leaves = bush(rng, 200)
         surface = Surface(leaves, leaning_anywhere(rng, len(leaves)), 1, np.full(len(leaves), THICK))
         source = seen_from(POSE, leaves[::2] + 0.02 * rng.standard_normal((len(leaves[::2]), 3)))
-        both = [register(surface, source, start, settings, 0.1, held, thick_as_points=thick) for thick in (True, False)]
+        both = [
+            register(surface, source, start, settings, 0.1, held, match_thick_as_points=thick)
+            for thick in (True, False)
+        ]
         errors_m.append([np.linalg.norm(se3.log(se3.between(POSE, found.pose))[3:]) for found in both])
     by_points_m, by_planes_m = np.mean(errors_m, axis=0)
     assert by_points_m < 0.02

@@ -3,7 +3,7 @@ import pytest
 
 from hybridlio.core import se3
 from hybridlio.registration.local_map import LocalMap, LocalMapSettings
-from hybridlio.registration.ring_planes import LoosePoints
+from hybridlio.registration.ring_planes import RingPlanes
 
 HEIGHT_M = 1.7
 GRADE = np.radians(2.0)  # of the ground, a slope up ahead
@@ -28,15 +28,15 @@ NORMAL = np.array([-np.sin(GRADE), 0.0, np.cos(GRADE)])
 
 
 def test_a_ring_alone_makes_no_plane():
-    index, planes = LoosePoints().take_in(noisy(ring(-5.0), 0), 1)
+    index, planes = RingPlanes().add_keyframe(noisy(ring(-5.0), 0), 1)
     assert len(index) == len(planes.normals) == len(planes.weights) == 0
 
 
 def test_rings_of_two_keyframes_make_the_grounds_planes():
-    loose = LoosePoints()
-    loose.take_in(noisy(ring(-5.0), 0), 1)
+    loose = RingPlanes()
+    loose.add_keyframe(noisy(ring(-5.0), 0), 1)
     second = noisy(ring(-5.0, 2.0), 1)
-    index, planes = loose.take_in(second, 1)
+    index, planes = loose.add_keyframe(second, 1)
     assert len(index) > 0.8 * len(second)
     off_deg = np.degrees(np.arccos(np.minimum(np.abs(planes.normals @ NORMAL), 1.0)))
     assert np.median(off_deg) < 1.0  # half of the slope; the beam's cone is steeper by seven degrees
@@ -44,31 +44,31 @@ def test_rings_of_two_keyframes_make_the_grounds_planes():
 
 
 def test_the_same_ring_seen_again_from_the_same_place_makes_none():
-    loose = LoosePoints()
+    loose = RingPlanes()
     for seed in range(4):
-        index, _ = loose.take_in(noisy(ring(-5.0), seed), 1)
+        index, _ = loose.add_keyframe(noisy(ring(-5.0), seed), 1)
         assert len(index) == 0
 
 
 def test_rings_too_far_apart_make_none():
-    loose = LoosePoints()
-    loose.take_in(ring(-5.0), 1)
-    assert len(loose.take_in(ring(-5.0, 6.0), 1)[0]) == 0
+    loose = RingPlanes()
+    loose.add_keyframe(ring(-5.0), 1)
+    assert len(loose.add_keyframe(ring(-5.0, 6.0), 1)[0]) == 0
 
 
 @pytest.mark.parametrize(("between", "planes"), [(3, True), (4, False)])
 def test_keyframes_of_long_ago_are_forgotten(between: int, planes: bool):
-    loose = LoosePoints()
-    loose.take_in(ring(-5.0), 1)
+    loose = RingPlanes()
+    loose.add_keyframe(ring(-5.0), 1)
     for k in range(between):
-        loose.take_in(ring(-5.0, 500.0 * (k + 1)), 1)
-    assert bool(len(loose.take_in(ring(-5.0, 2.0), 1)[0])) == planes
+        loose.add_keyframe(ring(-5.0, 500.0 * (k + 1)), 1)
+    assert bool(len(loose.add_keyframe(ring(-5.0, 2.0), 1)[0])) == planes
 
 
 def test_few_points_or_none_are_no_error():
-    loose = LoosePoints()
-    assert len(loose.take_in(np.empty((0, 3)), 1)[0]) == 0
-    assert len(loose.take_in(ring(-5.0)[:3], 1)[0]) == 0
+    loose = RingPlanes()
+    assert len(loose.add_keyframe(np.empty((0, 3)), 1)[0]) == 0
+    assert len(loose.add_keyframe(ring(-5.0)[:3], 1)[0]) == 0
 
 
 def test_a_sparse_sensors_map_has_ground_where_one_scan_has_only_rings():

@@ -2,7 +2,7 @@ import numpy as np
 from rooms import FLOOR, ROOM, scene, seen_from, wall
 
 from hybridlio.core import se3
-from hybridlio.registration.surface import Matches, Neighbours, Surface
+from hybridlio.registration.surface import Neighbours, PlaneMatches, Surface
 
 MOTION = se3.exp(np.array([0.01, -0.02, 0.05, 0.3, -0.2, 0.1]))
 
@@ -28,7 +28,7 @@ def test_gradient_and_hessian_are_those_of_the_weighted_cost(rng: np.random.Gene
     # Gauss-Newton leaves out the residuals' curvature: put the points on their planes and there is none
     normals = matches.planes[:, :3]
     offsets = np.einsum("ij,ij->i", se3.transform(pose, matches.source), normals)
-    flat = Matches.of(pose, matches.source, np.column_stack([normals, offsets, matches.planes[:, 4]]))
+    flat = PlaneMatches.linearised(pose, matches.source, np.column_stack([normals, offsets, matches.planes[:, 4]]))
     exact = flat.system(0.1)
 
     def flat_cost(xi: np.ndarray) -> float:
@@ -65,7 +65,7 @@ def test_along_a_small_way_the_system_is_as_good_as_that_made_anew_at_its_end(rn
     source = seen_from(MOTION, scene(rng, ROOM, 60)[0] + 0.05 * rng.standard_normal((300, 3)))
     matches, way = Neighbours(surface, source, 1).matches(MOTION, 1.0), np.array([1, -1, 1, 5, 5, -5]) / 1e3
     along = matches.system(0.1, way)
-    anew = Matches.of(MOTION @ se3.exp(way), matches.source, matches.planes).system(0.1)
+    anew = PlaneMatches.linearised(MOTION @ se3.exp(way), matches.source, matches.planes).system(0.1)
     np.testing.assert_allclose(along.distances, anew.distances, atol=2e-5)
     np.testing.assert_allclose(along.gradient, anew.gradient, atol=2e-3 * np.abs(anew.gradient).max())
 

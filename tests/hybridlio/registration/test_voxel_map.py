@@ -29,10 +29,10 @@ def test_the_table_counts_like_a_dictionary(rng: np.random.Generator):
         for key, more in zip(keys.tolist(), added.tolist(), strict=True):
             if key in held or more:
                 held[key], hit[key] = held.get(key, 0) + more, time
-        table.hit(keys, added, time)
+        table.record_hits(keys, added, time)
         if time % 7 == 6:
-            table.forget(time - 3)
+            table.drop_before(time - 3)
             held = {key: count for key, count in held.items() if hit[key] >= time - 3}
         asked = np.arange(-5, 70)
-        np.testing.assert_array_equal(table.held(asked), [held.get(key, 0) for key in asked.tolist()])
-        np.testing.assert_array_equal(table.has(asked), [key in held for key in asked.tolist()])
+        np.testing.assert_array_equal(table.counts(asked), [held.get(key, 0) for key in asked.tolist()])
+        np.testing.assert_array_equal(table.contains(asked), [key in held for key in asked.tolist()])
