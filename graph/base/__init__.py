@@ -1,1 +1,1 @@
-"""Thin layers over GTSAM: noise models, iSAM2, preintegration, marginals."""
+"""Thin layers over GTSAM: noise models, robust weights, iSAM2, preintegration, marginal covariances."""

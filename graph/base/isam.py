@@ -1,4 +1,4 @@
-"""iSAM2 as hybridlio uses it (Kaess et al., "iSAM2: Incremental Smoothing and Mapping", IJRR 2012)."""
+"""Settings of iSAM2 (Kaess et al., "iSAM2: Incremental Smoothing and Mapping Using the Bayes Tree", IJRR 2012)."""
 
 from __future__ import annotations
 
@@ -9,54 +9,58 @@ import numpy as np
 
 from hybridlio.core.arrays import Array
 
-# A change of the newest pose hardly moves the oldest: below this change (rad, m, m/s) it is not carried on to older
-# variables, which would make each update cost as much as the run is long. The newest are always solved in full.
+# Changes below this (rad, m, m/s) are not propagated from the newest variables to older ones (the paper's wildfire
+# threshold). Propagating all of them would make each update as expensive as the run is long. The variables that an
+# update eliminates, the newest ones, are always solved in full, so online estimates do not depend on the value.
 _WILDFIRE_THRESHOLD = 1.0
-_EAGER = 1e-3
-# Far from the origin a little turn of the whole path moves its newest part by metres, all alike, which makes no other
-# factors: only turns do, and moves against each other.
-_RELINEARISE = {
+# Threshold of the solver that relinearises everything: GTSAM's default wildfire threshold, far below sensor noise.
+_EXACT_THRESHOLD = 1e-3
+# Changes above which a variable is relinearised, by the letter of its key. Position thresholds are wide because a small
+# rotation of the whole path moves its far end by metres without changing any relative pose; factors become nonlinear
+# by rotations only. A rotation error of 0.02 rad costs 0.02²/2 = 2e-4 of a step's length.
+_RELINEARISATION_THRESHOLDS = {
     "x": np.r_[np.full(3, 0.02), np.full(3, 5.0)],  # pose: rad, m
-    "m": np.r_[np.full(3, 0.02), np.full(3, 5.0)],  # pose on scan matching's own path
-    "v": np.full(3, 1.0),  # velocity, m/s
-    "b": np.r_[np.full(3, 0.1), np.full(3, 0.01)],  # biases: m/s², rad/s
-    "g": np.full(3, 0.1),  # gravity, m/s²
+    "m": np.r_[np.full(3, 0.02), np.full(3, 5.0)],  # pose on scan matching's own path: rad, m
+    "v": np.full(3, 1.0),  # velocity, m/s: enters linearly
+    "b": np.r_[np.full(3, 0.1), np.full(3, 0.01)],  # biases, m/s² and rad/s: preintegration is corrected to first order
+    "g": np.full(3, 0.1),  # gravity, m/s²: 0.01 rad of tilt
     "e": np.r_[np.full(3, 0.02), np.full(3, 1.0)],  # world in the frame of GPS fixes: rad, m
-    **{kind: np.full(3, 1.0) for kind in "awp"},  # antenna at a GPS fix, m
-    "t": np.full(1, 0.1),  # time between the clocks of fixes and scans, s
+    **{kind: np.full(3, 1.0) for kind in "awp"},  # antenna at a GPS fix, m: enters linearly
+    "t": np.full(1, 0.1),  # clock shift of the fixes, s: 1 cm at an acceleration of 2 m/s²
 }
 
 
-def incremental_solver(forgets: bool = False) -> gtsam.ISAM2:
-    """An empty iSAM2 for graphs of poses ``x`` and ``m``, velocities ``v``, biases ``b``, gravity ``g`` …
+def incremental_solver(removes_factors: bool = False) -> gtsam.ISAM2:
+    """Return an empty iSAM2 for the variables of a run (keys as in :mod:`hybridlio.graph.run.factors`).
 
     Args:
-        forgets: factors will leave, and new ones take their slots: looking for a free one goes through all slots.
+        removes_factors: reuse the slots of removed factors. The search for a free slot visits every slot, so this only
+            pays where factors are removed.
     """
-    params = make_isam_params(_RELINEARISE, _WILDFIRE_THRESHOLD)
-    params.findUnusedFactorSlots = forgets
+    params = make_isam_params(_RELINEARISATION_THRESHOLDS, _WILDFIRE_THRESHOLD)
+    params.findUnusedFactorSlots = removes_factors
     return gtsam.ISAM2(params)
 
 
-def eager_solver() -> gtsam.ISAM2:
-    """As :func:`incremental_solver`, but every update linearises all that moves anew: for a graph of few scans."""
-    everything = {kind: np.full_like(change, _EAGER) for kind, change in _RELINEARISE.items()}
-    params = make_isam_params(everything, _EAGER)
+def relinearising_solver() -> gtsam.ISAM2:
+    """Return an empty iSAM2 that relinearises every changed variable at every update; for graphs of few scans."""
+    thresholds = {kind: np.full_like(change, _EXACT_THRESHOLD) for kind, change in _RELINEARISATION_THRESHOLDS.items()}
+    params = make_isam_params(thresholds, _EXACT_THRESHOLD)
     params.relinearizeSkip = 1
     return gtsam.ISAM2(params)
 
 
 def make_isam_params(relinearise: Mapping[str, Array], wildfire_threshold: float) -> gtsam.ISAM2Params:
-    """Parameters of iSAM2 as used everywhere here.
+    """Return the parameters that every iSAM2 of this package shares.
 
     Args:
-        relinearise: changes beyond which a variable is linearised anew, by the letter of its name.
-        wildfire_threshold: changes below it are not carried on to older variables.
+        relinearise: changes above which a variable is relinearised, by the letter of its key.
+        wildfire_threshold: changes below it are not propagated to older variables.
     """
     params = gtsam.ISAM2Params()
-    params.setFactorization("QR")  # Cholesky finds long straight chains indeterminate
+    params.setFactorization("QR")  # Cholesky, the default, finds long straight chains indeterminate
     params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(wildfire_threshold))
-    params.relinearizeSkip = 10
+    params.relinearizeSkip = 10  # GTSAM's default: check for relinearisation at every tenth update
     thresholds = gtsam.ISAM2ThresholdMap()
     for kind, change in relinearise.items():
         thresholds.insert((kind, change))
@@ -64,6 +68,6 @@ def make_isam_params(relinearise: Mapping[str, Array], wildfire_threshold: float
     return params
 
 
-def reason(error: RuntimeError) -> str:
-    """What GTSAM says went wrong, and at which variable, on one line; the essay that follows it left out."""
+def gtsam_message(error: RuntimeError) -> str:
+    """Return the first paragraph of GTSAM's message on one line: what failed, and at which variable."""
     return " ".join(str(error).strip().split("\n\n")[0].split())

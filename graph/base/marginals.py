@@ -1,4 +1,4 @@
-"""How sure a solved run is: marginal covariances of its poses, and of the steps between them."""
+"""Marginal covariances of a solved run: of its poses, and of the steps between consecutive poses."""
 
 from __future__ import annotations
 
@@ -10,33 +10,35 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
 from hybridlio.core.progress import Progress
-from hybridlio.graph.base.isam import incremental_solver, reason
+from hybridlio.graph.base.isam import gtsam_message, incremental_solver
 
 
 def bayes_tree(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.ISAM2:
-    """The solved graph as one that tells marginal covariances; GTSAM's own ``Marginals`` fails on long chains.
+    """Return the solved graph as an iSAM2, whose Bayes tree gives marginal covariances.
+
+    ``gtsam.Marginals`` would give the same, but it uses Cholesky, which fails on long straight chains.
 
     Raises:
-        GraphError: a variable is not determined; names it.
+        GraphError: a variable is not determined; the message names it.
     """
     isam = incremental_solver()
     try:
         isam.update(graph, values)
     except RuntimeError as error:
-        raise GraphError(f"smoothing: the graph does not fix every variable: {reason(error)}") from error
+        raise GraphError(f"smoothing: the graph does not determine every variable: {gtsam_message(error)}") from error
     return isam
 
 
 def pose_covariances(isam: gtsam.ISAM2, poses: Array, progress: Progress) -> tuple[Array, Array]:
-    """Covariances ``(N, 6, 6)`` of the poses ``x``, and ``(N-1, 6, 6)`` of the steps between consecutive ones.
+    """Return covariances ``(N, 6, 6)`` of the poses ``x`` and ``(N-1, 6, 6)`` of the steps between consecutive poses.
 
-    World is the first pose, so that the poses' are relative to it without more ado. A step's follow from the joint
-    covariance of both its poses: most of what is unsure of them is common to both.
+    World is the first pose, so the marginal covariances of poses are relative to it already. A step's covariance needs
+    the joint covariance of its two poses, whose errors are mostly common.
 
     Args:
         isam: the solved graph.
-        poses: ``(N, 4, 4)``, as solved.
-        progress: called before each pose.
+        poses: ``(N, 4, 4)`` solved poses.
+        progress: called before each pose, and at the end.
     """
     count = len(poses)
     absolute, steps = np.empty((count, 6, 6)), np.empty((count - 1, 6, 6))
@@ -52,7 +54,10 @@ def pose_covariances(isam: gtsam.ISAM2, poses: Array, progress: Progress) -> tup
 
 
 def step_covariance(joint: Array, step: Array) -> Array:
-    """Covariance ``(6, 6)`` of a step ``(4, 4)`` between two poses of joint covariance ``(12, 12)``."""
+    """Return the covariance ``(6, 6)`` of a step ``T_i_j`` from the joint covariance ``(12, 12)`` of poses i and j.
+
+    With right perturbations ``ξ_i`` and ``ξ_j`` the step is perturbed by ``ξ_j − Ad(T_i_j⁻¹) ξ_i``.
+    """
     J = np.hstack([-se3.adjoint(se3.inverse(step)), np.eye(6)])
     return np.asarray(J @ joint @ J.T)
 

@@ -1,4 +1,7 @@
-"""IMU preintegration (Forster et al., "On-Manifold Preintegration", TRO 2017) by GTSAM."""
+"""IMU preintegration by GTSAM.
+
+Forster, Carlone, Dellaert, Scaramuzza, "On-Manifold Preintegration for Real-Time Visual-Inertial Odometry", TRO 2017.
+"""
 
 from __future__ import annotations
 
@@ -17,12 +20,17 @@ from hybridlio.core.motion_limits import (
 )
 from hybridlio.core.sensors import NS_PER_S, ImuNoise, ImuSamples
 
+_INTEGRATION_VARIANCE = 1e-8  # m²/s: GTSAM needs it positive; 0.1 mm per √s is far below what the accelerometer adds
+_COVER_SLACK_NS = NS_PER_S // 1000  # stamps are often rounded to milliseconds
+
 
 def sampling_noise(noise: ImuNoise, gap_s: float) -> tuple[float, float]:
-    """White-noise densities ``(accel, gyro)`` of an IMU whose longest time without a sample is ``gap_s``.
+    """Return white-noise densities ``(accel, gyro)`` of an IMU whose longest time between two samples is ``gap_s``.
 
-    Adds to the sensor's own noise the motion that samples so far apart cannot show, growing with the gap up to the
-    accelerations and rates a vehicle reaches; constant over the gap, so its density is the deviation times √gap.
+    To the sensor's own noise it adds the motion that samples so far apart cannot show. An acceleration that leaves the
+    line between two samples at the vehicle's typical jerk J, and returns half-way, differs from it by J·gap/4 on
+    average; it never differs by more than a vehicle can accelerate. The same holds for rates. A deviation that is
+    constant over the gap changes the speed by deviation·gap, as white noise of density deviation·√gap does.
     """
     accel = min(JERK_SIGMA_M_S3 * gap_s / 4, LARGEST_ACCELERATION_M_S2) * np.sqrt(gap_s)
     gyro = min(ANGULAR_ACCELERATION_SIGMA_RAD_S2 * gap_s / 4, LARGEST_RATE_RAD_S) * np.sqrt(gap_s)
@@ -34,21 +42,21 @@ def _params(noise: ImuNoise, gap_s: float, gravity: Array) -> gtsam.Preintegrati
     params = gtsam.PreintegrationCombinedParams(gravity)
     params.setAccelerometerCovariance(np.eye(3) * accel**2)
     params.setGyroscopeCovariance(np.eye(3) * gyro**2)
-    params.setIntegrationCovariance(np.eye(3) * 1e-8)  # GTSAM needs it positive; 0.1 mm per root second
+    params.setIntegrationCovariance(np.eye(3) * _INTEGRATION_VARIANCE)
     params.setBiasAccCovariance(np.eye(3) * noise.accel_walk_m_s3_sqrt_hz**2)
     params.setBiasOmegaCovariance(np.eye(3) * noise.gyro_walk_rad_s2_sqrt_hz**2)
     return params
 
 
-def bias_of(state: State) -> gtsam.imuBias.ConstantBias:
-    """The state's biases as GTSAM has them."""
+def gtsam_bias(state: State) -> gtsam.imuBias.ConstantBias:
+    """Return the state's biases as GTSAM's type."""
     return gtsam.imuBias.ConstantBias(state.accel_bias_m_s2, state.gyro_bias_rad_s)
 
 
 def preintegrate(imu: ImuSamples, state: State, noise: ImuNoise) -> gtsam.PreintegratedCombinedMeasurements:
-    """Sum up the samples from the state's stamp to the last, with the state's biases and gravity.
+    """Preintegrate the samples from the state's stamp to the last one, with the state's biases and gravity.
 
-    Each step between two samples takes their mean (trapezoidal rule). The noise grows with the longest step
+    The trapezoidal rule: each step between two samples takes their mean. The noise grows with the longest step
     (:func:`sampling_noise`).
 
     Raises:
@@ -58,9 +66,10 @@ def preintegrate(imu: ImuSamples, state: State, noise: ImuNoise) -> gtsam.Preint
         raise DataError(f"preintegration: {len(imu)} IMU samples after {state.stamp_ns} ns, at least 2 are needed")
     steps_s = np.diff(imu.stamps_ns) / NS_PER_S
     params = _params(noise, float(steps_s.max()), state.gravity_m_s2)
-    pim = gtsam.PreintegratedCombinedMeasurements(params, bias_of(state))
+    pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam_bias(state))
     gyro = (imu.gyro_rad_s[1:] + imu.gyro_rad_s[:-1]) / 2
-    # GTSAM takes the force in the frame at the step's start, from where the second sample's frame has turned
+    # GTSAM takes the specific force in the sensor's frame at the start of the step (Euler integration); the second
+    # sample is measured at its end, so it is rotated back by the turn in between before the mean is taken
     turned = se3.so3_exp((gyro - state.gyro_bias_rad_s) * steps_s[:, None])
     accel = (imu.accel_m_s2[:-1] + (turned @ imu.accel_m_s2[1:, :, None])[..., 0]) / 2
     for step_s, a, w in zip(steps_s, accel, gyro, strict=True):
@@ -69,25 +78,28 @@ def preintegrate(imu: ImuSamples, state: State, noise: ImuNoise) -> gtsam.Preint
 
 
 def covers(imu: ImuSamples, start_ns: int, end_ns: int) -> bool:
-    """Whether the samples reach from ``start_ns`` to ``end_ns`` (within a millisecond), so that they say it all."""
-    slack = NS_PER_S // 1000
-    return len(imu) >= 2 and imu.stamps_ns[0] <= start_ns + slack and imu.stamps_ns[-1] >= end_ns - slack
+    """Whether the samples reach from ``start_ns`` to ``end_ns``, within a millisecond."""
+    if len(imu) < 2:
+        return False
+    return bool(imu.stamps_ns[0] <= start_ns + _COVER_SLACK_NS and imu.stamps_ns[-1] >= end_ns - _COVER_SLACK_NS)
 
 
 def predict_step(pim: gtsam.PreintegratedCombinedMeasurements, state: State) -> tuple[Array, Array]:
-    """The IMU's pose after the samples, in its pose before them, with covariance ``(6, 6)``.
+    """Return the IMU's pose ``(4, 4)`` after the samples in its pose before them, with covariance ``(6, 6)``.
 
-    Carries the state's uncertainty (velocity, tilt, biases, gravity) and the samples' noise.
+    The covariance propagates the state's (velocity, tilt, biases, gravity) and the noise of the samples.
     """
     now = gtsam.NavState(gtsam.Pose3(state.T_world_imu), state.velocity_m_s)
     by_state, by_bias = np.zeros((9, 9), order="F"), np.zeros((9, 6), order="F")
-    then = pim.predict(now, bias_of(state), by_state, by_bias)
+    then = pim.predict(now, gtsam_bias(state), by_state, by_bias)
     step = se3.between(state.T_world_imu, then.pose().matrix())
     R_world_imu, R_step = state.T_world_imu[:3, :3], step[:3, :3]
-    # GTSAM perturbs a NavState's velocity in the body's frame; the state's covariance is of the velocity in world
+    # GTSAM perturbs a NavState's velocity in the body frame; the state's covariance is of the velocity in world
     by_state[:, 6:] = by_state[:, 6:] @ R_world_imu.T
+    # step = now⁻¹·then: its perturbation is that of the pose after, less Ad(step⁻¹) times that of the pose before
     by_pose = by_state[:6, :6] - se3.adjoint(se3.inverse(step))
     J = np.hstack([by_pose, by_state[:6, 6:], by_bias[:6]])
+    # gravity g moves the end by g·dt²/2 in world; a right perturbation's translation is in the frame of the end
     half_dt2 = pim.deltaTij() ** 2 / 2
     by_gravity = np.vstack([np.zeros((3, 3)), half_dt2 * (R_world_imu @ R_step).T])
     noise = pim.preintMeasCov()[:6, :6]

@@ -1,1 +1,1 @@
-"""The odometry run's own graph: factors, backends, smoothing."""
+"""The factor graph of an odometry run: its factors, the online backends and offline smoothing."""

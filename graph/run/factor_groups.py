@@ -1,7 +1,7 @@
 """Groups of factors that smoothing adds to a run's own steps, such as GPS fixes or loop closures.
 
 A group adds factors on the scans' variables (keys as in :mod:`hybridlio.graph.run.factors`) and variables of its own.
-It returns measurements that may be wrong as :class:`Doubtful`, so that one module makes all of them robust.
+It returns measurements that may be outliers as :class:`PossibleOutlier`, so that one module makes all of them robust.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from hybridlio.graph.base import noise
 
 
 @dataclass(frozen=True, eq=False)
-class Doubtful:
-    """A measurement that may be wrong.
+class PossibleOutlier:
+    """A measurement that may be an outlier.
 
     Attributes:
-        make: makes the factor, given its noise model.
-        covariance: ``(d, d)`` of the measurement if it is right.
+        make: makes the factor from its noise model.
+        covariance: ``(d, d)`` of the measurement if it is correct.
         name: for messages, such as ``loop 12-480``.
     """
 
@@ -33,7 +33,7 @@ class Doubtful:
     name: str
 
     def factor(self, weight: float = 1.0) -> gtsam.NonlinearFactor:
-        """The factor at a weight in (0, 1]."""
+        """Return the factor at a weight in (0, 1]."""
         return self.make(noise.gaussian(self.covariance / weight, self.name))
 
 
@@ -42,26 +42,26 @@ class GroupFactors:
     """What a group adds to the graph.
 
     Attributes:
-        sure: factors that are taken as they are.
-        doubtful: measurements that may be wrong.
-        values: first values of the group's own variables, under keys that no other group uses.
+        trusted: factors that are taken as they are.
+        possible_outliers: measurements that the robust method decides on.
+        values: initial values of the group's own variables, under keys that no other group uses.
     """
 
-    sure: list[gtsam.NonlinearFactor] = field(default_factory=list)
-    doubtful: list[Doubtful] = field(default_factory=list)
+    trusted: list[gtsam.NonlinearFactor] = field(default_factory=list)
+    possible_outliers: list[PossibleOutlier] = field(default_factory=list)
     values: gtsam.Values = field(default_factory=gtsam.Values)
 
 
 @dataclass(frozen=True, eq=False)
-class GroupAnswer:
+class GroupSolution:
     """The solved graph as a group sees it.
 
     Attributes:
         values: of all variables.
         states: of all scans.
-        weights: ``(M,)`` what counts of each doubtful measurement: 1 in full, 0 not at all.
-        chi2: ``(M,)`` their squared residuals in standard deviations.
-        covariance: joint marginal covariance of variables, by keys, in their order.
+        weights: ``(M,)`` weight of each possible outlier: 1 in full, 0 rejected.
+        chi2: ``(M,)`` their squared whitened residuals.
+        covariance: returns the joint marginal covariance of variables, in the order of the given keys.
     """
 
     values: gtsam.Values
@@ -72,25 +72,25 @@ class GroupAnswer:
 
 
 class FactorGroup(Protocol):
-    """Measurements of a run's poses from elsewhere."""
+    """Further measurements of a run's poses."""
 
     name: str
-    robust: str | None  # how to treat what may be wrong, by default: a kernel's name, ``gnc``, or None: as if right
+    robust: str | None  # default robust method: a kernel's name or ``gnc``; None takes all measurements for correct
 
-    def build(self, states: Sequence[State], before: gtsam.Values | None) -> GroupFactors:
-        """Factors and variables.
+    def build(self, states: Sequence[State], previous: gtsam.Values | None) -> GroupFactors:
+        """Return factors and variables.
 
         Args:
-            states: of all scans, online's or the last round's.
-            before: all variables as the last round found them; None in the first round.
+            states: of all scans: the online estimate, or the previous round's solution.
+            previous: all variables as the previous round solved them; None in the first round.
         """
         ...
 
-    def read(self, answer: GroupAnswer) -> Any:
-        """What the group found, for the user."""
+    def read(self, solution: GroupSolution) -> Any:
+        """Return the group's result for the user; it becomes an entry of ``Smoothed.found``."""
         ...
 
 
-def chi2_of(doubtful: Sequence[Doubtful], values: gtsam.Values) -> Array:
-    """``(M,)`` squared residuals in standard deviations."""
-    return np.array([2 * measurement.factor().error(values) for measurement in doubtful])
+def squared_residuals(measurements: Sequence[PossibleOutlier], values: gtsam.Values) -> Array:
+    """Return the squared whitened residuals ``(M,)``; χ² distributed for correct measurements."""
+    return np.array([2 * measurement.factor().error(values) for measurement in measurements])

@@ -1,10 +1,9 @@
-"""The factors of one odometry step, the same for the online and the offline graph.
+"""The factors of one odometry step, the same online and in offline smoothing.
 
-Keys: ``x`` pose of the IMU, ``v`` velocity, ``b`` biases, ``g`` gravity, ``m`` the pose on the path that scan matching
-has made for itself, each with the scan's number. World is the
-IMU's first pose, so that a marginal covariance is relative to the start without more ado, and gravity is what is
-estimated. It is one vector for all scans, written as a chain of nearly equal ones: a key shared by every factor would
-make each update cost as much as the run is long.
+Keys, each with the scan's number: ``x`` pose of the IMU, ``v`` velocity, ``b`` biases, ``g`` gravity, ``m`` pose on the
+map path (:func:`map_path_factors`). World is the IMU's first pose, so that marginal covariances of poses are relative
+to the start, and gravity is estimated in that frame. Gravity is one vector for all scans, but modelled as a chain of
+nearly equal ones: a key that every factor shares would make each iSAM2 update as expensive as the run is long.
 """
 
 from __future__ import annotations
@@ -19,18 +18,23 @@ from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.motion_limits import BRIDGED_ACCELERATION_SIGMA_M_S2, GRAVITY_M_S2, GRAVITY_MAGNITUDE_SIGMA_M_S2
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.graph.base import noise
-from hybridlio.graph.run.scan_numbers import Scans
+from hybridlio.graph.run.scan_numbers import ScanNumbers
 
 Factors = list[gtsam.NonlinearFactor]
 
-VARIABLES = (X, V, B, G, M)  # what a scan may have
+VARIABLES = (X, V, B, G, M)  # that a scan may have
 
-_GAUGE_SIGMA = 1e-6  # the first pose defines world
-_GRAVITY_CHAIN_SIGMA_M_S2 = 1e-6  # per scan; 0.1 mm/s² after 10,000 scans
+# Tight enough to define the origin (a thousandth of the best registration), loose enough for double precision.
+_GAUGE_SIGMA = 1e-6
+_GRAVITY_CHAIN_SIGMA_M_S2 = 1e-6  # per scan; 0.1 mm/s² after 10,000 scans, so gravity stays one vector
+# Random walk of the biases over a gap in the samples, m/s² and rad/s per √s: 30 and 50 times the defaults of ImuNoise,
+# because nothing is known about the sensor during a gap.
+_BRIDGED_BIAS_SIGMAS = np.r_[np.full(3, 1e-2), np.full(3, 1e-3)]
+_INDEX_MASK = 0xFFFFFF  # of a GTSAM key: the scan's number, without the letter
 
 
 def start_factors(state: State) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """Priors and values of the first scan's variables, from its state."""
+    """Return priors and values of the first scan's variables, from its state."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), noise.sigmas(np.full(6, _GAUGE_SIGMA))))
     insert_state(values, 0, state)
@@ -41,15 +45,16 @@ def start_factors(state: State) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Value
         graph.add(gtsam.PriorFactorConstantBias(B(0), bias, noise.gaussian(state.covariance[9:, 9:], "start biases")))
         gravity_model = noise.gaussian(state.gravity_covariance, "start gravity")
         graph.add(gtsam.PriorFactorPoint3(G(0), state.gravity_m_s2, gravity_model))
-        # gravity lies on a sphere, which no Gaussian around a direction that may be 0.3 rad off describes; the first
-        # pose is the origin, so that gravity's distance from it is its magnitude
+        # Gravity lies on a sphere. A Gaussian that is tight along the initial direction describes the sphere badly when
+        # that direction is 0.3 rad off (a start in a bend), so the magnitude is a factor of its own: the first pose is
+        # the origin, and gravity's distance from the origin is its magnitude.
         magnitude = noise.sigmas(np.array([GRAVITY_MAGNITUDE_SIGMA_M_S2]))
         graph.add(gtsam.RangeFactor3D(X(0), G(0), GRAVITY_M_S2, magnitude))
     return graph, values
 
 
 def insert_state(values: gtsam.Values, k: int, state: State) -> None:
-    """Put the state's variables under scan ``k``'s keys."""
+    """Insert the state's variables under scan ``k``'s keys."""
     values.insert(X(k), gtsam.Pose3(state.T_world_imu))
     if state.has_imu:
         values.insert(V(k), state.velocity_m_s)
@@ -60,71 +65,85 @@ def insert_state(values: gtsam.Values, k: int, state: State) -> None:
 def between_factor(
     i: int, j: int, relative: RelativePose, covariance: Array, T_imu_lidar: Array
 ) -> gtsam.BetweenFactorPose3:
-    """The relative pose between two keys' IMU poses, given with its covariance between lidar poses."""
+    """Return a between-factor of two IMU poses from a relative pose of the lidar.
+
+    Args:
+        i, j: keys of the poses.
+        relative: ``T_i_j`` of the lidar.
+        covariance: ``(6, 6)`` of it, of a right perturbation in the lidar's frame.
+        T_imu_lidar: ``(4, 4)``.
+    """
     pose = T_imu_lidar @ relative.pose @ se3.inverse(T_imu_lidar)
-    model = noise.gaussian(se3.rotate_covariance(covariance, T_imu_lidar), f"{relative.source} to scan {j & 0xFFFFFF}")
+    name = f"{relative.source} to scan {j & _INDEX_MASK}"
+    model = noise.gaussian(se3.rotate_covariance(covariance, T_imu_lidar), name)
     return gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(pose), model)
 
 
-def map_factors(i: int, relative: RelativePose, drift: Array, T_imu_lidar: Array, fresh: bool) -> Factors:
-    """The step from scan ``i`` of a source that matches to a map of its own.
+def map_path_factors(i: int, relative: RelativePose, drift: Array, T_imu_lidar: Array, starts_path: bool) -> Factors:
+    """Return the factors of the step from scan ``i``, of a source that registers scans to a map of its own.
 
-    A scan's scatter about the map is not carried on: the next step takes it back, so that consecutive steps' errors
-    are opposed and a chain of independent factors would claim far too much. Instead the source's path has poses of its
-    own: along it only the map's drift adds up, and each scan's pose lies beside it by the scatter.
+    A scan's scatter about the map does not add up: the next step takes it back, so errors of consecutive steps are
+    anticorrelated, and a chain of independent factors would claim far too large covariances. Instead the source's path
+    through its map has poses ``m`` of its own: along it only the map's drift adds up, and each scan's pose ``x`` lies
+    beside it by the scatter.
 
     Args:
         i: the scan before.
-        relative: the step; of a failed one, the path goes on where the source put it, but says nothing of the scan.
-        drift: ``(6, 6)``, what of its covariance adds up.
-        T_imu_lidar: the extrinsics.
-        fresh: whether the path begins at scan ``i``.
+        relative: the step; a failed one continues the path but does not constrain the scan's pose.
+        drift: ``(6, 6)`` part of its covariance that adds up.
+        T_imu_lidar: ``(4, 4)``.
+        starts_path: whether the path begins at scan ``i``.
     """
     graph: Factors = [between_factor(M(i), M(i + 1), relative, drift, T_imu_lidar)]
-    if fresh:
+    if starts_path:
         graph.append(gtsam.BetweenFactorPose3(M(i), X(i), gtsam.Pose3(), noise.sigmas(np.full(6, _GAUGE_SIGMA))))
     if relative.ok:
+        # a step's scatter is that of both its scans, half each
         scatter = se3.rotate_covariance((relative.covariance - drift) / 2, T_imu_lidar)
         model = noise.gaussian(scatter, f"{relative.source}, scatter of scan {i + 1}")
         graph.append(gtsam.BetweenFactorPose3(M(i + 1), X(i + 1), gtsam.Pose3(), model))
     return graph
 
 
-def earlier_scan_factors(k: int, relative: RelativePose, scans: Scans, T_imu_lidar: Array) -> Factors:
-    """Scan ``k`` relative to earlier scans than the last, as far as they are still in the graph.
+def earlier_scan_factors(k: int, relative: RelativePose, scans: ScanNumbers, T_imu_lidar: Array) -> Factors:
+    """Return factors of scan ``k``'s poses relative to earlier scans than the last, if these are in the graph.
 
-    All of a scan's relative poses share its noise, be it the newer one or the keyframe. Where the step says how much
-    of its covariance is such scatter (``drift`` is the rest), they join the poses on the source's own path, beside
-    which the scan's pose lies by the scatter: it is then counted once (:func:`map_factors`). Else they are taken for
-    independent of each other.
+    All relative poses of a scan share that scan's noise. If the step tells this scatter apart (``drift`` is the rest),
+    the factors join poses on the map path, beside which the scan's pose lies by the scatter, so it counts once
+    (:func:`map_path_factors`). Otherwise they are taken as independent of each other.
     """
     on_path = relative.drift is not None and relative.ok
     graph: Factors = []
-    for keyframe in relative.earlier_scans:
-        j = scans.number(keyframe.stamp_ns)
+    for earlier in relative.earlier_scans:
+        j = scans.number(earlier.stamp_ns)
         if j is not None:
-            before = M(j) if on_path and scans.is_on_path(j) else X(j)
-            pose = RelativePose(keyframe.pose, keyframe.covariance, relative.source)
-            graph.append(between_factor(before, M(k) if on_path else X(k), pose, pose.covariance, T_imu_lidar))
+            start = M(j) if on_path and scans.is_on_map_path(j) else X(j)
+            pose = RelativePose(earlier.pose, earlier.covariance, relative.source)
+            graph.append(between_factor(start, M(k) if on_path else X(k), pose, pose.covariance, T_imu_lidar))
     return graph
 
 
 def insert_step(
-    values: gtsam.Values, i: int, before: State, after: State, relative: RelativePose, scans: Scans
+    values: gtsam.Values, i: int, before: State, after: State, relative: RelativePose, scans: ScanNumbers
 ) -> None:
-    """Put the variables of the scan after ``i`` in; ``before`` and ``after`` are the states that the two start from.
+    """Insert initial values for the step from scan ``i``: the next scan's variables, and poses on the map path.
 
-    The poses of :func:`map_factors` start beside the IMU's.
+    Args:
+        values: to insert into.
+        i: the scan before.
+        before, after: states that the two scans' poses on the map path start from.
+        relative: the step.
+        scans: those in the graph, up to ``i``.
     """
     insert_state(values, i + 1, after)
     if relative.drift is not None:
-        if not scans.is_on_path(i):
+        if not scans.is_on_map_path(i):
             values.insert(M(i), gtsam.Pose3(before.T_world_imu))
         values.insert(M(i + 1), gtsam.Pose3(after.T_world_imu))
 
 
 def imu_factors(i: int, j: int, pim: gtsam.PreintegratedCombinedMeasurements) -> Factors:
-    """The samples between scans i and j as one factor, and gravity carried on."""
+    """Return the preintegrated samples between scans ``i`` and ``j`` as a factor, and gravity's link of the chain."""
     return [
         gtsam.CombinedImuFactorWithGravityVector(X(i), V(i), X(j), V(j), B(i), B(j), G(i), pim),
         _same_gravity(i, j),
@@ -132,16 +151,15 @@ def imu_factors(i: int, j: int, pim: gtsam.PreintegratedCombinedMeasurements) ->
 
 
 def bridge_factors(i: int, j: int, dt_s: float) -> Factors:
-    """In place of IMU samples that are missing: velocity and biases may have changed as much as they can.
+    """Return the factors of a step without IMU samples, over which velocity and biases may change freely.
 
-    Velocity here is tied to the poses again by the next samples; biases may have walked freely for ``dt_s``.
+    The next samples tie the velocity to the poses again.
     """
     no_change = gtsam.imuBias.ConstantBias()
-    bias_sigmas = np.r_[np.full(3, 1e-2), np.full(3, 1e-3)] * np.sqrt(dt_s)
     velocity_sigmas = np.full(3, BRIDGED_ACCELERATION_SIGMA_M_S2 * dt_s)
     return [
         gtsam.BetweenFactorVector(V(i), V(j), np.zeros(3), noise.sigmas(velocity_sigmas)),
-        gtsam.BetweenFactorConstantBias(B(i), B(j), no_change, noise.sigmas(bias_sigmas)),
+        gtsam.BetweenFactorConstantBias(B(i), B(j), no_change, noise.sigmas(_BRIDGED_BIAS_SIGMAS * np.sqrt(dt_s))),
         _same_gravity(i, j),
     ]
 
@@ -158,12 +176,21 @@ def step_factors(
     pim: gtsam.PreintegratedCombinedMeasurements | None,
     stamp_ns: int,
     T_imu_lidar: Array,
-    scans: Scans,
+    scans: ScanNumbers,
 ) -> gtsam.NonlinearFactorGraph:
-    """All factors of the step from scan ``i`` (at ``state``) to the next, at ``stamp_ns``.
+    """Return all factors of the step from scan ``i`` to the next.
 
-    A relative pose that failed, or that comes from the same IMU samples, is left out where the IMU factor bridges.
-    ``scans`` are those in the graph, up to ``i``.
+    A relative pose that failed, or that was made from the same IMU samples, becomes no factor where the IMU factor
+    bridges the step; without samples, any relative pose is better than none.
+
+    Args:
+        i: the scan before.
+        state: at scan ``i``.
+        relative: the step.
+        pim: preintegrated samples of the step; None where they do not cover it.
+        stamp_ns: of the next scan.
+        T_imu_lidar: ``(4, 4)``.
+        scans: those in the graph, up to ``i``.
     """
     graph = gtsam.NonlinearFactorGraph()
     if state.has_imu:
@@ -171,7 +198,8 @@ def step_factors(
         for factor in imu_factors(i, i + 1, pim) if pim else bridge_factors(i, i + 1, dt_s):
             graph.add(factor)
     if relative.drift is not None:
-        for factor in map_factors(i, relative, relative.drift, T_imu_lidar, fresh=not scans.is_on_path(i)):
+        starts_path = not scans.is_on_map_path(i)
+        for factor in map_path_factors(i, relative, relative.drift, T_imu_lidar, starts_path):
             graph.add(factor)
     for factor in earlier_scan_factors(i + 1, relative, scans, T_imu_lidar):
         graph.add(factor)

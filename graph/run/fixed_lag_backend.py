@@ -1,4 +1,4 @@
-"""The online graph with a memory of constant length: scans older than the lag are marginalised."""
+"""The online factor graph in constant memory: scans older than a lag are marginalised."""
 
 from __future__ import annotations
 
@@ -11,25 +11,27 @@ from hybridlio.graph.run import factors
 from hybridlio.graph.run.inertial_steps import InertialSteps
 from hybridlio.graph.run.isam_backend import WARM_UP_STEPS, IncrementalBackend
 
-_AT_ONCE = 40  # so many scans are forgotten together, as it takes sorting all that are left
+# Scans that are marginalised together: each time, all remaining variables are reordered, so rarely is cheaper; the
+# graph holds at most this many scans more than the lag.
+_BATCH_SCANS = 40
 
 
 class FixedLagBackend(IncrementalBackend):
-    """As :class:`IncrementalBackend`, in constant time and memory, however long the run.
+    """As :class:`IncrementalBackend`, in constant time and memory however long the run.
 
-    What is marginalised is not linearised anew; without loop closures little would change it, so that the newest state
-    is the same to a hundredth of its standard deviation.
+    Marginalised scans are not relinearised. Without loop closures that hardly matters: the newest state differs by less
+    than a fiftieth of its standard deviation (tests/graph/run/test_fixed_lag_backend.py).
 
     Args:
-        steps: as there.
-        lag_scans: how many scans stay in the graph at least.
+        steps: preintegrates the samples between scans.
+        lag_scans: the least number of scans that stay in the graph.
 
     Raises:
         ConfigError: the lag is shorter than the warm-up.
     """
 
     name = "fixed-lag"
-    _forgets = True  # costs 2 % of an update; without, empty slots take 0.2 to 0.4 kB a scan
+    _removes_factors = True  # 2 % of an update; otherwise empty slots take 0.2 to 0.4 kB a scan
 
     def __init__(self, steps: InertialSteps, lag_scans: int = 100) -> None:
         super().__init__(steps)
@@ -43,22 +45,24 @@ class FixedLagBackend(IncrementalBackend):
         self._oldest = 0
 
     def update(self, frame: Frame, relative: RelativePose) -> State:
-        """Add the step to ``frame``, now and then forgetting scans beyond the lag; returns the state there.
+        """Add the step to ``frame``, from time to time marginalising scans beyond the lag; return the state there.
 
         Raises:
-            GraphError: the graph cannot be solved; names the variable.
+            GraphError: the graph cannot be solved; the message names the variable.
+            DataError: as :meth:`IncrementalBackend.update`.
         """
         state = super().update(frame, relative)
-        if self._k - self._lag >= self._oldest + _AT_ONCE:
-            self._forget(range(self._oldest, self._k - self._lag))
+        if self._k - self._lag >= self._oldest + _BATCH_SCANS:
+            self._marginalise(range(self._oldest, self._k - self._lag))
             self._oldest = self._k - self._lag
         return state
 
-    def _forget(self, scans: range) -> None:
-        """Eliminate the scans before all others, then marginalise them.
+    def _marginalise(self, scans: range) -> None:
+        """Eliminate the scans' variables before all others, then marginalise them.
 
-        iSAM2 crashes at variables that were not eliminated first. As they come in, a chain of scans mostly is in order,
-        but not where old variables were linearised anew, or where keyframes join old scans to new ones.
+        iSAM2 crashes if it marginalises variables that are not leaves of its Bayes tree, that is, not eliminated first.
+        A chain of scans mostly is in that order, but not where old variables were relinearised, or where relative poses
+        join old scans to new ones.
         """
         order, everything, leaving = gtsam.KeyGroupMap(), gtsam.KeyList(), gtsam.KeyList()
         for place, group in enumerate((scans, range(scans.stop, self._k + 1))):
@@ -69,7 +73,7 @@ class FixedLagBackend(IncrementalBackend):
             leaving.push_back(key)
         self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [], order, None, everything)
         self._isam.marginalizeLeaves(leaving)
-        self._scans.forget(scans)
+        self._scans.remove(scans)
 
     def _keys(self, scans: range) -> list[int]:
         keys = (variable(k) for k in scans for variable in factors.VARIABLES)

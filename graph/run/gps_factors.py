@@ -1,14 +1,15 @@
-"""GPS fixes in offline smoothing: where they say the antenna was, in a frame and at times that have to be found too.
+"""GPS fixes in offline smoothing, with the frame and the clock of the fixes estimated.
 
-Fixes are in a local east-north-up frame, the run's poses in its own world; between the two lies an unknown pose, and
-between their clocks an unknown constant. Both are variables of the graph. A fix falls between scans: the motion from
-the nearest scan to its time is taken from the path (:class:`hybridlio.core.pose_interpolation.PosePath`), as a lever
-that the time shift draws along the velocity. In 50 ms the path is known to millimetres where a fix is known to
-decimetres, so no variable and no noise is added for it; each round takes the levers anew.
+Fixes are in a local east-north-up frame, the run's poses in its own world. The pose of one in the other and a constant
+time shift between their clocks are variables of the graph. A fix falls between two scans: the motion from the nearest
+scan to its time is taken from the path (:class:`hybridlio.core.pose_interpolation.PosePath`) as a lever arm, which the
+time shift moves along the velocity. Within 50 ms the path is known to millimetres and a fix to decimetres, so the
+interpolation adds no variable and no noise; each round recomputes the lever arms.
 
-Keys: ``e`` pose of the run's world in the fixes' frame, ``t`` time shift in seconds, and for each fix the antenna as a
-point, three times over, so that GTSAM's own factors reach from scan to fix: a factor in Python gets a copy of all
-values whenever it is evaluated, which takes longer than all the rest on a long run.
+Keys: ``e`` pose of the run's world in the frame of the fixes; ``t`` time shift in seconds; for each fix the antenna's
+position in three frames, ``a`` in the scan's, ``w`` in the run's world, ``p`` in the fixes'. These points let GTSAM's
+own factors connect a scan to a fix. One factor written in Python would need no points, but it gets a copy of all values
+at every evaluation, which takes longer than everything else on a long run.
 """
 
 from __future__ import annotations
@@ -28,27 +29,35 @@ from hybridlio.core.estimates import State
 from hybridlio.core.pose_interpolation import PosePath
 from hybridlio.core.sensors import NS_PER_S, GpsFix
 from hybridlio.graph.base import noise
-from hybridlio.graph.run.factor_groups import Doubtful, GroupAnswer, GroupFactors
+from hybridlio.graph.run.factor_groups import GroupFactors, GroupSolution, PossibleOutlier
 from hybridlio.record.record import Record
-from hybridlio.smoothing.gps_alignment import FixAlignment, align_fixes, fix_stamps
+from hybridlio.smoothing.gps_alignment import LEVEL_SIGMA_RAD, FixAlignment, align_fixes, fix_stamps
 from hybridlio.smoothing.gps_options import GpsFit, GpsOptions
 
 _UP = np.array([0.0, 0.0, 1.0])
-_PLUMB_SIGMA_RAD = 5e-4  # of the vertical against the ellipsoid's, and over a few kilometres
-_LEVEL_SIGMA_RAD = 0.1  # without IMU: how level the lidar started
-_NOWHERE_RAD, _NOWHERE_M = 10.0, 1e5
-_LINK_M = 1e-3
-_MEDIAN_CHI2 = 2.366  # of three degrees of freedom
-_SECOND_DIFFERENCE = 6.0  # 1 + 4 + 1: variance of x[-1] - 2 x[0] + x[1]
-_LEAST_FOR_SPREAD = 10
-_LONGEST_PAUSE = 1.5  # times the usual time between fixes
+# Gravity against the up of the fixes' frame: deflections of the vertical rarely exceed 3e-4 rad (60 arc seconds), and
+# the Earth's curvature turns it by 1.6e-4 rad a kilometre.
+_PLUMB_SIGMA_RAD = 5e-4
+# An uninformative prior of the fixes' frame, more than a turn and farther than a run goes, so that GTSAM always finds
+# it determined.
+_FRAME_SIGMAS = np.r_[np.full(3, 10.0), np.full(3, 1e5)]
+_LINK_SIGMA_M = 1e-3  # between a point and its image in the next frame: far below a fix's noise
+_LEAST_SHIFT_SIGMA_S = 1e-6  # where the clocks are known to agree; a microsecond is no motion
+_MEDIAN_CHI2 = 2.366  # median of χ² of three degrees of freedom
+_SECOND_DIFFERENCE = 6.0  # 1 + 4 + 1: variance of x[-1] - 2 x[0] + x[1] of independent x
+_LEAST_FOR_SPREAD = 10  # fewer second differences have no stable median
+_LONGEST_PAUSE = 1.5  # of the median interval: between fixes farther apart the path's drift would show
 
 
 class GpsGroup:
     """A record's fixes as a group of factors.
 
-    Raises:
-        EstimationError: too few fixes in the run's time.
+    Args:
+        record: of the run, with its fixes.
+        options: how to use them.
+
+    Raises (from :meth:`build`):
+        EstimationError: too few fixes lie in the run's time.
     """
 
     name = "gps"
@@ -63,15 +72,15 @@ class GpsGroup:
         self._scale: float | None = None
         self._rows: NDArray[np.int64] = np.empty(0, np.int64)
 
-    def build(self, states: Sequence[State], before: gtsam.Values | None) -> GroupFactors:
-        """One factor a fix, and what is known of frame and clock beforehand."""
+    def build(self, states: Sequence[State], previous: gtsam.Values | None) -> GroupFactors:
+        """Return one possible outlier per fix, with the factors and initial values of frame and clock."""
         path = _path_of(states)
-        if before is None:
+        if previous is None:
             aligned = self._align(path, states[0])
             T_enu_world, shift = aligned.T_enu_world, aligned.shift_s
             self._scale = _noise_scale([self._fixes[k] for k in self._rows], aligned.residuals_m, aligned.inliers)
         else:
-            T_enu_world, shift = before.atPose3(E(0)).matrix(), float(before.atVector(T(0))[0])
+            T_enu_world, shift = previous.atPose3(E(0)).matrix(), float(previous.atVector(T(0))[0])
         values = gtsam.Values()
         values.insert(E(0), gtsam.Pose3(T_enu_world))
         values.insert(T(0), np.array([shift]))
@@ -80,6 +89,7 @@ class GpsGroup:
         return group
 
     def _align(self, path: PosePath, start: State) -> FixAlignment:
+        """Choose the fixes to use, and return their rigid alignment."""
         stamps = fix_stamps(self._fixes)
         out = np.zeros(len(stamps), dtype=bool)
         for first, last in self._options.outages:
@@ -97,16 +107,16 @@ class GpsGroup:
         )  # fmt: skip
 
     def _priors(self, T_enu_world: Array) -> list[gtsam.NonlinearFactor]:
-        """The frame may be anywhere; the shift is within what was searched."""
-        anywhere = noise.sigmas(np.r_[np.full(3, _NOWHERE_RAD), np.full(3, _NOWHERE_M)])
-        shift = noise.sigmas(np.array([max(self._options.max_shift_s, 1e-6)]))
+        """Priors: the frame may be anywhere, the shift is within the searched range."""
+        anywhere = noise.sigmas(_FRAME_SIGMAS)
+        shift = noise.sigmas(np.array([max(self._options.max_shift_s, _LEAST_SHIFT_SIGMA_S)]))
         return [
             gtsam.PriorFactorPose3(E(0), gtsam.Pose3(T_enu_world), anywhere),
             gtsam.PriorFactorVector(T(0), np.zeros(1), shift),
         ]
 
     def _add_fixes(self, group: GroupFactors, path: PosePath, shift_s: float, T_enu_world: Array) -> None:
-        """The antenna in the nearest scan's frame ``a``, in the run's world ``w`` and in the fixes' frame ``p``."""
+        """Add each fix's points ``a``, ``w``, ``p``, the links between them, and the fix itself at ``p``."""
         fixes = [self._fixes[k] for k in self._rows]
         stamps = fix_stamps(fixes, shift_s)
         near = path.nearest(stamps)
@@ -115,33 +125,33 @@ class GpsGroup:
         T_scan_world = se3.inverse(path.poses[near])
         levers = (T_scan_world @ np.column_stack([points, np.ones(len(points))])[..., None])[:, :3, 0]
         drawn = (T_scan_world[:, :3, :3] @ velocities[..., None])[..., 0]
-        link = noise.sigmas(np.full(3, _LINK_M))
+        link = noise.sigmas(np.full(3, _LINK_SIGMA_M))
         for n, (k, fix) in enumerate(zip(near.tolist(), fixes, strict=True)):
             for key, value in ((A(n), levers[n]), (W(n), points[n]), (P(n), placed[n])):
                 group.values.insert(key, value)
             links = [
-                _draw(n, levers[n], drawn[n], shift_s, link),
+                _lever_factor(n, levers[n], drawn[n], shift_s, link),
                 gtsam.ReferenceFrameFactorPoint3Pose3(A(n), X(k), W(n), link),
                 gtsam.ReferenceFrameFactorPoint3Pose3(W(n), E(0), P(n), link),
             ]
-            group.sure.extend(links)
+            group.trusted.extend(links)
             covariance = (self._scale or 1.0) ** 2 * fix.covariance_m2
-            group.doubtful.append(
-                Doubtful(
+            group.possible_outliers.append(
+                PossibleOutlier(
                     partial(gtsam.PriorFactorPoint3, P(n), fix.position_m), covariance, f"GPS fix at {fix.stamp_ns} ns"
                 )
             )
 
-    def read(self, answer: GroupAnswer) -> GpsFit:
-        """Frame, clock, and how each fix fits."""
-        T_enu_imu = answer.values.atPose3(E(0)).matrix()
-        shift = float(answer.values.atVector(T(0))[0])
-        joint = answer.covariance([E(0), T(0)])
+    def read(self, solution: GroupSolution) -> GpsFit:
+        """Return frame, clock, and how each fix fits."""
+        T_enu_imu = solution.values.atPose3(E(0)).matrix()
+        shift = float(solution.values.atVector(T(0))[0])
+        joint = solution.covariance([E(0), T(0)])
         count = len(self._fixes)
         residuals, weights, used = np.full((count, 3), np.nan), np.zeros(count), np.zeros(count, bool)
         used[self._rows] = True
-        weights[self._rows] = answer.weights
-        points, _ = _path_of(answer.states).points(
+        weights[self._rows] = solution.weights
+        points, _ = _path_of(solution.states).points(
             fix_stamps([self._fixes[k] for k in self._rows], shift), self._antenna
         )
         positions = np.array([self._fixes[k].position_m for k in self._rows])
@@ -162,28 +172,30 @@ def _path_of(states: Sequence[State]) -> PosePath:
 
 
 def _up_of(state: State) -> tuple[Array, float]:
-    """The direction up in the run's world, and how far it may be off."""
+    """Return the direction up ``(3,)`` in the run's world, of any length, and its standard deviation in rad."""
     if not state.has_imu:
-        return _UP, _LEVEL_SIGMA_RAD
+        return _UP, LEVEL_SIGMA_RAD
     spread = float(np.sqrt(np.trace(state.gravity_covariance) / 3)) / float(np.linalg.norm(state.gravity_m_s2))
     return -state.gravity_m_s2, float(np.hypot(spread, _PLUMB_SIGMA_RAD))
 
 
-def _draw(n: int, lever: Array, velocity: Array, shift_s: float, model: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
-    """``a = lever + velocity · (t - shift)``, which is linear and stays as it is."""
+def _lever_factor(
+    n: int, lever: Array, velocity: Array, shift_s: float, model: gtsam.noiseModel.Base
+) -> gtsam.NonlinearFactor:
+    """The linear factor ``a = lever + velocity · (t - shift)``, which needs no relinearisation."""
     at = gtsam.Values()
     at.insert(A(n), lever)
     at.insert(T(0), np.array([shift_s]))
     by_shift = -velocity[:, None]
-    make: Any = gtsam.JacobianFactor  # its stubs know other models than its code
+    make: Any = gtsam.JacobianFactor  # its stubs lack this overload
     linear = make(A(n), np.eye(3), T(0), by_shift, np.zeros(3), model)
     return gtsam.LinearContainerFactor(linear, at)
 
 
 def _plumb_factor(start: State) -> gtsam.NonlinearFactor:
-    """The fixes' up is opposite to gravity; without IMU, the lidar started about level."""
+    """The frame's up is opposite to gravity; without IMU, the lidar is assumed to start about level."""
     if not start.has_imu:
-        model = noise.sigmas(np.full(2, _LEVEL_SIGMA_RAD))
+        model = noise.sigmas(np.full(2, LEVEL_SIGMA_RAD))
         return gtsam.AttitudeFactorPose3(E(0), gtsam.Unit3(_UP), model, gtsam.Unit3(_UP))
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
@@ -200,11 +212,16 @@ def _plumb_factor(start: State) -> gtsam.NonlinearFactor:
 
 
 def _noise_scale(fixes: Sequence[GpsFix], residuals: Array, inliers: NDArray[np.bool_]) -> float:
-    """How many times their claimed standard deviations the fixes scatter, at least 1.
+    """Return the ratio of the fixes' scatter to their claimed standard deviations, at least 1.
 
-    Told by second differences of consecutive residuals, which the path's drift leaves alone; by their median, and
-    without the fixes that are far off the path, so that wrong ones do not decide. An error common to neighbouring fixes
-    does not show.
+    From second differences of consecutive residuals, which cancel the drift of the path; from their median, and without
+    outliers of the alignment, so that wrong fixes do not count. Errors that neighbouring fixes share cancel too, so the
+    ratio is a lower bound.
+
+    Args:
+        fixes: ``M`` of them.
+        residuals: ``(M, 3)`` of their alignment.
+        inliers: ``(M,)`` of their alignment.
     """
     stamps = fix_stamps(fixes) / NS_PER_S
     steps = np.diff(stamps)

@@ -1,4 +1,4 @@
-"""The samples of a step, summed up once for all that ask: the initial pose, the comparison with it, and the graph."""
+"""The IMU's share of a step, computed once for the initial pose, the innovation gate and the graph."""
 
 from __future__ import annotations
 
@@ -7,47 +7,58 @@ import gtsam
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose, State
-from hybridlio.core.sensors import Calibration, Frame, ImuNoise, ImuSamples
+from hybridlio.core.sensors import Calibration, Frame, ImuNoise
 from hybridlio.graph.base.preintegration import covers, predict_step, preintegrate
 
 PREINTEGRATION = "preintegration"
 
 
 class InertialSteps:
-    """What the IMU says of the step from a state to a frame; the last answer is kept.
+    """Preintegrated samples of the step from a state to a frame; the last result is kept.
 
     Args:
-        calibration: where the lidar is.
+        calibration: its ``T_imu_lidar`` is used.
         noise: of the IMU.
     """
 
     def __init__(self, calibration: Calibration, noise: ImuNoise) -> None:
         self.T_imu_lidar = calibration.T_imu_lidar
         self._noise = noise
-        self._asked: tuple[ImuSamples, int, State] | None = None
-        self._sum: gtsam.PreintegratedCombinedMeasurements | None = None
+        self._inputs: tuple[object, ...] | None = None
+        self._preintegrated: gtsam.PreintegratedCombinedMeasurements | None = None
         self._predicted: RelativePose | None = None
 
-    def sum(self, frame: Frame, state: State) -> gtsam.PreintegratedCombinedMeasurements | None:
-        """The preintegrated samples; None where they do not reach from the state's stamp to the scan's."""
-        last = self._asked
-        if last is None or last[0] is not frame.imu or last[1] != frame.scan.stamp_ns or last[2] is not state:
+    def preintegrated(self, frame: Frame, state: State) -> gtsam.PreintegratedCombinedMeasurements | None:
+        """Return the preintegrated samples, or None where they do not cover the step from ``state`` to the scan."""
+        inputs = _inputs(frame, state)
+        if inputs != self._inputs:
             usable = state.has_imu and covers(frame.imu, state.stamp_ns, frame.scan.stamp_ns)
-            self._sum = preintegrate(frame.imu, state, self._noise) if usable else None
-            self._asked, self._predicted = (frame.imu, frame.scan.stamp_ns, state), None
-        return self._sum
+            self._preintegrated = preintegrate(frame.imu, state, self._noise) if usable else None
+            self._inputs, self._predicted = inputs, None
+        return self._preintegrated
 
     def predicted(self, frame: Frame, state: State) -> RelativePose | None:
-        """The step between the lidar's poses; None as of :meth:`sum`."""
-        pim = self.sum(frame, state)
+        """Return the step between the lidar's poses, or None where :meth:`preintegrated` gives None."""
+        pim = self.preintegrated(frame, state)
         if pim is not None and self._predicted is None:
             step, covariance = predict_step(pim, state)
-            self._predicted = self.between_lidars(step, covariance, from_imu=True)
+            self._predicted = self.as_lidar_step(step, covariance, from_imu=True)
         return self._predicted
 
-    def between_lidars(self, step: Array, covariance: Array, ok: bool = True, from_imu: bool = False) -> RelativePose:
-        """A step of the IMU as one of the lidar."""
+    def as_lidar_step(self, step: Array, covariance: Array, ok: bool = True, from_imu: bool = False) -> RelativePose:
+        """Convert a step of the IMU ``(4, 4)`` with its covariance ``(6, 6)`` to one of the lidar."""
         T_lidar_imu = se3.inverse(self.T_imu_lidar)
         pose = T_lidar_imu @ step @ self.T_imu_lidar
         covariance = se3.rotate_covariance(covariance, T_lidar_imu)
         return RelativePose(pose, covariance, source=PREINTEGRATION, ok=ok, from_imu=from_imu)
+
+
+def _inputs(frame: Frame, state: State) -> tuple[object, ...]:
+    """Everything that the result depends on, by value: a few kilobytes, compared in microseconds."""
+    imu = frame.imu
+    arrays = (
+        imu.stamps_ns, imu.gyro_rad_s, imu.accel_m_s2,
+        state.T_world_imu, state.velocity_m_s, state.accel_bias_m_s2, state.gyro_bias_rad_s, state.gravity_m_s2,
+        state.covariance, state.gravity_covariance,
+    )  # fmt: skip
+    return (frame.scan.stamp_ns, state.stamp_ns, state.has_imu, *(array.tobytes() for array in arrays))

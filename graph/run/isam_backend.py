@@ -1,4 +1,4 @@
-"""The online graph: poses, velocities, biases and gravity in iSAM2 (Kaess et al., IJRR 2012)."""
+"""The online factor graph: poses, velocities, biases and gravity in iSAM2 (Kaess et al., IJRR 2012)."""
 
 from __future__ import annotations
 
@@ -10,28 +10,29 @@ from hybridlio.core import se3
 from hybridlio.core.errors import GraphError
 from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.sensors import NS_PER_S, Frame
-from hybridlio.graph.base.isam import eager_solver, incremental_solver, reason
+from hybridlio.graph.base.isam import gtsam_message, incremental_solver, relinearising_solver
 from hybridlio.graph.base.marginals import step_covariance
-from hybridlio.graph.base.preintegration import bias_of
+from hybridlio.graph.base.preintegration import gtsam_bias
 from hybridlio.graph.run import factors
 from hybridlio.graph.run.inertial_steps import InertialSteps
-from hybridlio.graph.run.scan_numbers import Scans
+from hybridlio.graph.run.scan_numbers import ScanNumbers
 
-# While tilt, speed and biases are still found, every step linearises anew what it moves of the few poses there are; and
-# the very first, when nothing is known, solve them anew by damped steps.
+# While tilt, speed and biases converge (2 s at 10 Hz), every step relinearises everything that it changes; the graph is
+# still small. In the very first steps even that diverges, as the speed may be off by 20 m/s and down by 0.3 rad: these
+# are solved from scratch by damped iterations.
 WARM_UP_STEPS = 20
-_FIRST_STEPS = 5
+_DAMPED_STEPS = 5
 
 
 class IncrementalBackend:
-    """Every scan a pose; consecutive ones joined by the IMU's samples and by the relative pose of the front end.
+    """A graph of every scan's pose; consecutive scans are joined by IMU samples and the front end's relative pose.
 
     Args:
-        steps: sums up the samples between scans.
+        steps: preintegrates the samples between scans.
     """
 
     name = "incremental"
-    _forgets = False
+    _removes_factors = False
 
     def __init__(self, steps: InertialSteps) -> None:
         self._steps = steps
@@ -40,37 +41,37 @@ class IncrementalBackend:
         self._k = 0
 
     def start(self, state: State) -> None:
-        """Put the first scan's pose at the origin, the rest at ``state`` with its covariance."""
+        """Put the first scan's pose at the origin, the other variables at ``state`` with its covariance."""
         self._k = 0
-        self._scans = Scans(state.stamp_ns)
+        self._scans = ScanNumbers(state.stamp_ns)
         self._state = state
         self._graph, self._values = factors.start_factors(state)
-        self._isam = incremental_solver(self._forgets)
+        self._isam = incremental_solver(self._removes_factors)
         self._isam.update(self._graph, self._values)
 
     def update(self, frame: Frame, relative: RelativePose) -> State:
-        """Add the step to ``frame``; returns the state there.
+        """Add the step to ``frame`` and return the state there.
 
         Raises:
-            GraphError: the graph cannot be solved; names the variable.
-            DataError: a pose relative to a keyframe names a scan that there is not.
+            GraphError: the graph cannot be solved; the message names the variable.
+            DataError: a pose relative to an earlier scan gives a stamp that no scan has.
         """
         state, stamp_ns = self._state, frame.scan.stamp_ns
-        pim = self._steps.sum(frame, state)
+        pim = self._steps.preintegrated(frame, state)
         graph = factors.step_factors(self._k, state, relative, pim, stamp_ns, self._T_imu_lidar, self._scans)
-        values, guess = gtsam.Values(), self._guess(frame, relative, pim)
-        factors.insert_step(values, self._k, state, guess, relative, self._scans)
+        values, initial = gtsam.Values(), self._initial_state(frame, relative, pim)
+        factors.insert_step(values, self._k, state, initial, relative, self._scans)
         try:
             self._solve(graph, values, self._order(relative, values))
         except RuntimeError as error:
-            raise GraphError(f"frame {frame.index}: the graph cannot be solved: {reason(error)}") from error
+            raise GraphError(f"frame {frame.index}: the graph cannot be solved: {gtsam_message(error)}") from error
         self._k += 1
-        self._scans.add(stamp_ns, on_path=relative.drift is not None)
+        self._scans.add(stamp_ns, on_map_path=relative.drift is not None)
         self._state = self._read(stamp_ns)
         return self._state
 
     def last_step(self) -> RelativePose:
-        """The step to the current scan with the covariance that all factors together leave it."""
+        """Return the step to the current scan, lidar frames, with its covariance from all factors together."""
         i, j = X(self._k - 1), X(self._k)
         T_w_i, T_w_j = (self._isam.calculateEstimatePose3(key).matrix() for key in (i, j))
         joint = self._isam.jointMarginalCovariance([i, j]).fullMatrix()
@@ -79,13 +80,13 @@ class IncrementalBackend:
         pose = self._T_lidar_imu @ step @ self._T_imu_lidar
         return RelativePose(pose, (covariance + covariance.T) / 2, source=self.name, from_imu=self._state.has_imu)
 
-    def _guess(
+    def _initial_state(
         self, frame: Frame, relative: RelativePose, pim: gtsam.PreintegratedCombinedMeasurements | None
     ) -> State:
-        """Where the new variables start: the relative pose and the velocity it means; the IMU's where that failed."""
+        """Initial values of the new variables: from the relative pose, or from the IMU where that failed."""
         state, stamp_ns = self._state, frame.scan.stamp_ns
         if pim is not None and not relative.ok:
-            then = pim.predict(gtsam.NavState(gtsam.Pose3(state.T_world_imu), state.velocity_m_s), bias_of(state))
+            then = pim.predict(gtsam.NavState(gtsam.Pose3(state.T_world_imu), state.velocity_m_s), gtsam_bias(state))
             T_world_imu, velocity = then.pose().matrix(), then.velocity()
         else:
             T_world_imu = state.T_world_imu @ self._T_imu_lidar @ relative.pose @ self._T_lidar_imu
@@ -101,25 +102,28 @@ class IncrementalBackend:
             self._isam.update(graph, values, [], order)
             return
         self._graph.push_back(graph)
-        if self._k < _FIRST_STEPS:
+        if self._k < _DAMPED_STEPS:
             self._values.insert(values)
             params = gtsam.LevenbergMarquardtParams()
             params.setLinearSolverType("MULTIFRONTAL_QR")
             self._values = gtsam.LevenbergMarquardtOptimizer(self._graph, self._values, params).optimize()
-            self._isam = eager_solver()
+            self._isam = relinearising_solver()
             self._isam.update(self._graph, self._values)
             return
         self._isam.update(graph, values)
-        if self._k == WARM_UP_STEPS - 1:
+        if self._k == WARM_UP_STEPS - 1:  # continue in the solver that keeps old linearisation points
             self._values = self._isam.calculateEstimate()
-            self._isam = incremental_solver(self._forgets)
+            self._isam = incremental_solver(self._removes_factors)
             self._isam.update(self._graph, self._values)
 
     def _order(self, relative: RelativePose, new: gtsam.Values) -> gtsam.KeyGroupMap | None:
-        """Scan by scan from the oldest that a step reaches back to; None for one that reaches to the last scan only.
+        """Constrain iSAM2 to eliminate scan by scan, from the oldest scan that a step reaches back to.
 
-        By default iSAM2 eliminates all variables of the new factors last, old keyframes too; within a hundred scans
-        each update would then reach far back (fifty times as slow).
+        By default iSAM2 eliminates the variables of new factors last, including those of old scans. Within a hundred
+        scans each update would then affect a large part of the graph and take fifty times as long.
+
+        Returns:
+            The constraint, or None for a step that reaches back to the last scan only.
         """
         found = [j for k in relative.earlier_scans if (j := self._scans.number(k.stamp_ns)) is not None]
         if not found or min(found) >= self._k:
@@ -132,6 +136,7 @@ class IncrementalBackend:
         return order
 
     def _read(self, stamp_ns: int) -> State:
+        """Return the newest scan's state with its marginal covariances."""
         k, isam = self._k, self._isam
         pose = isam.calculateEstimatePose3(X(k)).matrix()
         if not self._state.has_imu:

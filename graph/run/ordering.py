@@ -1,19 +1,19 @@
-"""In which order to eliminate a run's variables."""
+"""The order in which smoothing eliminates a run's variables."""
 
 from __future__ import annotations
 
 import gtsam
 
-_SCANS = "xvbgm"  # kinds of variables that each scan has one of
-_POINTS = "awp"  # of a GPS fix
+_SCANS = "xvbgm"  # keys of variables that each scan has one of
+_POINTS = "awp"  # keys of a GPS fix
 
 
 def chain_order(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Ordering | None:
-    """Each fix's points first, then scan after scan, and what all share last; None where factors close loops.
+    """Return an order: the points of each fix, then scan after scan, then the shared variables.
 
-    A variable in hundreds of factors along the way, such as the frame of GPS fixes, misleads the search for a good
-    order (COLAMD, METIS): it then costs ten times what the same graph costs without it, and twice in this order.
-    Where nothing is shared, or where loops close, the search does well.
+    A variable that hundreds of factors along the path share, such as the frame of GPS fixes, misleads COLAMD and METIS:
+    with their order a graph takes ten times as long as without that variable, with this order twice as long. They do
+    well where nothing is shared or where loops close; None then leaves the order to GTSAM.
     """
     keys = [(gtsam.Symbol(key).index(), chr(gtsam.Symbol(key).chr()), key) for key in list(values.keys())]
     shared = [key for _, kind, key in keys if kind not in _SCANS + _POINTS]
@@ -30,6 +30,7 @@ def chain_order(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsa
 
 
 def _is_chain(graph: gtsam.NonlinearFactorGraph, apart: set[int]) -> bool:
+    """Whether factors join only consecutive scans; keys in ``apart`` are no scans' variables."""
     for k in range(graph.size()):
         places = [gtsam.Symbol(key).index() for key in list(graph.at(k).keys()) if key not in apart]
         if places and max(places) - min(places) > 1:

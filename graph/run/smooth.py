@@ -1,4 +1,4 @@
-"""Offline smoothing: all of a run's factors optimised together, from its record alone."""
+"""Offline smoothing: a run's factors optimised together, from its record alone."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hybridlio.core.errors import GraphError
 from hybridlio.core.estimates import State
 from hybridlio.core.progress import Progress
 from hybridlio.core.trajectory import Trajectory
-from hybridlio.graph.base.isam import reason
+from hybridlio.graph.base.isam import gtsam_message
 from hybridlio.graph.base.marginals import bayes_tree, pose_covariances
 from hybridlio.graph.base.preintegration import covers, preintegrate
 from hybridlio.graph.run import factors
@@ -24,8 +24,8 @@ from hybridlio.graph.run.factor_groups import FactorGroup
 from hybridlio.graph.run.gps_factors import GpsGroup
 from hybridlio.graph.run.loop_factors import LoopClosures
 from hybridlio.graph.run.ordering import chain_order
-from hybridlio.graph.run.robust import Added, check_treatment
-from hybridlio.graph.run.scan_numbers import Scans
+from hybridlio.graph.run.robust import AddedGroups, check_robust_method
+from hybridlio.graph.run.scan_numbers import ScanNumbers
 from hybridlio.record.record import Record
 from hybridlio.smoothing.gps_options import GpsOptions
 from hybridlio.smoothing.smoothed import Smoothed
@@ -33,9 +33,10 @@ from hybridlio.smoothing.smoothed import Smoothed
 if TYPE_CHECKING:
     from hybridlio.smoothing.loop_closure import LoopSettings
 
-_MAX_ITERATIONS = 50
-_ITERATIONS_A_STEP = 4  # while wrong measurements are looked for
-_ROUNDS = 2  # samples are summed up again with the biases that the first round found
+_MAX_ITERATIONS = 50  # a bound against endless descent; Smoothed.converged says whether it was reached
+_ITERATIONS_A_STEP = 4  # while outliers are rejected: each step of GNC repeats until it converges anyway
+_ROUNDS = 2  # the second preintegrates the samples again, with the biases that the first found
+_RELATIVE_TOLERANCE = 1e-6  # decrease of the error at which iterations stop; a tenth of GTSAM's default
 
 
 def smooth(
@@ -51,38 +52,38 @@ def smooth(
 
     Args:
         record: of the run, from :meth:`hybridlio.odometry.odometry.Odometry.record` or a run folder's ``odometry.npz``.
-        progress: called with the stage, what is done of it and what there is in all.
-        loops: find where the run comes back to a place, and close the loops; settings of how, or True. What became of
-            them is ``found["loops"]``, a :class:`hybridlio.smoothing.loops.ClosedLoops`.
-        gps: whether to use the record's GPS fixes, and how; what came of it is ``found["gps"]``, a
+        progress: called with the stage, the steps done and the steps in total.
+        loops: True, or settings, to find and close loops; ``found["loops"]`` is then a
+            :class:`hybridlio.smoothing.loops.ClosedLoops`.
+        gps: True, or options, to use the record's GPS fixes; ``found["gps"]`` is then a
             :class:`hybridlio.smoothing.gps_options.GpsFit`.
-        groups: more measurements.
-        robust: how to treat those of the groups' measurements that may be wrong: ``huber``, ``cauchy``,
-            ``geman-mcclure``, ``dcs`` or ``gnc``; by default as each group prefers.
+        groups: further measurements.
+        robust: method against outliers among the measurements of all groups: ``huber``, ``cauchy``, ``geman-mcclure``,
+            ``dcs`` or ``gnc``; None takes each group's default.
 
     Raises:
         GraphError: the graph cannot be solved.
         EstimationError: too few fixes lie in the run's time.
-        ConfigError: an unknown treatment.
+        ConfigError: an unknown robust method.
         DataError: loops are asked for, and the record has no keyframes.
     """
-    report, robust = progress or _silent, check_treatment(robust)  # before the search for loops, which takes long
+    report, robust = progress or _silent, check_robust_method(robust)  # checked before the long search for loops
     fixes = [GpsGroup(record, gps if isinstance(gps, GpsOptions) else GpsOptions())] if gps else []
-    added = Added([*fixes, *_with_loops(groups, record, loops, report)], robust)
+    added = AddedGroups([*fixes, *_with_loops(groups, record, loops, report)], robust)
     states = _online_states(record)
     error_before: float | None = None
     for number in range(_ROUNDS):
         report("optimising", number, _ROUNDS)
         graph, values = _build(record, states)
-        graph, values = added.to(graph, values, states, _few_iterations)
+        graph, values = added.add_to(graph, values, states, _few_iterations)
         error_before = graph.error(values) if error_before is None else error_before
         optimiser = _optimiser(graph, values)
         values = _solve(optimiser)
-        states = _read(values, states)
-        added.keep(values)
+        states = _states(values, states)
+        added.start_next_from(values)
     isam = bayes_tree(graph, values)
     covariances = pose_covariances(isam, np.array([state.T_world_imu for state in states]), report)
-    found = added.found(values, states, isam)
+    found = added.results(values, states, isam)
     return _smoothed(record, states, covariances, error_before or 0.0, optimiser, found)
 
 
@@ -98,11 +99,12 @@ def _with_loops(
 
 
 def _silent(stage: str, done: int, total: int) -> None:
-    """Report to nobody."""
+    """Ignore progress."""
     del stage, done, total
 
 
 def _online_states(record: Record) -> list[State]:
+    """States of the online estimate, with velocities from finite differences."""
     T = record.calibration.T_imu_lidar
     poses = T @ record.online.poses @ se3.inverse(T)
     times_s = record.online.times_s
@@ -114,10 +116,11 @@ def _online_states(record: Record) -> list[State]:
 
 
 def _build(record: Record, states: list[State]) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """The factors of all steps, with biases and initial values of ``states``."""
     graph, _ = factors.start_factors(record.start)
     values = gtsam.Values()
     factors.insert_state(values, 0, states[0])
-    scans = Scans(states[0].stamp_ns)
+    scans = ScanNumbers(states[0].stamp_ns)
     for i, relative in enumerate(record.relative):
         state, stamp_ns = states[i], states[i + 1].stamp_ns
         imu = record.imu.between(state.stamp_ns, stamp_ns)
@@ -126,7 +129,7 @@ def _build(record: Record, states: list[State]) -> tuple[gtsam.NonlinearFactorGr
         T_imu_lidar = record.calibration.T_imu_lidar
         graph.push_back(factors.step_factors(i, state, relative, pim, stamp_ns, T_imu_lidar, scans))
         factors.insert_step(values, i, state, states[i + 1], relative, scans)
-        scans.add(stamp_ns, on_path=relative.drift is not None)
+        scans.add(stamp_ns, on_map_path=relative.drift is not None)
     return graph, values
 
 
@@ -134,8 +137,8 @@ def _optimiser(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, iterations: int = _MAX_ITERATIONS
 ) -> gtsam.LevenbergMarquardtOptimizer:
     params = gtsam.LevenbergMarquardtParams()
-    params.setLinearSolverType("MULTIFRONTAL_QR")  # Cholesky finds long straight chains indeterminate
-    params.setRelativeErrorTol(1e-6)
+    params.setLinearSolverType("MULTIFRONTAL_QR")  # Cholesky fails on long straight chains
+    params.setRelativeErrorTol(_RELATIVE_TOLERANCE)
     params.setMaxIterations(iterations)
     ordering = chain_order(graph, values)
     if ordering is None:
@@ -147,14 +150,14 @@ def _solve(optimiser: gtsam.LevenbergMarquardtOptimizer) -> gtsam.Values:
     try:
         return optimiser.optimize()
     except RuntimeError as error:
-        raise GraphError(f"smoothing: the graph cannot be solved: {reason(error)}") from error
+        raise GraphError(f"smoothing: the graph cannot be solved: {gtsam_message(error)}") from error
 
 
-def _read(values: gtsam.Values, states: list[State]) -> list[State]:
-    return [_read_one(values, k, state) for k, state in enumerate(states)]
+def _states(values: gtsam.Values, states: list[State]) -> list[State]:
+    return [_state(values, k, state) for k, state in enumerate(states)]
 
 
-def _read_one(values: gtsam.Values, k: int, state: State) -> State:
+def _state(values: gtsam.Values, k: int, state: State) -> State:
     pose = values.atPose3(X(k)).matrix()
     if not state.has_imu:
         return replace(state, T_world_imu=pose)

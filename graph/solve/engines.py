@@ -13,7 +13,7 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 
 from hybridlio.core.errors import GraphError
-from hybridlio.graph.base.isam import make_isam_params, reason
+from hybridlio.graph.base.isam import gtsam_message, make_isam_params
 
 # Linearised anew beyond these changes, rad and m; every tenth update looks.
 _TURN, _SHIFT, _SPEED, _BIAS = 0.01, 0.1, 0.1, (0.05, 0.005)
@@ -62,7 +62,7 @@ class Incremental:
             return list(self.solver.update(graph, values, removed).getNewFactorsIndices())
         except RuntimeError as error:
             self._new = values.keys()
-            raise GraphError(f"the graph cannot be solved: {reason(error)}") from error
+            raise GraphError(f"the graph cannot be solved: {gtsam_message(error)}") from error
 
     def iterate(self) -> bool:
         """See :class:`Engine`."""
@@ -103,7 +103,7 @@ class FixedLag:
             self.solver.update(graph, values, _stamps(values), removed)
         except RuntimeError as error:
             self._before = before, values_before
-            raise GraphError(f"the graph cannot be solved: {reason(error)}") from error
+            raise GraphError(f"the graph cannot be solved: {gtsam_message(error)}") from error
         return list(self.solver.getISAM2Result().getNewFactorsIndices())
 
     def iterate(self) -> bool:

@@ -13,7 +13,7 @@ from gtsam.symbol_shorthand import X
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
-from hybridlio.graph.base.isam import reason
+from hybridlio.graph.base.isam import gtsam_message
 from hybridlio.graph.base.truncated_squares import GRADUATION, chi2_bound, first_control, truncated_weights
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.checks import components
@@ -97,4 +97,4 @@ class _Weighted:
         try:
             return gtsam.LevenbergMarquardtOptimizer(graph, values, self._params).optimize()
         except RuntimeError as error:
-            raise GraphError(f"the graph cannot be solved: {reason(error)}") from error
+            raise GraphError(f"the graph cannot be solved: {gtsam_message(error)}") from error

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import breadth_first_order
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
-from hybridlio.graph.base.isam import reason
+from hybridlio.graph.base.isam import gtsam_message
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.solve.build import Builder
@@ -154,7 +154,7 @@ class Descent:
         try:
             values = optimiser.optimize()
         except RuntimeError as error:
-            raise GraphError(f"the graph cannot be solved: {reason(error)}") from error
+            raise GraphError(f"the graph cannot be solved: {gtsam_message(error)}") from error
         total = done + int(optimiser.iterations())
         return _Stepped(values, stepped.before, float(optimiser.error()), total, total < self._max_iterations)
 

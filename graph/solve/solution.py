@@ -12,7 +12,7 @@ from gtsam.symbol_shorthand import B, V, X
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
-from hybridlio.graph.base.isam import incremental_solver, reason
+from hybridlio.graph.base.isam import gtsam_message, incremental_solver
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key
@@ -151,7 +151,7 @@ class Solution:
         try:
             isam.update(self._solved.graph, self._solved.values)
         except RuntimeError as error:
-            raise GraphError(f"covariances: {reason(error)}") from error
+            raise GraphError(f"covariances: {gtsam_message(error)}") from error
         return isam
 
     def _at(self, key: Key) -> int:

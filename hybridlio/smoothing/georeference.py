@@ -20,14 +20,14 @@ from hybridlio.core.pose_interpolation import PosePath
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.core.trajectory_files import write_tum
-from hybridlio.smoothing.gps_alignment import MAX_SHIFT_S, FixAlignment, align_fixes
+from hybridlio.smoothing.gps_alignment import LEVEL_SIGMA_RAD, MAX_SHIFT_S, FixAlignment, align_fixes
 
 if TYPE_CHECKING:
     from hybridlio.record.record import Record
 
 
 POSES_ENU, TABLE, MAP = "poses_enu_tum.txt", "georeferenced.csv", "georeferenced.geojson"
-_LEVEL_SIGMA_RAD, _GRAVITY_SIGMA_RAD = 0.1, 0.01
+_GRAVITY_SIGMA_RAD = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ def georeference(
     T_imu_lidar = record.calibration.T_imu_lidar
     antenna = record.calibration.antenna_imu_m if antenna_m is None else np.asarray(antenna_m, dtype=np.float64)
     lever = se3.transform(se3.inverse(T_imu_lidar), np.zeros((1, 3)) if antenna is None else antenna[None])[0]
-    up, sigma = np.array([0.0, 0.0, 1.0]), _LEVEL_SIGMA_RAD
+    up, sigma = np.array([0.0, 0.0, 1.0]), LEVEL_SIGMA_RAD
     if record.start.has_imu:
         up, sigma = _up_from_forces(record, trajectory), _GRAVITY_SIGMA_RAD
     path = PosePath(trajectory.stamps_ns, trajectory.poses)

@@ -21,6 +21,7 @@ from hybridlio.core.pose_interpolation import PosePath
 from hybridlio.core.sensors import NS_PER_S, GpsFix
 
 MAX_SHIFT_S = 2.0
+LEVEL_SIGMA_RAD = 0.1
 _LEAST_FIXES = 3
 _GRID_S = 0.05
 _WINDOW = 40  # fixes; within as many a trajectory drifts little, whatever it does over all

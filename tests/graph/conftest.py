@@ -9,5 +9,5 @@ from hybridlio.simulation.chain import Chain, make_chain
 
 @pytest.fixture(scope="session")
 def chain() -> Callable[..., Chain]:
-    """Makes drives: see :func:`make_chain`."""
+    """Return :func:`make_chain`, which makes drives."""
     return make_chain

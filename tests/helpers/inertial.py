@@ -1,4 +1,4 @@
-"""Inertial samples, and states that they are integrated from."""
+"""IMU samples, and states to integrate them from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whole drives through the incremental backend."""
+"""Runs of whole drives through the incremental backend."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hybridlio.graph.run.isam_backend import IncrementalBackend
 
 
 def run(chain: Any) -> tuple[IncrementalBackend, list[State], list[RelativePose]]:
-    """The chain through the backend: states at all scans but the first, and the steps to them."""
+    """Run the chain; return the backend, the states at all scans but the first, and the steps to them."""
     backend = IncrementalBackend(InertialSteps(chain.calibration, chain.noise))
     backend.start(chain.start)
     states, steps = [], []

@@ -5,7 +5,7 @@ from hybridlio.core.errors import DataError
 from hybridlio.graph.base import noise
 
 
-def test_a_residual_of_one_sigma_whitens_to_one(rng: np.random.Generator):
+def test_the_squared_whitened_residual_is_the_mahalanobis_distance(rng: np.random.Generator):
     root = rng.normal(size=(6, 6))
     covariance = root @ root.T + np.eye(6)
     model = noise.gaussian(covariance, "step")
@@ -14,7 +14,7 @@ def test_a_residual_of_one_sigma_whitens_to_one(rng: np.random.Generator):
     assert whitened @ whitened == pytest.approx(residual @ np.linalg.solve(covariance, residual), rel=1e-9)
 
 
-def test_sigmas_whiten_each_component_by_its_own():
+def test_sigmas_whiten_each_component_by_its_sigma():
     np.testing.assert_allclose(noise.sigmas(np.array([0.5, 2.0])).whiten(np.array([1.0, 1.0])), [2.0, 0.5])
 
 
@@ -28,6 +28,6 @@ def test_sigmas_whiten_each_component_by_its_own():
     ],
     ids=["negative", "singular", "not finite", "asymmetric"],
 )
-def test_what_is_no_covariance_is_refused_by_the_name_of_its_owner(covariance: np.ndarray, what: str):
+def test_an_invalid_covariance_is_an_error_with_the_measurements_name(covariance: np.ndarray, what: str):
     with pytest.raises(DataError, match=f"gps 7.*{what}"):
         noise.gaussian(covariance, "gps 7")

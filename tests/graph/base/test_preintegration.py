@@ -1,4 +1,4 @@
-"""Preintegration against closed forms, the simulator's path, Monte Carlo, and a real recording."""
+"""Preintegration against closed forms, the simulated path, Monte Carlo runs, and a real recording."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def step_of(imu: ImuSamples, state: State, noise: ImuNoise = NOISE) -> np.ndarra
 
 
 @pytest.mark.parametrize("seconds", [0.1, 1.0])
-def test_a_steady_turn_under_constant_acceleration_is_predicted_in_closed_form(seconds: float):
+def test_a_steady_turn_under_constant_acceleration_agrees_with_the_closed_form(seconds: float):
     acceleration, rate = np.array([1.5, -2.0, 0.3]), np.array([0.0, 0.0, 0.4])
     R0 = Rotation.from_euler("xyz", [3.0, -4.0, 70.0], degrees=True)
     T0, v0 = se3.make(R0.as_matrix(), [5.0, -3.0, 1.0]), np.array([8.0, 4.0, -0.2])
@@ -39,7 +39,7 @@ def test_a_steady_turn_under_constant_acceleration_is_predicted_in_closed_form(s
     assert np.abs(error[3:]).max() < 1e-5 * seconds**2
 
 
-def test_biases_in_the_state_are_taken_off_the_samples():
+def test_the_states_biases_are_subtracted_from_the_samples():
     times = np.arange(11) / 100
     accel_bias, gyro_bias = np.array([0.1, -0.2, 0.05]), np.array([0.01, 0.02, -0.03])
     T0, v0 = np.eye(4), np.array([10.0, 0.0, 0.0])
@@ -49,7 +49,7 @@ def test_biases_in_the_state_are_taken_off_the_samples():
 
 
 @pytest.mark.parametrize("settings", [{"seed": 1}, {"seed": 2, "speed_m_s": 20.0}], ids=["town", "fast"])
-def test_the_simulators_noise_free_imu_gives_each_step_of_the_path(settings: dict):
+def test_noise_free_simulated_samples_give_the_steps_of_the_path(settings: dict):
     path = plan(SimulationConfig(seconds=8.0, **settings)).path
     for start_s in np.arange(1.0, 6.0, 0.7):
         times = start_s + np.arange(101) / 100
@@ -65,7 +65,7 @@ def test_the_simulators_noise_free_imu_gives_each_step_of_the_path(settings: dic
 
 
 class Truth:
-    """A second of a vehicle's path as an IMU measures it, and the state at its start."""
+    """Part of a vehicle's path as an IMU measures it, and the state at its start."""
 
     def __init__(self, seconds: float) -> None:
         path = plan(SimulationConfig(seconds=4.0, seed=3)).path
@@ -73,7 +73,7 @@ class Truth:
         self.gyro, self.accel = ideal_imu(path, self.times)
         motion = path.motion(self.times[[0, -1]])
         self.state = state_at(motion.poses[0], motion.velocity_m_s[0])
-        # what ideal samples are off by through sampling alone is no part of the noise
+        # from the ideal samples, so that their discretisation error does not count as noise
         self.step = step_of(self.imu(), self.state)
 
     def imu(self, gyro: float | np.ndarray = 0.0, accel: float | np.ndarray = 0.0) -> ImuSamples:
@@ -81,7 +81,7 @@ class Truth:
 
 
 def perturbed(state: State, xi: np.ndarray) -> State:
-    """The state whose truth lies ``xi`` (18 numbers, gravity last) away: truth = estimate ⊕ xi."""
+    """Return the estimate of which the state is ``xi`` (18 numbers, gravity last) off: state = estimate ⊕ xi."""
     return replace(
         state,
         T_world_imu=state.T_world_imu @ se3.exp(-xi[:6]),
@@ -93,7 +93,7 @@ def perturbed(state: State, xi: np.ndarray) -> State:
 
 
 @pytest.mark.parametrize("direction", range(18))
-def test_each_uncertainty_of_the_state_reaches_the_step_as_numerical_differentiation_says(direction: int):
+def test_the_states_covariance_is_propagated_as_by_numerical_differentiation(direction: int):
     truth, unit, small = Truth(1.0), np.eye(18)[direction], 1e-6
     quiet = ImuNoise(1e-9, 1e-9, 1e-12, 1e-12)
     variances = 1e-18 + unit
@@ -102,12 +102,12 @@ def test_each_uncertainty_of_the_state_reaches_the_step_as_numerical_differentia
     _, without = predict_step(preintegrate(truth.imu(), truth.state, quiet), truth.state)
     ends = [step_of(truth.imu(), perturbed(truth.state, sign * small * unit), quiet) for sign in (1, -1)]
     column = se3.log(se3.between(ends[0], ends[1])) / (2 * small)
-    # a gyroscope's bias turns the force within each sample's step too, which its derivative leaves out
+    # a gyroscope bias also rotates the force within each step between samples, which GTSAM's Jacobian leaves out
     tolerance = 2e-5 if direction not in (12, 13, 14) else 0.04 * (column @ column)
     np.testing.assert_allclose(with_unit - without, np.outer(column, column), atol=tolerance)
 
 
-def test_the_claimed_covariance_is_that_of_many_noisy_repetitions(rng: np.random.Generator):
+def test_the_covariance_is_consistent_over_many_noisy_repetitions(rng: np.random.Generator):
     truth, repetitions = Truth(0.5), 500
     sigmas = np.r_[np.full(3, 0.01), np.full(3, 0.1), np.full(3, 0.2), np.full(3, 0.05), np.full(3, 0.005)]
     gravity_sigma = 0.1
@@ -126,7 +126,7 @@ def test_the_claimed_covariance_is_that_of_many_noisy_repetitions(rng: np.random
     assert np.mean(nees) == pytest.approx(1.0, abs=0.08)
 
 
-def test_noise_of_the_samples_alone_is_claimed_as_it_scatters(rng: np.random.Generator):
+def test_the_covariance_from_sample_noise_alone_is_its_scatter(rng: np.random.Generator):
     truth = Truth(0.5)
     white = np.sqrt(100.0) * np.r_[np.full(3, NOISE.gyro_rad_s_sqrt_hz), np.full(3, NOISE.accel_m_s2_sqrt_hz)]
     errors = []
@@ -136,13 +136,13 @@ def test_noise_of_the_samples_alone_is_claimed_as_it_scatters(rng: np.random.Gen
         errors.append(se3.log(se3.between(step, truth.step)))
     _, claimed = predict_step(preintegrate(truth.imu(), truth.state, NOISE), truth.state)
     ratio = np.sqrt(np.diag(claimed)) / np.std(errors, axis=0)
-    np.testing.assert_allclose(ratio, 1.0, atol=0.12)  # three times the scatter of 600 repetitions
+    np.testing.assert_allclose(ratio, 1.0, atol=0.12)  # four standard deviations of a sigma from 600 repetitions
 
 
 # ---------------------------------------------------------------------------------------------- sampling
 
 
-def test_at_100_hz_the_sensors_own_noise_is_nearly_all():
+def test_at_100_hz_the_sensors_own_noise_dominates():
     accel, gyro = sampling_noise(NOISE, 0.01)
     assert NOISE.accel_m_s2_sqrt_hz <= accel < 1.02 * NOISE.accel_m_s2_sqrt_hz
     assert NOISE.gyro_rad_s_sqrt_hz <= gyro < 1.02 * NOISE.gyro_rad_s_sqrt_hz
@@ -154,14 +154,14 @@ def test_noise_grows_with_the_time_between_samples():
     np.testing.assert_allclose(densities[0], (NOISE.accel_m_s2_sqrt_hz, NOISE.gyro_rad_s_sqrt_hz))
 
 
-def test_over_a_gap_the_deviation_in_speed_is_what_a_vehicle_can_do():
+def test_over_a_long_gap_the_speed_is_limited_by_the_vehicles_acceleration():
     accel, gyro = sampling_noise(NOISE, 10.0)
-    # density times the root of the gap: the deviation after it
+    # density times the root of the gap: the standard deviation after it
     assert 10 < accel * np.sqrt(10.0) <= 40.1  # m/s: at most 4 m/s² all along
     assert 1 < gyro * np.sqrt(10.0) <= 6.1  # rad
 
 
-def test_a_vehicles_motion_between_ten_samples_a_second_stays_within_the_noise_they_are_given():
+def test_motion_between_samples_at_10_hz_stays_within_the_sampling_noise():
     path = plan(SimulationConfig(seconds=20.0, seed=5)).path
     nees = []
     for start_s in np.arange(1.0, 19.0, 0.1):
@@ -175,12 +175,12 @@ def test_a_vehicles_motion_between_ten_samples_a_second_stays_within_the_noise_t
     assert np.mean(nees) < 1.0
 
 
-def test_one_sample_cannot_be_summed_up():
+def test_a_single_sample_is_an_error():
     with pytest.raises(DataError, match="1 IMU samples"):
         preintegrate(at_rest(0.0, 0.0), state_at(np.eye(4), np.zeros(3)), NOISE)
 
 
-def test_samples_cover_a_step_when_both_its_ends_are_within_a_millisecond():
+def test_samples_cover_a_step_within_a_millisecond():
     imu = at_rest(0.0, 0.1)
     ms = NS_PER_S // 1000
     assert covers(imu, 0, 100 * ms)
@@ -216,16 +216,16 @@ def errors_over(real: tuple[ImuSamples, np.ndarray, np.ndarray, np.ndarray], ste
     return np.array(errors)
 
 
-# Measured medians: 0.005, 0.022 and 0.068 degrees; 0.15, 14 and 350 mm. The turns are those of a gyroscope that is off
-# by 0.2 mrad/s; the distances those of a force that is off by 0.03 m/s² (0.16 degrees of tilt, or as much bias).
+# Measured medians: 0.005, 0.022 and 0.068 degrees; 0.15, 14 and 350 mm. They correspond to a gyroscope bias of
+# 0.2 mrad/s and to an error of the specific force of 0.03 m/s² (0.16 degrees of tilt, or as much bias).
 @pytest.mark.parametrize(("seconds", "degrees"), [(0.1, 0.01), (1.0, 0.03), (5.0, 0.1)])
-def test_a_real_imu_without_any_bias_known_gives_the_turn_of_a_trajectory(real, seconds: float, degrees: float):
+def test_a_real_imu_with_unknown_biases_gives_the_rotation_of_its_trajectory(real, seconds: float, degrees: float):
     errors = errors_over(real, round(seconds * 10))
     assert np.degrees(np.median(np.linalg.norm(errors[:, :3], axis=1))) < degrees
     distance_m = np.median(np.linalg.norm(errors[:, 3:], axis=1))
     assert distance_m < 3e-4 + 0.04 * seconds**2 / 2
 
 
-def test_the_error_of_a_real_imus_distance_grows_as_the_square_of_time(real):
+def test_the_translation_error_of_a_real_imu_grows_quadratically_with_time(real):
     one, five = (np.median(np.linalg.norm(errors_over(real, steps)[:, 3:], axis=1)) for steps in (10, 50))
     assert five / one == pytest.approx(25, rel=0.25)

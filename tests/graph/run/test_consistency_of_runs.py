@@ -1,4 +1,4 @@
-"""Covariances of whole runs, through `Odometry` and `smooth`, against the truth; benchmarks/consistency.py has more."""
+"""Consistency of covariances of whole runs, by `Odometry` and `smooth`; see also benchmarks/consistency.py."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Simulated:
 
 
 @pytest.mark.parametrize("drift_share", [None, 0.02], ids=["steps", "map"])
-def test_runs_are_as_far_off_as_they_say_online_and_smoothed(chain: Callable[..., Any], drift_share: float | None):
+def test_covariances_of_runs_are_consistent_online_and_smoothed(chain: Callable[..., Any], drift_share: float | None):
     errors: dict[str, list[np.ndarray]] = {"online": [], "smoothed": []}
     covariances: dict[str, list[np.ndarray]] = {"online": [], "smoothed": []}
     for seed in range(700, 708):
@@ -55,6 +55,6 @@ def test_runs_are_as_far_off_as_they_say_online_and_smoothed(chain: Callable[...
             covariances[name].append(trajectory.covariances[1:])
     for name in errors:
         found = pose_consistency(np.concatenate(errors[name]), np.concatenate(covariances[name]))
-        # a drive's average scatters by 0.5: 0.18 for eight
+        # the mean over one drive has a standard deviation of 0.5: 0.18 for eight drives
         assert 0.6 < found.rotation.value < 1.45, name
         assert 0.6 < found.position.value < 1.45, name

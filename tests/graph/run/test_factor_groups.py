@@ -11,8 +11,8 @@ from gtsam.symbol_shorthand import X
 from hybridlio.core import se3
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.estimates import State
-from hybridlio.graph.run.factor_groups import Doubtful, GroupAnswer, GroupFactors
-from hybridlio.graph.run.robust import TREATMENTS
+from hybridlio.graph.run.factor_groups import GroupFactors, GroupSolution, PossibleOutlier
+from hybridlio.graph.run.robust import ROBUST_METHODS
 from hybridlio.graph.run.smooth import smooth
 
 SIGMAS = np.r_[np.full(3, 2e-3), np.full(3, 0.03)]
@@ -21,7 +21,7 @@ WRONG = [3, 4, 9]
 
 
 class Pairs:
-    """Relative poses of scans far apart, the ``WRONG`` ones metres off."""
+    """Relative poses of scans far apart, some of them wrong by metres."""
 
     name = "pairs"
     robust: str | None = "gnc"
@@ -33,19 +33,21 @@ class Pairs:
         i, j = np.array(PAIRS).T
         self.steps = se3.between(poses[i], poses[j]) @ se3.exp(noise)
 
-    def build(self, states: Sequence[State], before: gtsam.Values | None) -> GroupFactors:
-        del states, before
-        return GroupFactors(doubtful=[self._one(*pair, T) for pair, T in zip(PAIRS, self.steps, strict=True)])
+    def build(self, states: Sequence[State], previous: gtsam.Values | None) -> GroupFactors:
+        del states, previous
+        return GroupFactors(possible_outliers=[self._one(*pair, T) for pair, T in zip(PAIRS, self.steps, strict=True)])
 
-    def _one(self, i: int, j: int, step: np.ndarray) -> Doubtful:
+    def _one(self, i: int, j: int, step: np.ndarray) -> PossibleOutlier:
         T = gtsam.Pose3(step)
-        return Doubtful(lambda model: gtsam.BetweenFactorPose3(X(i), X(j), T, model), np.diag(SIGMAS**2), f"{i}-{j}")
+        return PossibleOutlier(
+            lambda model: gtsam.BetweenFactorPose3(X(i), X(j), T, model), np.diag(SIGMAS**2), f"{i}-{j}"
+        )
 
-    def read(self, answer: GroupAnswer) -> Any:
-        return answer
+    def read(self, solution: GroupSolution) -> Any:
+        return solution
 
 
-def multiplied(drive: Any) -> np.ndarray:
+def composed(drive: Any) -> np.ndarray:
     poses = [np.eye(4)]
     for relative in drive.relative:
         poses.append(poses[-1] @ relative.pose)
@@ -61,41 +63,41 @@ def drive(chain: Callable[..., Any]) -> Any:
     return chain(31, steps=60)
 
 
-@pytest.mark.parametrize("treatment", TREATMENTS)
-def test_wrong_measurements_of_a_group_do_not_bend_the_path(drive: Any, treatment: str):
-    record = drive.record(multiplied(drive))
+@pytest.mark.parametrize("robust", ROBUST_METHODS)
+def test_outliers_of_a_group_do_not_distort_the_path(drive: Any, robust: str):
+    record = drive.record(composed(drive))
     clean = smooth(record, groups=[Pairs(drive.poses, [], 1)])
-    bent = smooth(record, groups=[Pairs(drive.poses, WRONG, 1)], robust=treatment)
+    bent = smooth(record, groups=[Pairs(drive.poses, WRONG, 1)], robust=robust)
     naive = Pairs(drive.poses, WRONG, 1)
     naive.robust = None
     assert rmse(smooth(record, groups=[naive]), drive) > 10 * rmse(clean, drive)
     assert rmse(bent, drive) < 2 * rmse(clean, drive) + 0.02
-    answer = bent.found["pairs"]
-    weights = np.delete(answer.weights, WRONG)
-    assert answer.weights[WRONG].max() < 0.15 < weights.min()
-    if treatment == "gnc":
-        assert answer.weights[WRONG].max() == 0
+    solution = bent.found["pairs"]
+    weights = np.delete(solution.weights, WRONG)
+    assert solution.weights[WRONG].max() < 0.15 < weights.min()
+    if robust == "gnc":
+        assert solution.weights[WRONG].max() == 0
         assert weights.min() == 1
 
 
-def test_a_group_sees_the_covariances_of_the_solved_graph(drive: Any):
-    smoothed = smooth(drive.record(multiplied(drive)), groups=[Pairs(drive.poses, [], 1)])
-    answer = smoothed.found["pairs"]
-    joint = answer.covariance([X(10), X(40)])
+def test_a_group_gets_covariances_of_the_solved_graph(drive: Any):
+    smoothed = smooth(drive.record(composed(drive)), groups=[Pairs(drive.poses, [], 1)])
+    solution = smoothed.found["pairs"]
+    joint = solution.covariance([X(10), X(40)])
     T = drive.calibration.T_imu_lidar
     np.testing.assert_allclose(
         se3.rotate_covariance(joint[6:, 6:], se3.inverse(T)), smoothed.trajectory.covariances[40], rtol=1e-6, atol=1e-12
     )
-    assert [state.stamp_ns for state in answer.states] == smoothed.trajectory.stamps_ns.tolist()
+    assert [state.stamp_ns for state in solution.states] == smoothed.trajectory.stamps_ns.tolist()
 
 
-def test_a_treatment_of_no_known_name_is_refused(drive: Any):
+def test_an_unknown_robust_method_is_rejected(drive: Any):
     with pytest.raises(ConfigError, match=r"no 'magic'.*huber.*gnc"):
-        smooth(drive.record(multiplied(drive)), robust="magic")
+        smooth(drive.record(composed(drive)), robust="magic")
 
 
-def test_a_treatment_of_no_known_name_is_refused_before_loops_are_looked_for(drive: Any):
-    told: list[str] = []
+def test_an_unknown_robust_method_is_rejected_before_the_search_for_loops(drive: Any):
+    stages: list[str] = []
     with pytest.raises(ConfigError, match="no 'magic'"):
-        smooth(drive.record(multiplied(drive)), lambda stage, *_: told.append(stage), loops=True, robust="magic")
-    assert told == []
+        smooth(drive.record(composed(drive)), lambda stage, *_: stages.append(stage), loops=True, robust="magic")
+    assert stages == []

@@ -1,4 +1,4 @@
-"""The fixed-lag backend against the incremental one, and its memory."""
+"""The fixed-lag backend: agreement with the incremental one, and constant memory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from hybridlio.graph.run.isam_backend import IncrementalBackend
 
 
 def drive_through(backend: IncrementalBackend, chain: Any, with_imu: bool = True) -> list[int]:
-    """The chain through a backend; how many variables it holds after each step."""
+    """Run the chain through a backend; return the number of its variables after each step."""
     backend.start(chain.start if with_imu else replace(chain.start, has_imu=False))
     sizes = []
     for frame, relative in zip(chain.frames[1:], chain.relative, strict=True):
@@ -34,7 +34,7 @@ def drive_through(backend: IncrementalBackend, chain: Any, with_imu: bool = True
 
 @pytest.mark.parametrize("drift_share", [None, 0.1])
 @pytest.mark.parametrize("with_imu", [True, False], ids=["imu", "no imu"])
-def test_the_newest_state_is_the_incremental_backends(
+def test_the_newest_state_agrees_with_the_incremental_backend(
     chain: Callable[..., Any], with_imu: bool, drift_share: float | None
 ) -> None:
     drive = chain(seed=5, steps=150, drift_share=drift_share)
@@ -54,7 +54,7 @@ def test_the_newest_state_is_the_incremental_backends(
         assert (np.abs(mine - theirs) < 0.02 * np.outer(spread, spread)).all()
 
 
-def test_memory_stops_growing_at_the_lag(chain: Callable[..., Any]) -> None:
+def test_the_number_of_variables_stops_growing_at_the_lag(chain: Callable[..., Any]) -> None:
     drive = chain(seed=6, steps=200, drift_share=0.1)
     sizes = drive_through(FixedLagBackend(InertialSteps(drive.calibration, drive.noise), lag_scans=40), drive)
     assert sizes[20] > sizes[10]
@@ -62,7 +62,7 @@ def test_memory_stops_growing_at_the_lag(chain: Callable[..., Any]) -> None:
     assert min(sizes[60:]) >= 5 * 40
 
 
-def test_factors_take_the_slots_of_those_that_are_forgotten(chain: Callable[..., Any]) -> None:
+def test_new_factors_reuse_the_slots_of_removed_ones(chain: Callable[..., Any]) -> None:
     drive = chain(seed=6, steps=200, drift_share=0.1)
     slots = {}
     for name, backend in (("whole", IncrementalBackend), ("lagged", partial(FixedLagBackend, lag_scans=40))):
@@ -70,18 +70,18 @@ def test_factors_take_the_slots_of_those_that_are_forgotten(chain: Callable[...,
         drive_through(made, drive)
         slots[name] = made._isam.getFactorsUnsafe()
     assert slots["whole"].nrFactors() == slots["whole"].size() > 4 * 200
-    assert slots["lagged"].size() < 1.5 * 4 * 82  # steps between lag and forgetting
+    assert slots["lagged"].size() < 1.5 * 4 * 82  # the lag and one batch of scans
 
 
-def test_a_lag_shorter_than_the_start_needs_is_refused() -> None:
+def test_a_lag_shorter_than_the_warm_up_is_an_error() -> None:
     with pytest.raises(ConfigError, match="too short"):
         FixedLagBackend(InertialSteps(Calibration(), ImuNoise()), lag_scans=5)
 
 
-def test_far_from_the_start_a_step_touches_no_more_of_the_graph_than_near_it(
+def test_a_step_far_from_the_start_updates_only_recent_variables(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """There a milliradian that the whole path turns by is a metre, by which all its scans move alike."""
+    """There, rotating the whole path by a milliradian moves all recent scans by the same metre."""
     touched: list[int] = []
     make = online.incremental_solver
 
@@ -91,7 +91,9 @@ def test_far_from_the_start_a_step_touches_no_more_of_the_graph_than_near_it(
 
         def update(self, graph: gtsam.NonlinearFactorGraph, *arguments: Any) -> None:
             result = self._solver.update(graph, *arguments)
-            touched.extend([result.getVariablesReeliminated()] if graph.size() else [])  # not where scans are forgotten
+            touched.extend(
+                [result.getVariablesReeliminated()] if graph.size() else []
+            )  # not when scans are marginalised
 
         def __getattr__(self, name: str) -> Any:
             return getattr(self._solver, name)

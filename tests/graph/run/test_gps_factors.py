@@ -27,7 +27,7 @@ SIGMA_M = 0.3
 ENU = se3.make(Rotation.from_euler("ZYX", (2.1, 0.0, 0.0)).as_matrix(), (350.0, -120.0, 4.0))
 
 
-def multiplied(drive: Any) -> np.ndarray:
+def composed(drive: Any) -> np.ndarray:
     poses = [np.eye(4)]
     for relative in drive.relative:
         poses.append(poses[-1] @ relative.pose)
@@ -35,7 +35,7 @@ def multiplied(drive: Any) -> np.ndarray:
 
 
 def T_enu_world(drive: Any) -> np.ndarray:
-    """World is the IMU's first pose; level it so that up is up."""
+    """World is the IMU's first pose; rotate it so that gravity points down."""
     down = drive.gravity / np.linalg.norm(drive.gravity)
     axis = np.cross(down, [0.0, 0.0, -1.0])
     angle = np.arccos(np.clip(-down[2], -1, 1))
@@ -44,9 +44,9 @@ def T_enu_world(drive: Any) -> np.ndarray:
 
 
 def with_fixes(drive: Any, seed: int, rate_hz: float = 2.0, sigma_m: float = SIGMA_M, shift_s: float = SHIFT_S) -> Any:
-    """The drive's record with fixes of the antenna; stamps are ``shift_s`` early."""
+    """The drive's record with fixes of the antenna, whose stamps are ``shift_s`` early."""
     rng = np.random.default_rng(seed)
-    record = drive.record(multiplied(drive))
+    record = drive.record(composed(drive))
     stamps = record.online.stamps_ns
     path = PosePath(stamps, drive.poses, drive.velocities)
     seconds = np.arange(0.05, (stamps[-1] - stamps[0]) / 1e9, 1 / rate_hz)
@@ -59,7 +59,7 @@ def with_fixes(drive: Any, seed: int, rate_hz: float = 2.0, sigma_m: float = SIG
 
 
 def rmse_m(smoothed: Any, drive: Any) -> float:
-    """Of the positions, the whole path aligned: where the first pose looked is no more than its own error."""
+    """Of positions after alignment of the whole path, so that the first pose's heading error does not dominate."""
     return ate(Trajectory(smoothed.trajectory.stamps_ns, drive.lidar_poses), smoothed.trajectory, lever_m=0.0).rmse_m
 
 
@@ -73,18 +73,18 @@ def smoothed(drive: Any) -> Any:
     return smooth(with_fixes(drive, 1), gps=True)
 
 
-def test_fixes_lower_the_error(drive: Any, smoothed: Any):
+def test_fixes_reduce_the_error(drive: Any, smoothed: Any):
     record = with_fixes(drive, 1)
     assert rmse_m(smoothed, drive) < 0.75 * rmse_m(smooth(record), drive)
 
 
-def test_the_clocks_difference_is_found_as_well_as_is_said(smoothed: Any):
+def test_the_clock_shift_is_found_within_its_claimed_uncertainty(smoothed: Any):
     fit = smoothed.found["gps"]
     assert fit.shift_sigma_s < 0.03
     assert abs(fit.shift_s - SHIFT_S) < 3 * fit.shift_sigma_s
 
 
-def test_the_frame_of_the_fixes_is_found_as_well_as_is_said(drive: Any, smoothed: Any):
+def test_the_frame_of_the_fixes_is_found_within_its_claimed_uncertainty(drive: Any, smoothed: Any):
     fit = smoothed.found["gps"]
     true = T_enu_world(drive) @ drive.calibration.T_imu_lidar
     error = se3.log(se3.between(fit.T_enu_world, true))
@@ -93,7 +93,7 @@ def test_the_frame_of_the_fixes_is_found_as_well_as_is_said(drive: Any, smoothed
     assert np.abs(error[:3]).max() < 0.05
 
 
-def test_the_nominal_fixes_all_count_and_fit_as_well_as_they_scatter(smoothed: Any):
+def test_fixes_with_nominal_noise_are_all_used(smoothed: Any):
     fit = smoothed.found["gps"]
     assert fit.rejected.sum() == 0
     assert fit.noise_scale < 1.3
@@ -111,7 +111,7 @@ def without_wrong(drive: Any) -> Any:
 
 
 @pytest.mark.parametrize("robust", ["cauchy", "geman-mcclure", "gnc"])
-def test_wrong_fixes_are_rejected_and_counted(drive: Any, without_wrong: Any, robust: str):
+def test_wrong_fixes_are_rejected_and_listed(drive: Any, without_wrong: Any, robust: str):
     record = with_fixes(drive, 1)
     rng = np.random.default_rng(2)
     fixes = list(record.gps)
@@ -133,29 +133,29 @@ def test_an_outage_is_bridged_by_odometry_and_imu(drive: Any, smoothed: Any):
     assert rmse_m(out, drive) < 2 * rmse_m(smoothed, drive)
 
 
-def test_fixes_that_claim_too_much_are_taken_for_what_they_scatter(drive: Any):
+def test_overconfident_fixes_are_scaled_to_their_scatter(drive: Any):
     record = with_fixes(drive, 1)
-    boasting = tuple(replace(fix, covariance_m2=fix.covariance_m2 / 100) for fix in record.gps)
-    fit = smooth(replace(record, gps=boasting), gps=True).found["gps"]
+    overconfident = tuple(replace(fix, covariance_m2=fix.covariance_m2 / 100) for fix in record.gps)
+    fit = smooth(replace(record, gps=overconfident), gps=True).found["gps"]
     assert fit.noise_scale == pytest.approx(10.0, rel=0.35)
     assert fit.rejected.sum() == 0
 
 
-def test_without_imu_fixes_still_help(drive: Any):
+def test_fixes_reduce_the_error_without_imu(drive: Any):
     record = with_fixes(drive, 1)
     start = start_state(int(record.online.stamps_ns[0]), ImuSamples.empty(), drive.noise)
     record = replace(record, imu=ImuSamples.empty(), start=start)
     assert rmse_m(smooth(record, gps=True), drive) < 0.75 * rmse_m(smooth(record), drive)
 
 
-def test_a_fixes_clock_that_is_known_is_not_searched(drive: Any):
+def test_a_known_clock_shift_is_kept(drive: Any):
     record = with_fixes(drive, 1, shift_s=0.0)
     fit = smooth(record, gps=GpsOptions(max_shift_s=0.0)).found["gps"]
     assert abs(fit.shift_s) < 1e-6
     assert fit.shift_sigma_s < 1e-5
 
 
-def test_too_few_fixes_are_a_clear_error(drive: Any):
+def test_too_few_fixes_are_an_error(drive: Any):
     record = with_fixes(drive, 1)
     with pytest.raises(EstimationError, match=r"2 of 2 GPS fixes lie in the run's time; 3 are needed"):
         smooth(replace(record, gps=record.gps[5:7]), gps=True)
@@ -163,12 +163,12 @@ def test_too_few_fixes_are_a_clear_error(drive: Any):
         smooth(replace(record, gps=()), gps=True)
 
 
-def test_antennas_are_three_finite_numbers():
+def test_an_antenna_must_be_three_finite_numbers():
     with pytest.raises(DataError, match="antenna_imu_m"):
         Calibration(antenna_imu_m=np.array([1.0, np.nan, 0.0]))
 
 
-def test_the_plumb_factors_jacobian_agrees_with_differences(drive: Any):
+def test_the_jacobian_of_the_plumb_factor_agrees_with_differences(drive: Any):
     rng = np.random.default_rng(3)
     values = gtsam.Values()
     values.insert(E(0), gtsam.Pose3(se3.exp(rng.normal(size=6))))
@@ -187,12 +187,12 @@ def test_the_plumb_factors_jacobian_agrees_with_differences(drive: Any):
     np.testing.assert_allclose(jacobian, np.column_stack(columns), rtol=1e-4, atol=1e-3)
 
 
-def test_the_same_group_goes_with_others(drive: Any):
+def test_the_gps_group_can_be_passed_like_any_other_group(drive: Any):
     record = with_fixes(drive, 1)
     assert set(smooth(record, groups=[GpsGroup(record)]).found) == {"gps"}
 
 
-def test_fixes_that_are_mostly_rejected_are_doubtful_and_count_as_used_only_where_they_are(drive: Any):
+def test_a_fit_is_doubtful_if_most_fixes_are_rejected_and_its_summary_counts_the_others(drive: Any):
     record = with_fixes(drive, 1, shift_s=0.0)
     fit = smooth(record, gps=GpsOptions(max_shift_s=0.0)).found["gps"]
     assert not fit.is_doubtful

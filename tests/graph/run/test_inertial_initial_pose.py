@@ -1,4 +1,4 @@
-"""Initial poses by preintegration, with samples, without some and without any."""
+"""Initial poses by preintegration, with all samples, with some missing and with none."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def straight(steps: int, mount: np.ndarray = IDENTITY) -> tuple[State, Callable[
     return state, lambda imu: Frame(3, empty_scan(steps * NS_PER_S // 10), imu, calibration=Calibration(mount))
 
 
-def test_the_prediction_is_of_the_lidar_not_of_the_imu():
+def test_the_predicted_step_is_the_lidars_not_the_imus():
     mount = se3.make(Rotation.from_euler("z", 90, degrees=True).as_matrix(), [1.0, 0.0, 0.5])
     state, frame = straight(1, mount)
     predicted = Preintegration(InertialSteps(Calibration(mount), NOISE)).predict(frame(at_rest(0.0, 0.1)), state)
@@ -41,7 +41,7 @@ def test_the_prediction_is_of_the_lidar_not_of_the_imu():
     [ImuSamples.empty(), at_rest(0.0, 0.05), at_rest(0.05, 0.1)],
     ids=["none in this step", "ends early", "starts late"],
 )
-def test_where_samples_are_missing_it_coasts_and_says_so(imu: ImuSamples):
+def test_missing_samples_give_a_constant_velocity_step_that_is_not_ok(imu: ImuSamples):
     state, frame = straight(1)
     source = Preintegration(InertialSteps(Calibration(), NOISE))
     coasted, sure = source.predict(frame(imu), state), source.predict(frame(at_rest(0.0, 0.1)), state)
@@ -51,7 +51,7 @@ def test_where_samples_are_missing_it_coasts_and_says_so(imu: ImuSamples):
     assert (np.diag(coasted.covariance) > np.diag(sure.covariance)).all()
 
 
-def test_coasting_goes_on_with_the_last_turn():
+def test_without_samples_the_last_rate_of_turn_continues():
     mount = se3.make(Rotation.from_euler("z", 90, degrees=True).as_matrix(), [1.0, 0.0, 0.5])
     state, frame = straight(1, mount)
     source = Preintegration(InertialSteps(Calibration(mount), NOISE))
@@ -62,7 +62,7 @@ def test_coasting_goes_on_with_the_last_turn():
     np.testing.assert_allclose(coasted.pose[:3, :3], turn, atol=1e-9)
 
 
-def test_longer_coasting_is_less_sure():
+def test_uncertainty_grows_with_the_time_without_samples():
     source = Preintegration(InertialSteps(Calibration(), NOISE))
     sigmas = []
     for steps in (1, 3, 10):
@@ -71,7 +71,7 @@ def test_longer_coasting_is_less_sure():
     assert (np.diff(sigmas, axis=0) > 0).all()
 
 
-def test_before_the_first_samples_the_last_step_is_carried_on_and_it_says_so_once(caplog: pytest.LogCaptureFixture):
+def test_before_the_first_samples_the_last_step_continues_with_one_warning(caplog: pytest.LogCaptureFixture):
     state, frame = straight(1)
     state, blank = replace(state, has_imu=False), frame(ImuSamples.empty())
     source = Preintegration(InertialSteps(Calibration(), NOISE))
@@ -84,15 +84,17 @@ def test_before_the_first_samples_the_last_step_is_carried_on_and_it_says_so_onc
     ]
 
 
-def test_samples_are_summed_up_once_for_the_same_step_and_anew_for_another():
+def test_samples_are_preintegrated_once_for_equal_inputs_and_again_for_others():
     steps, (state, frame) = InertialSteps(Calibration(), NOISE), straight(1)
     asked = frame(at_rest(0.0, 0.1))
-    first = steps.sum(asked, state)
+    first = steps.preintegrated(asked, state)
     assert first is not None
-    assert steps.sum(replace(asked, index=7), state) is first
+    assert steps.preintegrated(replace(asked, index=7), state) is first
+    assert steps.preintegrated(replace(asked, imu=at_rest(0.0, 0.1)), replace(state)) is first
     assert steps.predicted(asked, state) is steps.predicted(asked, state)
     other = replace(state, accel_bias_m_s2=np.array([0.1, 0.0, 0.0]))
-    assert steps.sum(asked, other) is not first
-    assert steps.sum(replace(asked, imu=at_rest(0.0, 0.1)), state) is not first
-    assert steps.sum(asked, replace(state, has_imu=False)) is None
+    assert steps.preintegrated(asked, other) is not first
+    faster = replace(asked.imu, gyro_rad_s=np.full((11, 3), 0.01))
+    assert steps.preintegrated(replace(asked, imu=faster), state) is not first
+    assert steps.preintegrated(asked, replace(state, has_imu=False)) is None
     assert steps.predicted(frame(ImuSamples.empty()), state) is None

@@ -1,4 +1,4 @@
-"""The incremental backend on drives of known noise, on long straight roads, and with parts of the input missing."""
+"""The incremental backend: start, long straight roads, agreement with smoothing, and missing measurements."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from hybridlio.graph.run import factors
 from hybridlio.graph.run.inertial_initial_pose import Preintegration
 from hybridlio.graph.run.inertial_steps import InertialSteps
 from hybridlio.graph.run.isam_backend import IncrementalBackend
-from hybridlio.graph.run.scan_numbers import Scans
+from hybridlio.graph.run.scan_numbers import ScanNumbers
 from hybridlio.graph.run.smooth import smooth
 from hybridlio.simulation.drive.path import SmoothPath
 
 STRAIGHT = RelativePose(
     se3.make(np.eye(3), [1.0, 0.0, 0.0]), np.diag(np.r_[np.full(3, 1e-3), np.full(3, 0.02)] ** 2), "straight"
 )
-NEVER_TRUE = RelativePose(se3.exp(np.array([0.2, -0.3, 0.5, 5.0, -3.0, 2.0])), 1e-6 * np.eye(6), "broken", ok=False)
+FAILED = RelativePose(se3.exp(np.array([0.2, -0.3, 0.5, 5.0, -3.0, 2.0])), 1e-6 * np.eye(6), "broken", ok=False)
 
 
 def sigmas_off(error: np.ndarray, covariance: np.ndarray) -> float:
@@ -41,12 +41,12 @@ def sigmas_off(error: np.ndarray, covariance: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("speed", [0.0, 15.0, 30.0])
-def test_the_unknown_speed_is_found_after_a_few_relative_poses(chain: Callable[..., Any], speed: float):
+def test_the_unknown_speed_is_found_within_a_few_steps(chain: Callable[..., Any], speed: float):
     drive = chain(7, steps=5, speed=speed)
     state = run(drive)[1][-1]
     error = state.velocity_m_s - drive.velocities[5]
     assert sigmas_off(error, state.covariance[6:9, 6:9]) < 2.5
-    assert np.linalg.norm(error) < 0.4  # 2 cm in 0.1 s are 0.2 m/s
+    assert np.linalg.norm(error) < 0.4  # a registration error of 2 cm in 0.1 s is 0.2 m/s
 
 
 def test_the_gyroscopes_bias_converges(chain: Callable[..., Any]):
@@ -59,8 +59,8 @@ def test_the_gyroscopes_bias_converges(chain: Callable[..., Any]):
     assert sigma[-1] < 0.15 * sigma[0]
 
 
-def test_a_drive_that_begins_in_a_hard_bend_finds_down_all_the_same(chain: Callable[..., Any]):
-    """The mean force there is 0.25 rad off vertical."""
+def test_gravity_is_found_when_the_drive_begins_in_a_hard_bend(chain: Callable[..., Any]):
+    """The mean specific force there is 0.25 rad off vertical."""
     times = np.arange(-0.5, 8.0, 0.05)
     yaw = 0.25 * times
     position = 40.0 * np.column_stack([np.sin(yaw), 1 - np.cos(yaw), np.zeros(len(times))])  # 10 m/s, 2.5 m/s²
@@ -77,7 +77,7 @@ def test_a_drive_that_begins_in_a_hard_bend_finds_down_all_the_same(chain: Calla
     assert sigmas_off(state.accel_bias_m_s2 - drive.accel_biases[-1], state.covariance[9:12, 9:12]) < 2
 
 
-# --------------------------------------------------------------------------------------- long, straight, constant
+# -------------------------------------------------------------------------------------------- long, straight, constant
 
 
 def straight_frame(k: int) -> Frame:
@@ -93,18 +93,18 @@ def test_a_straight_road_of_five_thousand_poses_is_solved():
     for k in range(5000):
         values = gtsam.Values()
         factors.insert_state(values, k + 1, replace(start, T_world_imu=se3.make(np.eye(3), [k + 1.0, 0.0, 0.0])))
-        solver.update(factors.step_factors(k, start, STRAIGHT, None, 0, np.eye(4), Scans(0)), values)
+        solver.update(factors.step_factors(k, start, STRAIGHT, None, 0, np.eye(4), ScanNumbers(0)), values)
         if k % 500 == 499:
             spread.append(np.sqrt(np.diag(solver.marginalCovariance(X(k + 1)))))
     end = solver.calculateEstimatePose3(X(5000)).matrix()
     np.testing.assert_allclose(end, se3.make(np.eye(3), [5000.0, 0.0, 0.0]), atol=1e-6)
     assert (np.diff(spread, axis=0) > 0).all()
-    # along the road the steps' variances add up; across it the turns' do, times the distances still to go
+    # along the road the variances of the steps add up; across it those of the rotations, times the remaining distance
     np.testing.assert_allclose(spread[-1][3], 0.02 * np.sqrt(5000), rtol=1e-3)
     np.testing.assert_allclose(spread[-1][4], 1e-3 * np.sqrt(5000**3 / 3), rtol=1e-2)
 
 
-def test_a_straight_road_of_a_thousand_poses_with_imu_is_solved_without_touching_the_past(
+def test_a_straight_road_of_a_thousand_poses_with_imu_is_solved_without_updating_old_poses(
     monkeypatch: pytest.MonkeyPatch,
 ):
     eliminated: list[int] = []
@@ -127,15 +127,15 @@ def test_a_straight_road_of_a_thousand_poses_with_imu_is_solved_without_touching
         end = backend.update(straight_frame(k), STRAIGHT)
     np.testing.assert_allclose(end.T_world_imu, se3.make(np.eye(3), [1000.0, 0.0, 0.0]), atol=0.01)
     np.testing.assert_allclose(end.velocity_m_s, [10.0, 0.0, 0.0], atol=1e-3)
-    # of the four variables a scan has, those of the last few scans
+    # a scan has four variables: only those of the last few scans are eliminated again
     assert np.median(eliminated[-200:]) == np.median(eliminated[100:300])
     assert max(eliminated[100:]) < 60
 
 
-# -------------------------------------------------------------------------------------------- against the batch
+# --------------------------------------------------------------------------------------------------- against smoothing
 
 
-def test_online_and_offline_agree_on_the_newest_pose(chain: Callable[..., Any]):
+def test_incremental_and_smoothed_estimates_of_the_newest_pose_agree(chain: Callable[..., Any]):
     drive = chain(11, steps=60)
     _, states, _ = run(drive)
     T = drive.calibration.T_imu_lidar
@@ -151,7 +151,7 @@ def test_online_and_offline_agree_on_the_newest_pose(chain: Callable[..., Any]):
     np.testing.assert_allclose(batch.velocities_m_s[-1], states[-1].velocity_m_s, atol=0.02)
 
 
-# ---------------------------------------------------------------------------------------------- what goes in once
+# ------------------------------------------------------------------------------------ missing and repeated information
 
 
 def warmed_up(chain: Callable[..., Any], steps: int = 30) -> tuple[Any, IncrementalBackend, State]:
@@ -163,7 +163,7 @@ def warmed_up(chain: Callable[..., Any], steps: int = 30) -> tuple[Any, Incremen
     return drive, backend, state
 
 
-def test_a_relative_pose_made_from_the_imu_leaves_the_estimate_as_the_imu_alone_has_it(chain: Callable[..., Any]):
+def test_a_relative_pose_made_from_the_imu_does_not_change_the_imus_estimate(chain: Callable[..., Any]):
     drive, backend, before = warmed_up(chain)
     predicted = Preintegration(InertialSteps(drive.calibration, drive.noise)).predict(drive.frames[-1], before)
     backend.update(drive.frames[-1], predicted)
@@ -172,7 +172,7 @@ def test_a_relative_pose_made_from_the_imu_leaves_the_estimate_as_the_imu_alone_
     np.testing.assert_allclose(np.diag(step.covariance), np.diag(predicted.covariance), rtol=0.1)
 
 
-def test_the_same_pose_from_elsewhere_is_information(chain: Callable[..., Any]):
+def test_the_same_relative_pose_from_another_sensor_reduces_the_uncertainty(chain: Callable[..., Any]):
     drive, backend, before = warmed_up(chain)
     predicted = Preintegration(InertialSteps(drive.calibration, drive.noise)).predict(drive.frames[-1], before)
     backend.update(drive.frames[-1], replace(predicted, from_imu=False))
@@ -181,7 +181,7 @@ def test_the_same_pose_from_elsewhere_is_information(chain: Callable[..., Any]):
 
 def test_a_failed_relative_pose_is_bridged_by_the_imu(chain: Callable[..., Any]):
     drive, backend, _ = warmed_up(chain)
-    state = backend.update(drive.frames[-1], NEVER_TRUE)
+    state = backend.update(drive.frames[-1], FAILED)
     assert sigmas_off(pose_error(state, drive.poses[-1]), state.covariance[:6, :6]) < 2.5
     assert np.linalg.norm(pose_error(state, drive.poses[-1])[3:]) < 0.5
 
@@ -189,7 +189,7 @@ def test_a_failed_relative_pose_is_bridged_by_the_imu(chain: Callable[..., Any])
 def test_two_seconds_of_failed_relative_poses_are_bridged_and_their_uncertainty_grows(chain: Callable[..., Any]):
     drive = chain(13, steps=60)
     for k in range(30, 50):
-        drive.relative[k] = NEVER_TRUE
+        drive.relative[k] = FAILED
     _, states, _ = run(drive)
     spread = [np.trace(s.covariance[3:6, 3:6]) for s in states]
     assert (np.diff(spread[30:50]) > 0).all()
@@ -212,7 +212,7 @@ def test_missing_samples_are_bridged_by_the_relative_poses(chain: Callable[..., 
         assert sigmas_off(state.velocity_m_s - drive.velocities[k + 1], state.covariance[6:9, 6:9]) < 2.5
 
 
-def test_without_imu_the_poses_are_the_relative_poses_multiplied(chain: Callable[..., Any]):
+def test_without_imu_the_poses_are_the_composed_relative_poses(chain: Callable[..., Any]):
     drive = chain(15, steps=30)
     frames = [replace(frame, imu=ImuSamples.empty()) for frame in drive.frames]
     start = start_state(frames[0].scan.stamp_ns, ImuSamples.empty(), drive.noise)
@@ -227,7 +227,7 @@ def test_without_imu_the_poses_are_the_relative_poses_multiplied(chain: Callable
     np.testing.assert_allclose(step.covariance, drive.relative[-1].covariance, rtol=1e-3, atol=1e-9)
 
 
-def test_a_second_start_forgets_the_first(chain: Callable[..., Any]):
+def test_a_second_start_resets_the_graph(chain: Callable[..., Any]):
     drive = chain(16, steps=25)
     backend, states, _ = run(drive)
     backend.start(drive.start)

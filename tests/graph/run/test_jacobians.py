@@ -1,8 +1,8 @@
-"""The derivative that each kind of factor gives GTSAM, against central differences of its whitened residual.
+"""The Jacobian of each kind of factor against central differences of its whitened residual.
 
-Steps are along GTSAM's own tangent vectors (``Values.retract``), at values that fit and at values far from what was
-measured. Entries agree to ``TOLERANCE`` of their row's largest; the differences themselves are good to about 1e-9.
-Without robust kernels, whose weights are no derivative but stand for one.
+Steps are along GTSAM's tangent vectors (``Values.retract``), at values that fit the measurement and at values far from
+it. Entries agree to ``TOLERANCE`` of the largest in their row; the differences are accurate to about 1e-9. Robust
+kernels are left out: they reweight residuals and have no exact Jacobian.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from hybridlio.graph.base.preintegration import preintegrate
 from hybridlio.graph.model.coordinates import from_matrices
 from hybridlio.graph.run import factors
 from hybridlio.graph.run.gps_factors import GpsGroup, _plumb_factor
-from hybridlio.graph.run.scan_numbers import Scans
+from hybridlio.graph.run.scan_numbers import ScanNumbers
 from hybridlio.graph.solve.build import Builder
 
 STEP = 1e-5
@@ -51,7 +51,7 @@ def covariance(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def pose_graph(dimension: int) -> Case:
-    """Poses that fit their priors and between-factors, and every other kind of factor where there is one."""
+    """Poses that fit their priors and between-factors, and every other kind of factor of that dimension."""
     rng = np.random.default_rng(7)
     graph, size = PoseGraph(dimension), 6 if dimension == 3 else 3
     poses = [pose(rng, dimension) for _ in range(3)]
@@ -75,7 +75,7 @@ def pose_graph(dimension: int) -> Case:
 
 
 def odometry() -> Case:
-    """A start, then a step of every kind: samples, a bridge, a relative pose, a map's path, a keyframe."""
+    """A start, then every kind of step: samples, a bridge, a relative pose, the map path, an earlier scan."""
     rng = np.random.default_rng(8)
     begin = start_state(0, samples(rng), ImuNoise())
     after = [replace(begin, stamp_ns=100_000_000 * k, T_world_imu=pose(rng)) for k in (1, 2)]
@@ -89,20 +89,20 @@ def odometry() -> Case:
     step = se3.between(*(states[k].T_world_imu @ mount for k in (0, 1)))
     relative = RelativePose(step, covariance(rng, 6), "test")
     made.append(factors.between_factor(X(0), X(1), relative, relative.covariance, mount))
-    made += factors.map_factors(0, relative, 0.3 * relative.covariance, mount, fresh=True)
-    scans = Scans(begin.stamp_ns)
+    made += factors.map_path_factors(0, relative, 0.3 * relative.covariance, mount, starts_path=True)
+    scans = ScanNumbers(begin.stamp_ns)
     for state in after:
-        scans.add(state.stamp_ns, on_path=False)
+        scans.add(state.stamp_ns, on_map_path=False)
     to_first = se3.between(begin.T_world_imu @ mount, after[1].T_world_imu @ mount)
-    keyframes = (EarlierScanPose(begin.stamp_ns, to_first, covariance(rng, 6)),)
-    made += factors.earlier_scan_factors(2, replace(relative, earlier_scans=keyframes), scans, mount)
+    earlier = (EarlierScanPose(begin.stamp_ns, to_first, covariance(rng, 6)),)
+    made += factors.earlier_scan_factors(2, replace(relative, earlier_scans=earlier), scans, mount)
     made += factors.imu_factors(0, 1, preintegrate(samples(rng), begin, ImuNoise()))
     made += factors.bridge_factors(1, 2, 0.1)
     return made, values
 
 
 def fixes(chain: Callable[..., Any]) -> Case:
-    """What smoothing adds for fixes of an antenna off the IMU, by a clock of their own."""
+    """Factors of fixes of an antenna beside the IMU, with a clock of their own."""
     drive = chain(51, steps=60)
     stamps = np.array([frame.scan.stamp_ns for frame in drive.frames])
     states = [
@@ -120,11 +120,11 @@ def fixes(chain: Callable[..., Any]) -> Case:
         values.insert(X(k), gtsam.Pose3(state.T_world_imu))
     values.insert(G(0), drive.gravity)
     without_imu = _plumb_factor(start_state(0, ImuSamples.empty(), ImuNoise()))
-    return [*group.sure, *(doubtful.factor() for doubtful in group.doubtful), without_imu], values
+    return [*group.trusted, *(one.factor() for one in group.possible_outliers), without_imu], values
 
 
 def whitened(factor: Any, values: gtsam.Values) -> tuple[np.ndarray, np.ndarray]:
-    """Derivative and residual."""
+    """Jacobian and residual."""
     jacobian, negative = factor.linearize(values).jacobian()
     return jacobian, -negative
 
@@ -143,7 +143,7 @@ def differences(factor: Any, values: gtsam.Values) -> np.ndarray:
 
 
 def only(values: gtsam.Values, keys: list[int]) -> gtsam.Values:
-    """A copy of what one factor needs, so that moving it is quick."""
+    """A copy of the values of some keys, so that retracting it is fast."""
     some = gtsam.Values(values)
     for key in set(values.keys()) - set(keys):
         some.erase(key)
@@ -182,7 +182,7 @@ def cases(chain: Callable[..., Any]) -> dict[str, Case]:
 
 @pytest.mark.parametrize("where", ["at values that fit", "far from them"])
 @pytest.mark.parametrize("case", KINDS)
-def test_every_factors_derivative_agrees_with_differences(cases, case, where):
+def test_the_jacobian_of_every_factor_agrees_with_differences(cases, case, where):
     made, values = cases[case]
     rng = np.random.default_rng(9)
     assert {type(factor).__name__ for factor in made} == KINDS[case]
@@ -194,8 +194,8 @@ def test_every_factors_derivative_agrees_with_differences(cases, case, where):
         assert apart.max() < TOLERANCE, f"{type(factor).__name__}: {apart.max():.1e} apart"
 
 
-def test_the_whitened_residual_is_the_one_that_makes_the_error(cases):
-    """What the differences are taken of is what the solver minimises."""
+def test_the_error_is_half_the_squared_whitened_residual(cases):
+    """So the differences are taken of what the solver minimises."""
     for made, values in cases.values():
         here = moved(values, np.random.default_rng(10))
         for factor in made:
@@ -203,7 +203,7 @@ def test_the_whitened_residual_is_the_one_that_makes_the_error(cases):
             assert factor.error(here) == pytest.approx(residual @ residual / 2, rel=1e-9, abs=1e-12)
 
 
-def test_a_wrong_derivative_is_found():
+def test_a_wrong_jacobian_is_detected():
     def error(_: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
         z = values.atVector(G(0))
         if jacobians is not None:

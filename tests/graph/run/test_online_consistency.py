@@ -1,4 +1,4 @@
-"""The incremental backend's covariances against what it is off by in many drives."""
+"""Consistency of the incremental backend's covariances with its errors over many drives."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from hybridlio.evaluation.consistency import Anees, anees
 def many(
     request: pytest.FixtureRequest, chain: Callable[..., Any]
 ) -> list[tuple[Any, list[State], list[RelativePose]]]:
-    """Twenty-four drives of 2.5 s, each with biases, gravity and noise of its own.
+    """Twenty-four drives of 2.5 s, each with its own biases, gravity and noise.
 
-    Their relative poses err independently of each other, or are of matching to a map that drifts slowly.
+    The errors of their relative poses are independent, or those of registration to a slowly drifting map.
     """
     drives = [chain(seed, steps=25, drift_share=request.param) for seed in range(100, 124)]
     return [(drive, *run(drive)[1:]) for drive in drives]
@@ -32,15 +32,15 @@ def parts(errors: list[np.ndarray], covariances: list[np.ndarray]) -> dict[str, 
 
 
 @pytest.mark.parametrize("part", ["rotation", "position"])
-def test_poses_are_as_far_off_as_their_covariances_say(many: Any, part: str):
-    # a drive's average scatters by 0.5 around 1 from drive to drive (its errors hang together): 0.1 for all
+def test_covariances_of_poses_are_consistent(many: Any, part: str):
+    # errors within a drive are correlated: its mean has a standard deviation of 0.5; the mean of all drives, 0.1
     errors = [pose_error(s, T) for drive, states, _ in many for s, T in zip(states, drive.poses[1:], strict=True)]
     covariances = [s.covariance[:6, :6] for _, states, _ in many for s in states]
     assert 0.8 < parts(errors, covariances)[part].value < 1.25
 
 
 @pytest.mark.parametrize("part", ["rotation", "position"])
-def test_steps_are_as_far_off_as_their_covariances_say(many: Any, part: str):
+def test_covariances_of_steps_are_consistent(many: Any, part: str):
     errors, covariances = [], []
     for drive, _, steps in many:
         truth = se3.between(drive.lidar_poses[:-1], drive.lidar_poses[1:])
@@ -57,7 +57,7 @@ def test_steps_are_as_far_off_as_their_covariances_say(many: Any, part: str):
         ("gyro_bias_rad_s", slice(12, 15), "gyro_biases"),
     ],
 )
-def test_velocity_and_biases_are_as_far_off_as_their_covariances_say(many: Any, name: str, block: slice, of_truth: str):
+def test_covariances_of_velocity_and_biases_are_consistent(many: Any, name: str, block: slice, of_truth: str):
     errors, covariances = [], []
     for drive, states, _ in many:
         errors += list(np.array([getattr(s, name) for s in states]) - getattr(drive, of_truth)[1:])
@@ -65,15 +65,15 @@ def test_velocity_and_biases_are_as_far_off_as_their_covariances_say(many: Any, 
     assert 0.6 < anees(np.array(errors), np.array(covariances)).value < 1.45
 
 
-def test_gravity_is_as_far_off_as_its_covariance_says_once_a_second_has_passed(many: Any):
+def test_the_covariance_of_gravity_is_consistent_after_a_second(many: Any):
     errors = [s.gravity_m_s2 - drive.gravity for drive, states, _ in many for s in states[10:]]
     covariances = [s.gravity_covariance for _, states, _ in many for s in states[10:]]
-    # hardly changes along a drive: 24 values of three dimensions scatter by 0.17
+    # nearly constant along a drive: the mean of 24 values of three dimensions has a standard deviation of 0.17
     assert 0.5 < anees(np.array(errors), np.array(covariances)).value < 1.5
 
 
-def test_covariances_notice_noise_that_is_twice_what_was_claimed(chain: Callable[..., Any]):
-    """The check above can fail: relative poses twice as noisy show in it."""
+def test_twice_the_claimed_noise_is_inconsistent(chain: Callable[..., Any]):
+    """The checks above can fail: relative poses with twice the claimed noise make them."""
     errors, covariances = [], []
     for seed in range(5):
         drive = chain(seed, steps=30, step_error=2.0)

@@ -24,8 +24,8 @@ ALMOST_NONE = ImuNoise(1e-6, 1e-6, 1e-9, 1e-9, 1e-6, 1e-6)
 TIGHT = np.r_[np.full(3, 1e-5), np.full(3, 1e-4)]
 
 
-def multiplied(drive: Any) -> np.ndarray:
-    """What the relative poses alone make of the drive."""
+def composed(drive: Any) -> np.ndarray:
+    """The drive's relative poses, composed."""
     poses = [np.eye(4)]
     for relative in drive.relative:
         poses.append(poses[-1] @ relative.pose)
@@ -37,7 +37,7 @@ def errors_of(poses: np.ndarray, drive: Any) -> np.ndarray:
 
 
 def rms(errors: np.ndarray) -> tuple[float, float]:
-    """Of rotations in rad and positions in m."""
+    """Root mean squares of rotations in rad and of positions in m."""
     squares = errors[:, :3] ** 2, errors[:, 3:] ** 2
     return float(np.sqrt(squares[0].sum(axis=1).mean())), float(np.sqrt(squares[1].sum(axis=1).mean()))
 
@@ -45,12 +45,12 @@ def rms(errors: np.ndarray) -> tuple[float, float]:
 @pytest.fixture(scope="module", params=[None, 0.02], ids=["steps", "map"])
 def many(request: pytest.FixtureRequest, chain: Callable[..., Any]) -> list[tuple[Any, Smoothed]]:
     drives = [chain(seed, steps=40, drift_share=request.param) for seed in range(200, 216)]
-    return [(drive, smooth(drive.record(multiplied(drive)))) for drive in drives]
+    return [(drive, smooth(drive.record(composed(drive)))) for drive in drives]
 
 
-def test_factors_without_noise_give_the_truth(chain: Callable[..., Any]):
+def test_measurements_without_noise_give_the_true_states(chain: Callable[..., Any]):
     drive = chain(1, steps=30, imu_noise=ALMOST_NONE, step_sigmas=TIGHT, step_error=0.0)
-    smoothed = smooth(drive.record(multiplied(drive)))
+    smoothed = smooth(drive.record(composed(drive)))
     rotation, position = rms(errors_of(smoothed.trajectory.poses, drive))
     assert rotation < 2e-5
     assert position < 2e-4
@@ -59,9 +59,9 @@ def test_factors_without_noise_give_the_truth(chain: Callable[..., Any]):
     assert smoothed.converged
 
 
-def test_a_poor_start_leads_to_the_same_answer(chain: Callable[..., Any]):
+def test_a_poor_initial_estimate_leads_to_the_same_solution(chain: Callable[..., Any]):
     drive = chain(2, steps=30)
-    rng, poses = np.random.default_rng(0), multiplied(drive)
+    rng, poses = np.random.default_rng(0), composed(drive)
     off = poses @ se3.exp(np.r_[np.full(3, 0.05), np.full(3, 0.5)] * rng.standard_normal((len(poses), 6)))
     off[0] = np.eye(4)
     near, far = smooth(drive.record(poses)), smooth(drive.record(off))
@@ -70,8 +70,8 @@ def test_a_poor_start_leads_to_the_same_answer(chain: Callable[..., Any]):
     assert far.error_after == pytest.approx(near.error_after, rel=1e-2)
 
 
-def test_smoothing_lowers_the_error_of_the_relative_poses_alone(many: list[tuple[Any, Smoothed]]):
-    before = np.array([rms(errors_of(multiplied(drive), drive)) for drive, _ in many])
+def test_smoothing_reduces_the_error_of_composed_relative_poses(many: list[tuple[Any, Smoothed]]):
+    before = np.array([rms(errors_of(composed(drive), drive)) for drive, _ in many])
     after = np.array([rms(errors_of(smoothed.trajectory.poses, drive)) for drive, smoothed in many])
     assert (after.mean(axis=0) < 0.9 * before.mean(axis=0)).all()
     for _, smoothed in many:
@@ -79,29 +79,29 @@ def test_smoothing_lowers_the_error_of_the_relative_poses_alone(many: list[tuple
         assert smoothed.converged
 
 
-def test_the_cost_that_is_left_is_what_noise_leaves(many: list[tuple[Any, Smoothed]]):
-    # per step 15 equations of the IMU and 6 of the relative pose, less 15 unknowns: 3 of a half each
+def test_the_final_error_is_half_the_degrees_of_freedom(many: list[tuple[Any, Smoothed]]):
+    # per step: 15 residuals of the IMU and 6 of the relative pose, less 15 unknowns, a half each
     costs = [smoothed.error_after / (len(drive.relative) * 6 / 2) for drive, smoothed in many]
     assert 0.8 < np.mean(costs) < 1.25
 
 
-def test_smoothed_poses_are_as_far_off_as_their_covariances_say(many: list[tuple[Any, Smoothed]]):
+def test_covariances_of_smoothed_poses_are_consistent(many: list[tuple[Any, Smoothed]]):
     errors = np.concatenate([errors_of(smoothed.trajectory.poses, drive)[1:] for drive, smoothed in many])
     covariances = [s.trajectory.covariances[1:] for _, s in many if s.trajectory.covariances is not None]
     consistency = pose_consistency(errors, np.concatenate(covariances))
-    # a drive's average scatters by 0.5: 0.13 for sixteen
+    # the mean over one drive has a standard deviation of 0.5: 0.13 for sixteen drives
     assert 0.75 < consistency.rotation.value < 1.3
     assert 0.75 < consistency.position.value < 1.3
 
 
-def test_biases_are_found_within_what_is_possible(many: list[tuple[Any, Smoothed]]):
+def test_biases_are_estimated(many: list[tuple[Any, Smoothed]]):
     before = [np.linalg.norm(drive.gyro_biases, axis=1).mean() for drive, _ in many]
     after = [np.linalg.norm(s.gyro_biases_rad_s - drive.gyro_biases, axis=1).mean() for drive, s in many]
     assert np.mean(after) < 0.35 * np.mean(before)
     assert np.mean([np.abs(s.accel_biases_m_s2 - drive.accel_biases).mean() for drive, s in many]) < 0.15
 
 
-def test_the_first_pose_is_the_origin_and_as_sure_as_can_be(many: list[tuple[Any, Smoothed]]):
+def test_the_first_pose_is_the_origin_with_almost_no_uncertainty(many: list[tuple[Any, Smoothed]]):
     for drive, smoothed in many:
         np.testing.assert_allclose(smoothed.trajectory.poses[0], np.eye(4), atol=1e-9)
         assert smoothed.trajectory.covariances is not None
@@ -116,7 +116,7 @@ def test_the_repr_is_one_informative_line(many: list[tuple[Any, Smoothed]]):
     assert repr(smoothed) == f"Smoothed(41 poses, {length_m:.1f} m, {errors}, converged after {count} iterations)"
 
 
-def test_covariances_are_positive_definite_and_grow_with_the_way(many: list[tuple[Any, Smoothed]]):
+def test_covariances_are_positive_definite_and_grow_along_the_path(many: list[tuple[Any, Smoothed]]):
     for _, smoothed in many:
         assert smoothed.trajectory.covariances is not None
         np.linalg.cholesky(smoothed.trajectory.covariances)
@@ -124,10 +124,10 @@ def test_covariances_are_positive_definite_and_grow_with_the_way(many: list[tupl
         assert rotation[-1] > rotation[1]
 
 
-def test_failed_steps_are_bridged_offline_too(chain: Callable[..., Any]):
+def test_failed_steps_are_bridged_by_the_imu(chain: Callable[..., Any]):
     drive = chain(4, steps=60)
     never_true = RelativePose(se3.exp(np.array([0.2, -0.3, 0.5, 5.0, -3.0, 2.0])), 1e-6 * np.eye(6), "broken", ok=False)
-    online = multiplied(drive)
+    online = composed(drive)
     for k in range(25, 35):
         drive.relative[k] = never_true
     smoothed = smooth(drive.record(online))
@@ -138,20 +138,20 @@ def test_failed_steps_are_bridged_offline_too(chain: Callable[..., Any]):
 
 def test_a_gap_in_the_samples_is_bridged_by_the_relative_poses(chain: Callable[..., Any]):
     drive = chain(5, steps=60)
-    record = drive.record(multiplied(drive))
+    record = drive.record(composed(drive))
     stamps = record.imu.stamps_ns
     keep = (stamps < stamps[0] + 2_000_000_000) | (stamps > stamps[0] + 4_000_000_000)
     imu = ImuSamples(stamps[keep], record.imu.gyro_rad_s[keep], record.imu.accel_m_s2[keep])
     errors = errors_of(smooth(replace(record, imu=imu)).trajectory.poses, drive)
-    assert rms(errors)[1] < 1.5 * rms(errors_of(multiplied(drive), drive))[1] + 0.05
+    assert rms(errors)[1] < 1.5 * rms(errors_of(composed(drive), drive))[1] + 0.05
 
 
-def test_without_imu_there_is_nothing_to_improve(chain: Callable[..., Any]):
+def test_without_imu_the_poses_are_the_composed_relative_poses(chain: Callable[..., Any]):
     drive = chain(6, steps=30)
     start = start_state(drive.frames[0].scan.stamp_ns, ImuSamples.empty(), drive.noise)
-    record = replace(drive.record(multiplied(drive)), imu=ImuSamples.empty(), start=start)
+    record = replace(drive.record(composed(drive)), imu=ImuSamples.empty(), start=start)
     smoothed = smooth(record)
-    np.testing.assert_allclose(smoothed.trajectory.poses, multiplied(drive), atol=1e-6)
+    np.testing.assert_allclose(smoothed.trajectory.poses, composed(drive), atol=1e-6)
     assert smoothed.trajectory.covariances is not None
     expected = np.zeros((6, 6))
     for relative in drive.relative:
@@ -159,15 +159,15 @@ def test_without_imu_there_is_nothing_to_improve(chain: Callable[..., Any]):
     np.testing.assert_allclose(np.diag(smoothed.trajectory.covariances[-1]), np.diag(expected), rtol=1e-3)
 
 
-def test_progress_is_told_of_every_pose(chain: Callable[..., Any]):
-    told: list[tuple[str, int, int]] = []
+def test_progress_is_reported_for_every_pose(chain: Callable[..., Any]):
+    reports: list[tuple[str, int, int]] = []
     drive = chain(7, steps=5)
-    smooth(drive.record(multiplied(drive)), lambda *what: told.append(what))
-    assert {stage for stage, _, _ in told} == {"optimising", "covariances"}
-    assert [(done, total) for stage, done, total in told if stage == "covariances"] == [(k, 6) for k in range(6)]
+    smooth(drive.record(composed(drive)), lambda *what: reports.append(what))
+    assert {stage for stage, _, _ in reports} == {"optimising", "covariances"}
+    assert [(done, total) for stage, done, total in reports if stage == "covariances"] == [(k, 6) for k in range(6)]
 
 
-def test_a_graph_that_leaves_something_open_is_a_clear_error_that_names_it(
+def test_an_underdetermined_graph_is_an_error_that_names_a_variable(
     chain: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ):
     def only_distances(i: int, *_: Any) -> gtsam.NonlinearFactorGraph:
@@ -179,10 +179,10 @@ def test_a_graph_that_leaves_something_open_is_a_clear_error_that_names_it(
     drive = chain(8, steps=5)
     start = start_state(drive.frames[0].scan.stamp_ns, ImuSamples.empty(), drive.noise)
     with pytest.raises(GraphError, match=r"smoothing: .*x\d\)\.$"):
-        smooth(replace(drive.record(multiplied(drive)), imu=ImuSamples.empty(), start=start))
+        smooth(replace(drive.record(composed(drive)), imu=ImuSamples.empty(), start=start))
 
 
-def test_smoothed_steps_are_as_far_off_as_their_covariances_say(many: list[tuple[Any, Smoothed]]):
+def test_covariances_of_smoothed_steps_are_consistent(many: list[tuple[Any, Smoothed]]):
     errors, covariances = [], []
     for drive, smoothed in many:
         reference = Trajectory(smoothed.trajectory.stamps_ns, drive.lidar_poses)
@@ -194,7 +194,7 @@ def test_smoothed_steps_are_as_far_off_as_their_covariances_say(many: list[tuple
     assert 0.85 < consistency.position.value < 1.18
 
 
-def test_smoothed_steps_are_surer_than_measured_ones(many: list[tuple[Any, Smoothed]]):
+def test_smoothed_steps_have_smaller_covariances_than_measured_ones(many: list[tuple[Any, Smoothed]]):
     for drive, smoothed in many:
         before = np.array([np.trace(step.covariance) for step in drive.relative])
         assert (np.trace(smoothed.step_covariances, axis1=1, axis2=2) < before).all()

@@ -1,4 +1,4 @@
-"""Poses relative to several earlier scans: which factors they become, and that their shared noise is counted once."""
+"""Poses relative to several earlier scans: their factors, and that their shared noise counts once."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from hybridlio.graph.run import factors
 from hybridlio.graph.run.fixed_lag_backend import FixedLagBackend
 from hybridlio.graph.run.inertial_steps import InertialSteps
 from hybridlio.graph.run.isam_backend import IncrementalBackend
-from hybridlio.graph.run.scan_numbers import Scans
+from hybridlio.graph.run.scan_numbers import ScanNumbers
 from hybridlio.graph.run.smooth import smooth
 
 BACK = (2, 4, 8)
@@ -48,43 +48,43 @@ def errors(states: np.ndarray, drive: Any) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------ which factors
 
 
-def scans(count: int, on_path: bool) -> Scans:
-    out = Scans(1000)
+def scans(count: int, on_map_path: bool) -> ScanNumbers:
+    out = ScanNumbers(1000)
     for k in range(1, count):
-        out.add(1000 + k, on_path)
+        out.add(1000 + k, on_map_path)
     return out
 
 
-def joined(relative: RelativePose, of: Scans) -> list[list[str]]:
+def joined(relative: RelativePose, of: ScanNumbers) -> list[list[str]]:
     graph = factors.earlier_scan_factors(5, relative, of, np.eye(4))
     return [[gtsam.DefaultKeyFormatter(key) for key in factor.keys()] for factor in graph]  # noqa: SIM118
 
 
 def step(*back_stamps: int, **changes: Any) -> RelativePose:
-    keyframes = tuple(EarlierScanPose(stamp, np.eye(4), np.eye(6)) for stamp in back_stamps)
-    return replace(RelativePose(np.eye(4), np.eye(6), "test", earlier_scans=keyframes), **changes)
+    earlier = tuple(EarlierScanPose(stamp, np.eye(4), np.eye(6)) for stamp in back_stamps)
+    return replace(RelativePose(np.eye(4), np.eye(6), "test", earlier_scans=earlier), **changes)
 
 
-def test_independent_poses_join_the_scans_themselves():
-    assert joined(step(1002, 1000), scans(5, on_path=False)) == [["x2", "x5"], ["x0", "x5"]]
+def test_independent_poses_join_the_scans_poses():
+    assert joined(step(1002, 1000), scans(5, on_map_path=False)) == [["x2", "x5"], ["x0", "x5"]]
 
 
-def test_poses_that_share_scatter_join_the_path_beside_the_scans():
+def test_poses_that_share_scatter_join_poses_on_the_map_path():
     shared = step(1002, 1000, drift=0.25 * np.eye(6))
-    assert joined(shared, scans(5, on_path=True)) == [["m2", "m5"], ["m0", "m5"]]
-    assert joined(shared, scans(5, on_path=False)) == [["x2", "m5"], ["x0", "m5"]]
+    assert joined(shared, scans(5, on_map_path=True)) == [["m2", "m5"], ["m0", "m5"]]
+    assert joined(shared, scans(5, on_map_path=False)) == [["x2", "m5"], ["x0", "m5"]]
 
 
-def test_a_failed_step_still_has_its_keyframes():
-    assert joined(step(1002, ok=False), scans(5, on_path=True)) == [["x2", "x5"]]
-    assert joined(step(1002, ok=False, drift=0.25 * np.eye(6)), scans(5, on_path=True)) == [["x2", "x5"]]
+def test_a_failed_step_keeps_its_poses_relative_to_earlier_scans():
+    assert joined(step(1002, ok=False), scans(5, on_map_path=True)) == [["x2", "x5"]]
+    assert joined(step(1002, ok=False, drift=0.25 * np.eye(6)), scans(5, on_map_path=True)) == [["x2", "x5"]]
 
 
-def test_scans_that_are_forgotten_are_left_out_and_unknown_ones_named():
-    some = scans(5, on_path=True)
-    some.forget(range(2))
+def test_removed_scans_are_skipped_and_unknown_ones_are_an_error():
+    some = scans(5, on_map_path=True)
+    some.remove(range(2))
     assert joined(step(1001, 1003), some) == [["x3", "x5"]]
-    with pytest.raises(DataError, match="scan at 1077 ns, but there is no such scan"):
+    with pytest.raises(DataError, match="scan at 1077 ns, but no scan has this stamp"):
         joined(step(1077), some)
 
 
@@ -93,23 +93,23 @@ def test_scans_that_are_forgotten_are_left_out_and_unknown_ones_named():
 
 @pytest.fixture(scope="module")
 def drives(chain: Callable[..., Any]) -> list[Any]:
-    """Drives whose relative poses share their scans' noise, without IMU, so that nothing else decides."""
+    """Drives whose relative poses share their scans' noise; without IMU, so that nothing else has an influence."""
     share = 1 - SHARED
     return [without_imu(chain(seed, steps=40, drift_share=share, back=BACK)) for seed in range(300, 312)]
 
 
-def alone(drive: Any) -> Any:
-    """One factor a pose."""
+def last_scan_only(drive: Any) -> Any:
+    """The drive with poses relative to the last scan only."""
     return replace(drive, relative=[replace(relative, earlier_scans=()) for relative in drive.relative])
 
 
 def claiming(drive: Any, share: float | None) -> Any:
-    """The same measurements with another claim of how much of their noise is the scans'; None: that none is."""
+    """The same measurements with another claimed share of noise that is the scans'; None claims independence."""
 
     def claim(relative: RelativePose) -> RelativePose:
         own = relative.covariance * (1.0 if share is None else 1 - share)
-        keyframes = tuple(replace(k, covariance=own) for k in relative.earlier_scans)
-        return replace(relative, drift=None if share is None else own, earlier_scans=keyframes)
+        earlier = tuple(replace(k, covariance=own) for k in relative.earlier_scans)
+        return replace(relative, drift=None if share is None else own, earlier_scans=earlier)
 
     return replace(drive, relative=[claim(relative) for relative in drive.relative])
 
@@ -132,25 +132,25 @@ def judged(drives: list[Any]) -> tuple[float, float, float]:
     return values[0], values[1], float(np.sqrt(np.mean(metres)))
 
 
-def test_several_factors_a_pose_are_as_far_off_as_they_say_and_nearer_than_one(drives: list[Any]):
+def test_several_factors_per_scan_are_consistent_and_more_accurate_than_one(drives: list[Any]):
     poses, steps, metres = judged(drives)
     assert 0.8 < poses < 1.25
     assert 0.8 < steps < 1.25
-    assert metres < 0.8 * judged([alone(drive) for drive in drives])[2]
+    assert metres < 0.8 * judged([last_scan_only(drive) for drive in drives])[2]
 
 
-def test_taken_for_independent_they_would_claim_too_much(drives: list[Any]):
+def test_taken_as_independent_they_would_be_overconfident(drives: list[Any]):
     assert judged([claiming(drive, None) for drive in drives])[1] > 1.8
 
 
-def test_claiming_more_shared_noise_than_there_is_is_safe(chain: Callable[..., Any]):
+def test_claiming_more_shared_noise_than_true_is_conservative(chain: Callable[..., Any]):
     drives = [without_imu(chain(seed, steps=40, drift_share=0.6, back=BACK)) for seed in range(320, 328)]
     poses, steps, _ = judged([claiming(drive, SHARED) for drive in drives])
     assert poses < 1.25
     assert steps < 1.25
 
 
-def test_smoothing_has_the_same_factors(chain: Callable[..., Any]):
+def test_smoothing_with_several_factors_per_scan_is_consistent(chain: Callable[..., Any]):
     found, claimed = [], []
     for seed in range(340, 352):
         drive = chain(seed, steps=30, drift_share=1 - SHARED, back=BACK)
@@ -165,13 +165,13 @@ def test_smoothing_has_the_same_factors(chain: Callable[..., Any]):
 # ----------------------------------------------------------------------------------------------- constant memory
 
 
-@pytest.mark.parametrize("back", [(), BACK], ids=["chain", "keyframes"])
-def test_what_old_scans_are_forgotten_by_is_safe_wherever_they_are_linearised_anew(
+@pytest.mark.parametrize("back", [(), BACK], ids=["last scan", "earlier scans"])
+def test_marginalising_old_scans_works_when_they_are_relinearised(
     chain: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, back: tuple[int, ...]
 ):
-    """Variables that iSAM2 eliminates out of turn, and then has to forget, crash it."""
-    low = {kind: 1e-4 * change for kind, change in solver._RELINEARISE.items()}
-    monkeypatch.setattr(solver, "_RELINEARISE", low)
+    """iSAM2 crashes if it marginalises variables that it did not eliminate first."""
+    low = {kind: 1e-4 * change for kind, change in solver._RELINEARISATION_THRESHOLDS.items()}
+    monkeypatch.setattr(solver, "_RELINEARISATION_THRESHOLDS", low)
     drive = chain(seed=9, steps=110, drift_share=1 - SHARED, back=back)
     lagged = FixedLagBackend(InertialSteps(drive.calibration, drive.noise), lag_scans=30)
     states = drive_through(lagged, drive)
