@@ -11,3 +11,4 @@ Array: TypeAlias = NDArray[np.float64]  # poses, covariances, everything that is
 Floats: TypeAlias = NDArray[np.float32]  # points and maps as sensors and networks have them
 Mask: TypeAlias = NDArray[np.bool_]
 Index: TypeAlias = NDArray[np.int64]  # positions in another array
+Stamps: TypeAlias = NDArray[np.int64]  # times in nanoseconds

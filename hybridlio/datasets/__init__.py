@@ -1,4 +1,4 @@
-"""Readers, one file each, and the sequence they return."""
+"""Readers of recordings, one file each, and the sequence that they return."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["READERS", "Reader", "Sequence", "open_sequence", "sequence_names"]
 
 
 def __getattr__(name: str) -> Any:
-    # late, as readers import SciPy and this package is on the way of every import
+    # loaded on first use: readers import SciPy, and every import of a submodule runs this file
     if name == "Sequence":
         from hybridlio.datasets.sequence import Sequence
 

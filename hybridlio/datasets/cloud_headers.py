@@ -1,6 +1,6 @@
-"""Whether a ``.pcd`` or ``.ply`` file is as long as its header announces.
+"""Headers of ``.pcd`` and ``.ply`` files, to detect truncated files.
 
-Open3D does not say so: from a truncated file it returns uninitialised memory as points.
+Open3D does not detect them: it returns uninitialised memory as points.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ _PLY_BYTES = {"char": 1, "short": 2, "int": 4, "float": 4, "double": 8} | {
 
 @dataclass(frozen=True)
 class Header:
-    """What a file announces.
+    """The header of a point file, and its data.
 
     Attributes:
-        points: how many.
-        fields: the columns' names.
-        row_bytes: size of a point where the data are binary, else 0.
-        data: the file from the first point on.
+        points: number of points.
+        fields: names of the columns.
+        row_bytes: size of a point if the data are binary, else 0.
+        data: the file's bytes after the header.
     """
 
     points: int
@@ -34,24 +34,24 @@ class Header:
     data: bytes
 
 
-def check_whole(path: Path) -> Header:
-    """The header of a file that is as long as it announces.
+def read_header(path: Path) -> Header:
+    """Read the header of a file, and check that the file holds all points that the header announces.
 
     Raises:
-        DataError: the header is malformed, or the file ends before its last point; names the file.
+        DataError: the header is malformed, or the file ends before its last point; the message names the file.
     """
     content = path.read_bytes()
     try:
         header = _ply(content) if path.suffix == ".ply" else _pcd(content)
     except (ValueError, KeyError):
-        raise DataError(f"{path}: truncated, or no {path.suffix} file: its header cannot be read") from None
+        raise DataError(f"{path}: cannot read the header; the file is truncated, or no {path.suffix} file") from None
     if header.row_bytes:
         whole = len(header.data) >= header.points * header.row_bytes
     else:
         lines = header.data.split(b"\n", header.points)[: header.points]
         whole = len(lines) == header.points and (not lines or len(lines[-1].split()) >= len(header.fields))
     if not whole:
-        raise DataError(f"{path}: truncated, {header.points} points announced but the file ends before")
+        raise DataError(f"{path}: truncated, the file ends before the last of its {header.points} points")
     return header
 
 
@@ -72,7 +72,7 @@ def _pcd(content: bytes) -> Header:
     points, sizes = int(rows["POINTS"]), [int(size) for size in rows["SIZE"].split()]
     counts = [int(count) for count in rows.get("COUNT", "1 " * len(sizes)).split()]
     fields = tuple(name for name, count in zip(rows["FIELDS"].split(), counts, strict=True) for _ in range(count))
-    if kind == b"binary_compressed":  # two sizes of four bytes, then that many bytes
+    if kind == b"binary_compressed":  # compressed and uncompressed size, 4 bytes each, then the compressed data
         return Header(1, fields, 8 + int.from_bytes(data[:4], "little"), data)
     row_bytes = sum(s * c for s, c in zip(sizes, counts, strict=True)) if kind == b"binary" else 0
     return Header(points, fields, row_bytes, data)

@@ -1,4 +1,4 @@
-"""CSV files with a header, as rows of text that know their line."""
+"""CSV files with a header, read as rows of text with their line numbers."""
 
 from __future__ import annotations
 
@@ -9,10 +9,14 @@ from hybridlio.core.errors import DataError
 
 
 def read_csv(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """The header's names, without a leading ``#``, and each row that is not blank with its line.
+    """Read a CSV file with a header.
+
+    Returns:
+        The column names, without a leading ``#``; and the rows that are not blank, as ``(line number, fields)``.
 
     Raises:
-        DataError: no text in UTF-8, no CSV, or a row with another number of columns than the header; names the place.
+        DataError: the file is missing, not UTF-8 or not CSV, or a row has more or fewer columns than the header; the
+            message names file and line.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
@@ -20,10 +24,10 @@ def read_csv(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
             header = [name.strip().lstrip("# ") for name in next(reader, [])]
             rows = [(reader.line_num, row) for row in reader if any(field.strip() for field in row)]
     except UnicodeDecodeError:
-        raise DataError(f"{path}: not a text file in UTF-8; save it as such") from None
+        raise DataError(f"{path}: not UTF-8 text; save the file as UTF-8") from None
     except (OSError, csv.Error) as error:
         raise DataError(f"{path}: cannot be read as CSV ({error})") from None
     for line, row in rows:
         if len(row) != len(header):
-            raise DataError(f"{path}, line {line}: {len(row)} columns where the header has {len(header)}")
+            raise DataError(f"{path}, line {line}: {len(row)} columns, but the header has {len(header)}")
     return header, rows

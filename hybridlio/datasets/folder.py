@@ -1,13 +1,13 @@
-"""A plain folder: scans in natural order with a stamps file, an IMU CSV and a calibration.
+"""Reader of plain folders: scans in natural order, a file of stamps, an IMU CSV and a calibration.
 
 recording/
-    scans/*.bin|.npy|.pcd|.ply   (or in lidar/, points/, velodyne/, data/, or directly in the folder)
-    timestamps.txt or times.txt  one stamp a scan: seconds (1.5), whole nanoseconds, or ISO dates
-    imu.csv                      optional; see `imu_csv`
-    calibration.yaml             T_imu_lidar as four rows of four; needed with imu.csv. Also T_camera_lidar, lidar,
-                                 antenna_imu_m
-    poses_tum.txt                optional reference: lidar poses on the stamps' clock
-    gps.csv                      optional; see `extras.read_gps_csv`
+    scans/*.bin|.npy|.pcd|.ply   one kind per folder, see `point_files`; also in lidar/, points/, velodyne/, data/,
+                                 or directly in recording/
+    timestamps.txt or times.txt  one stamp per scan, see `stamps.read_stamps`
+    imu.csv                      optional, see `imu_csv`
+    calibration.yaml             needed with imu.csv, see `read_calibration_yaml`
+    poses_tum.txt                optional reference: lidar poses on the scans' clock, TUM format
+    gps.csv                      optional, see `gps_csv`
 """
 
 from __future__ import annotations
@@ -18,28 +18,37 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array, Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.files import read_yaml
 from hybridlio.core.sensors import LIDAR_MODELS, Calibration, ImuSamples, LidarModel, Scan
 from hybridlio.core.trajectory_files import read_tum
-from hybridlio.datasets.extras import note_fixes, read_gps_csv
+from hybridlio.datasets.gps_csv import note_fixes, read_gps_csv
 from hybridlio.datasets.imu_csv import read_imu_csv
+from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.point_files import SUFFIXES, read_scan
 from hybridlio.datasets.reference import poses_at
-from hybridlio.datasets.sequence import Notes, Sequence
-from hybridlio.datasets.stamps import MISSING_STAMP, note_coverage, note_gaps, read_stamps, usable_scans
+from hybridlio.datasets.sequence import Sequence
+from hybridlio.datasets.stamps import (
+    MISSING_STAMP,
+    SCAN_GAP_FACTOR,
+    note_coverage,
+    note_gaps,
+    read_stamps,
+    usable_scans,
+)
 from hybridlio.datasets.vertical_angle import raised
 
-LAYOUT = "a folder with .bin, .npy, .pcd or .ply scans (there or in scans/) and timestamps.txt"
+LAYOUT = "a folder with timestamps.txt, and scans .bin, .npy, .pcd or .ply in it or in scans/"
 
-_SCAN_FOLDERS = ("scans", "lidar", "points", "velodyne", "data", ".")  # a map may lie beside the scans' folder
-_FARTHEST_M = 20.0  # from the IMU to the lidar, on any vehicle
+_SCAN_FOLDERS = ("scans", "lidar", "points", "velodyne", "data", ".")  # the folder itself last: a map may be in it
+_MAX_LEVER_ARM_M = 20.0  # from IMU to lidar on any vehicle; more is another unit, such as millimetres
+_MAX_UPSIDE_DOWN = -0.5  # cosine of the angle between the specific force and the lidar's z axis: 120°, no hill
 _STAMP_FILES = ("timestamps.txt", "times.txt")
 _HOW_TO_CALIBRATE = (
-    "write T_imu_lidar there, which maps lidar points into the IMU's frame, as in\n"
+    "write the transform T_imu_lidar, which maps lidar points into the IMU's frame, such as\n"
     "T_imu_lidar:\n  - [1, 0, 0, 0.1]\n  - [0, 1, 0, 0.0]\n  - [0, 0, 1, 0.3]\n  - [0, 0, 0, 1]"
 )
 
@@ -49,10 +58,10 @@ class PointFiles:
     """Loads scan ``k`` from ``paths[k]`` with stamp ``stamps_ns[k]``."""
 
     paths: tuple[Path, ...]
-    stamps_ns: NDArray[np.int64]
+    stamps_ns: Stamps
 
     def __call__(self, k: int) -> Scan:
-        """Scan ``k``; a :class:`DataError` names the frame and the file."""
+        """Load scan ``k``; a :class:`DataError` names frame and file."""
         try:
             return read_scan(self.paths[k], int(self.stamps_ns[k]))
         except DataError as error:
@@ -60,17 +69,22 @@ class PointFiles:
 
 
 def find(path: Path) -> dict[str, Path]:
-    """The recording at ``path``, or those in the folders directly below it, by name."""
+    """Find the recording at ``path``, or those in the folders directly below: folders by name."""
     here = [path] if _scan_files(path) else sorted(p for p in path.glob("*") if _stamp_files(p) and _scan_files(p))
     return {p.resolve().name: p for p in here}
 
 
 def open_folder(folder: Path, raw_root: Path | None = None, vertical_angle_deg: float | None = None) -> Sequence:
-    """One recording, laid out as the module says. ``raw_root`` is not used; points are raised by the angle, if any.
+    """Open one recording in the layout above.
+
+    Args:
+        folder: the recording's folder.
+        raw_root: not used.
+        vertical_angle_deg: angle by which points are raised; none by default.
 
     Raises:
-        DataError: stamps missing or not one a scan, an IMU without ``T_imu_lidar``, or a malformed file; says what
-            to write.
+        DataError: stamps are missing or not one per scan, ``imu.csv`` has no ``T_imu_lidar``, or a file is malformed;
+            the message says what to write.
         ConfigError: ``vertical_angle_deg`` is over 5°.
     """
     del raw_root
@@ -109,7 +123,7 @@ def _stamp_files(folder: Path) -> list[Path]:
 
 
 def _scan_files(folder: Path) -> tuple[Path, ...]:
-    """The scans of a recording, from the first of the known folders that has any, in natural order."""
+    """Return the scan files of a recording in natural order, from the first of the known folders that has any."""
     for name in _SCAN_FOLDERS:
         found = [p for p in (folder / name).glob("*") if p.suffix in SUFFIXES and not p.name.startswith(".")]
         if found:
@@ -117,16 +131,18 @@ def _scan_files(folder: Path) -> tuple[Path, ...]:
     return ()
 
 
-def _stamped(folder: Path, paths: tuple[Path, ...], notes: Notes) -> tuple[NDArray[np.int64], tuple[Path, ...]]:
-    """Scans with their stamps, without those whose stamps repeat or go backwards."""
+def _stamped(folder: Path, paths: tuple[Path, ...], notes: Notes) -> tuple[Stamps, tuple[Path, ...]]:
+    """Return stamps and files of the scans, without those whose stamps do not increase."""
     if not paths:
         raise DataError(f"{folder}: no scans ({', '.join(SUFFIXES)})")
     suffixes = sorted({p.suffix for p in paths})
     if len(suffixes) > 1:
-        raise DataError(f"{paths[0].parent}: scans of several kinds ({', '.join(suffixes)}); keep one kind a folder")
+        raise DataError(f"{paths[0].parent}: scans of several kinds ({', '.join(suffixes)}); keep one kind per folder")
     files = _stamp_files(folder)
     if not files:
-        raise DataError(f"{folder}: no {' or '.join(_STAMP_FILES)}; write one stamp a line, in seconds, for each scan")
+        raise DataError(
+            f"{folder}: no {' or '.join(_STAMP_FILES)}; write one stamp per line, in seconds, for each scan"
+        )
     stamps = read_stamps(files[0])
     if len(stamps) != len(paths) or (stamps == MISSING_STAMP).any():
         raise DataError(f"{files[0]}: {len(stamps)} lines for {len(paths)} scans; each scan needs one stamp")
@@ -134,34 +150,42 @@ def _stamped(folder: Path, paths: tuple[Path, ...], notes: Notes) -> tuple[NDArr
     if len(keep) < len(paths):
         first = paths[int(np.setdiff1d(np.arange(len(paths)), keep)[0])].name
         notes.add(f"dropped {len(paths) - len(keep)} scans whose stamps repeat or go backwards, first {first}")
-    note_gaps(stamps[keep], "scans", notes, factor=1.5)
+    note_gaps(stamps[keep], "scans", notes, SCAN_GAP_FACTOR)
     return stamps[keep], tuple(paths[k] for k in keep)
 
 
-def _note_mounting(imu: ImuSamples, T_imu_lidar: NDArray[np.float64], notes: Notes) -> None:
-    """Say if the extrinsics and the samples cannot both be right: lengths in another unit, gravity from above."""
-    away_m = float(np.linalg.norm(T_imu_lidar[:3, 3]))
-    if away_m > _FARTHEST_M:
-        notes.add(f"T_imu_lidar: the lidar is {away_m:g} m from the IMU; its last column must be in metres")
+def _note_mounting(imu: ImuSamples, T_imu_lidar: Array, notes: Notes) -> None:
+    """Note extrinsics that contradict the samples: lengths in another unit, or gravity that points up."""
+    distance_m = float(np.linalg.norm(T_imu_lidar[:3, 3]))
+    if distance_m > _MAX_LEVER_ARM_M:
+        notes.add(f"T_imu_lidar: the lidar is {distance_m:g} m from the IMU; the last column must be in metres")
     force = T_imu_lidar[:3, :3].T @ np.median(imu.accel_m_s2, axis=0)
-    if force[2] < -0.5 * np.linalg.norm(force):
+    if force[2] < _MAX_UPSIDE_DOWN * np.linalg.norm(force):
         notes.add(
-            "the specific force points down in the lidar's frame, whose z axis is up; check T_imu_lidar, and that an "
-            "accelerometer at rest reads +9.81 on the axis that points up"
+            "the specific force points down in the lidar's frame, whose z axis must be up; check T_imu_lidar, and that "
+            "the accelerometer at rest reads +9.81 on the axis that points up"
         )
 
 
 def read_calibration_yaml(path: Path, needs_imu: bool = False) -> tuple[Calibration, LidarModel | None]:
-    """Extrinsics and lidar of a ``calibration.yaml``; the identity and None where the file, or the entry, is missing.
+    """Read extrinsics and lidar from a ``calibration.yaml``.
+
+    Keys, all optional: ``T_imu_lidar`` and ``T_camera_lidar``, four rows of four numbers in metres; ``antenna_imu_m``,
+    the GPS antenna in the IMU frame, three numbers; ``lidar``, a name of
+    :data:`hybridlio.core.sensors.LIDAR_MODELS`. Without ``T_imu_lidar`` it is the identity, the others are None.
+
+    Args:
+        path: the file, which need not exist.
+        needs_imu: whether there are inertial data, which need ``T_imu_lidar``.
 
     Raises:
-        DataError: not YAML, an unknown key or lidar, an antenna that is nowhere, or a matrix that is no rigid
-            transform; or no ``T_imu_lidar`` although there are inertial data that need it.
+        DataError: the file is not YAML, a key or lidar is unknown, a value has another shape, a matrix is no rigid
+            transform, or ``T_imu_lidar`` is needed and missing.
     """
     content = read_yaml(path) if path.is_file() else {}
     known = ("T_imu_lidar", "T_camera_lidar", "lidar", "antenna_imu_m")
     if not isinstance(content, dict):
-        raise DataError(f"{path}: expected keys with values; {_HOW_TO_CALIBRATE}")
+        raise DataError(f"{path}: expected a mapping; {_HOW_TO_CALIBRATE}")
     if unknown := [key for key in content if key not in known]:
         raise DataError(f"{path}: unknown key {unknown[0]!r}; the keys are {', '.join(known)}")
     lidar = content.get("lidar")
@@ -176,7 +200,7 @@ def read_calibration_yaml(path: Path, needs_imu: bool = False) -> tuple[Calibrat
     return calibration, LIDAR_MODELS[lidar] if lidar else None
 
 
-def _matrix(path: Path, name: str, value: Any) -> NDArray[np.float64] | None:
+def _matrix(path: Path, name: str, value: Any) -> Array | None:
     if value is None:
         return None
     try:
@@ -188,7 +212,7 @@ def _matrix(path: Path, name: str, value: Any) -> NDArray[np.float64] | None:
     return se3.check_pose(matrix, f"{path}: {name}")
 
 
-def _antenna(path: Path, value: Any) -> NDArray[np.float64] | None:
+def _antenna(path: Path, value: Any) -> Array | None:
     if value is None:
         return None
     try:
@@ -196,5 +220,5 @@ def _antenna(path: Path, value: Any) -> NDArray[np.float64] | None:
     except (ValueError, TypeError):
         antenna = np.empty(0)
     if antenna.shape != (3,) or not np.isfinite(antenna).all():
-        raise DataError(f"{path}: antenna_imu_m must be three numbers, the GPS antenna in the IMU's frame")
+        raise DataError(f"{path}: antenna_imu_m must be three finite numbers, the GPS antenna in the IMU's frame")
     return antenna

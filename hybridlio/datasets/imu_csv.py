@@ -1,21 +1,22 @@
-"""Inertial samples from a CSV file whose header names the columns and, where it can, their units."""
+"""IMU samples from a CSV file, whose header names the columns and optionally their units."""
 
 from __future__ import annotations
 
-from decimal import Decimal, InvalidOperation
+from decimal import InvalidOperation
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hybridlio.core.arrays import Array, Stamps
 from hybridlio.core.errors import DataError
-from hybridlio.core.sensors import NS_PER_S, ImuSamples
+from hybridlio.core.sensors import ImuSamples
 from hybridlio.datasets.csv_rows import read_csv
-from hybridlio.datasets.sequence import Notes
-from hybridlio.datasets.stamps import note_gaps, sorted_unique
+from hybridlio.datasets.notes import Notes
+from hybridlio.datasets.stamps import IMU_GAP_FACTOR, note_gaps, seconds_ns, sorted_unique
 
-_STANDARD_GRAVITY_M_S2 = 9.80665
-_FASTEST_RAD_S = 6.0  # a turn a second: of a vehicle, or of a hand for long, only degrees taken for radians
+_STANDARD_GRAVITY_M_S2 = 9.80665  # the unit g, by definition; not the gravity of a place
+_PLAUSIBLE_FORCE_M_S2 = (5.0, 20.0)  # of the median: half to twice gravity; values in g (1) or mm/s² (9810) are outside
+_MAX_RATE_RAD_S = 6.0  # 95 % quantile; a turn per second is beyond vehicles and hands, but 6 °/s taken for rad/s is not
 _UNITS = {
     "g": {"": 1.0, "_rad_s": 1.0, "_deg_s": np.pi / 180},
     "a": {"": 1.0, "_m_s2": 1.0, "_g": _STANDARD_GRAVITY_M_S2},
@@ -24,14 +25,18 @@ _EXPECTED = "stamp_ns (or t_s), gx gy gz (rad/s; or gx_deg_s …), ax ay az (m/s
 
 
 def read_imu_csv(path: Path, notes: Notes) -> ImuSamples:
-    """Samples of a CSV file, in order of time.
+    """Read IMU samples from a CSV file, sorted by time.
 
-    The time is ``stamp_ns`` (whole nanoseconds) or ``t_s`` (seconds) on the scans' clock. Angular velocity is
-    ``gx gy gz`` in rad/s, or ``gx_deg_s`` and so on; specific force ``ax ay az`` in m/s², or ``ax_g`` and so on. Other
-    columns are ignored. Stamps out of order are sorted, repeated ones and rows that are not finite dropped, with notes.
+    Columns, in any order; others are ignored:
+
+    * ``stamp_ns`` (whole nanoseconds) or ``t_s`` (seconds), on the scans' clock;
+    * angular velocity in the IMU frame: ``gx gy gz`` in rad/s, or ``gx_deg_s gy_deg_s gz_deg_s``;
+    * specific force in the IMU frame (+9.81 at rest on the axis that points up): ``ax ay az`` in m/s², or ``ax_g …``.
+
+    Repeated stamps and rows that are not finite are dropped. Both are noted, as are gaps and implausible units.
 
     Raises:
-        DataError: a column is missing, or a row is malformed; names file and line.
+        DataError: a column is missing, a row is malformed, or no row is finite; the message names file and line.
     """
     header, rows = read_csv(path)
     time_column, columns = _columns(path, header)
@@ -42,12 +47,12 @@ def read_imu_csv(path: Path, notes: Notes) -> ImuSamples:
             stamps[k] = _stamp_ns(row[time_column], header[time_column])
             values[k] = [float(row[column]) * scale for column, scale in columns]
         except (ValueError, InvalidOperation, OverflowError):
-            raise DataError(f"{path}, line {line}: not all numbers: {','.join(row)[:80]}") from None
+            raise DataError(f"{path}, line {line}: expected numbers, found {','.join(row)[:80]}") from None
     return _clean(path, stamps, values, notes)
 
 
 def _columns(path: Path, header: list[str]) -> tuple[int, list[tuple[int, float]]]:
-    """The time's column, and for gx gy gz ax ay az the column and the factor to rad/s or m/s²."""
+    """Return the column of the time, and for gx gy gz ax ay az the column and the factor to rad/s or m/s²."""
     times = [header.index(name) for name in ("stamp_ns", "t_s") if name in header]
     found = []
     for kind, axis in ((kind, axis) for kind in "ga" for axis in "xyz"):
@@ -59,10 +64,11 @@ def _columns(path: Path, header: list[str]) -> tuple[int, list[tuple[int, float]
 
 
 def _stamp_ns(text: str, name: str) -> int:
-    return int(text) if name == "stamp_ns" else int((Decimal(text.strip()) * NS_PER_S).to_integral_value())
+    return int(text) if name == "stamp_ns" else seconds_ns(text.strip())
 
 
-def _clean(path: Path, stamps: NDArray[np.int64], values: NDArray[np.float64], notes: Notes) -> ImuSamples:
+def _clean(path: Path, stamps: Stamps, values: Array, notes: Notes) -> ImuSamples:
+    """Sort the rows, drop those that repeat or are not finite, and note what looks like a wrong unit."""
     finite = np.isfinite(values).all(axis=1)
     if not finite.any():
         raise DataError(f"{path}: no row of finite values")
@@ -71,11 +77,11 @@ def _clean(path: Path, stamps: NDArray[np.int64], values: NDArray[np.float64], n
     stamps, values = stamps[finite], values[finite]
     order = sorted_unique(stamps, str(path), notes)
     stamps, values = stamps[order], values[order]
-    note_gaps(stamps, str(path), notes, factor=5.0)
+    note_gaps(stamps, str(path), notes, IMU_GAP_FACTOR)
     force = float(np.median(np.linalg.norm(values[:, 3:], axis=1)))
-    if not 5 < force < 20:
-        notes.add(f"{path}: the median specific force is {force:.2f} m/s², far from gravity's 9.81; check the unit")
-    turn = float(np.quantile(np.linalg.norm(values[:, :3], axis=1), 0.95))
-    if turn > _FASTEST_RAD_S:
-        notes.add(f"{path}: angular velocities of {turn:.0f} rad/s are no vehicle's; check the unit (gx_deg_s for °/s)")
+    if not _PLAUSIBLE_FORCE_M_S2[0] < force < _PLAUSIBLE_FORCE_M_S2[1]:
+        notes.add(f"{path}: the median specific force is {force:.2f} m/s², gravity is 9.81; check the unit")
+    rate = float(np.quantile(np.linalg.norm(values[:, :3], axis=1), 0.95))
+    if rate > _MAX_RATE_RAD_S:
+        notes.add(f"{path}: angular velocities reach {rate:.0f} rad/s; check the unit (name columns gx_deg_s for °/s)")
     return ImuSamples(stamps, values[:, :3], values[:, 3:])

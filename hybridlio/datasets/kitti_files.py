@@ -1,21 +1,25 @@
-"""KITTI's file formats: calibrations, and scans as float32 x y z reflectance."""
+"""KITTI's file formats: calibrations, numbered files, scans; and the sensors that a simulated drive describes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridlio.core import se3
-from hybridlio.core.arrays import Array
+from hybridlio.core.arrays import Array, Floats, Index, Stamps
 from hybridlio.core.errors import DataError
-from hybridlio.core.sensors import Scan
+from hybridlio.core.sensors import LIDAR_MODELS, Calibration, ImuNoise, LidarModel, Scan
+
+KITTI_LIDAR = LIDAR_MODELS["hdl-64e"]  # Geiger et al., "Vision meets Robotics: The KITTI Dataset", IJRR 2013
+_BYTES_PER_POINT = 16  # x y z reflectance, float32
 
 
 def read_calibration(path: Path) -> dict[str, Array]:
-    """The numeric ``name: values`` rows of a KITTI calibration file; other rows (dates) are left out.
+    """Read the numeric ``name: values`` rows of a KITTI calibration file; skip others, such as dates.
 
     Raises:
         DataError: the file is missing.
@@ -33,39 +37,78 @@ def read_calibration(path: Path) -> dict[str, Array]:
 
 
 def rows_of(calibration: dict[str, Array], path: Path, *names: str) -> tuple[Array, ...]:
-    """The rows ``names`` of a calibration: of 12 numbers as ``(3, 4)``, of 9 as ``(3, 3)``, of 3 as ``(3,)``.
+    """Return rows of a calibration: 12 numbers as ``(3, 4)``, 9 as ``(3, 3)``, 3 as ``(3,)``.
 
     Raises:
-        DataError: a row is missing, has another number of values, or is not finite.
+        DataError: a row is missing, has another number of values, or is not finite; the message names ``path``.
     """
     found = []
     for name in names:
         values = calibration.get(name, np.empty(0))
         if len(values) not in (3, 9, 12) or not np.isfinite(values).all():
-            raise DataError(f"{path}: expected a row '{name}:' with 3, 9 or 12 numbers, found {len(values)}")
+            raise DataError(f"{path}: expected a row '{name}:' of 3, 9 or 12 finite numbers, found {len(values)}")
         found.append(values.reshape(3, -1) if len(values) > 3 else values)
     return tuple(found)
 
 
 def read_rigid(path: Path) -> Array:
-    """The transform ``(4, 4)`` of a raw-data calibration file with rows ``R:`` and ``T:``."""
+    """Read the transform ``(4, 4)`` of a raw-data calibration file, from its rows ``R:`` and ``T:``.
+
+    Raises:
+        DataError: the file or a row is missing, or the rows are no rigid transform.
+    """
     R, t = rows_of(read_calibration(path), path, "R", "T")
     if R.shape != (3, 3) or t.shape != (3,):
         raise DataError(f"{path}: expected 9 numbers in 'R:' and 3 in 'T:', found {R.size} and {t.size}")
     return se3.check_pose(se3.make(R, t), str(path))
 
 
-def numbered(folder: Path, suffix: str) -> tuple[NDArray[np.int64], tuple[Path, ...]]:
-    """The files of ``folder`` named by a number, in that number's order: the numbers ``(N,)`` and the paths."""
+def read_drive_calibration(drive: Path, needs_imu: bool) -> Calibration:
+    """Read the extrinsics of a raw drive, from the drive's own folder or from its date's.
+
+    ``T_imu_lidar`` comes from ``calib_imu_to_velo.txt``, without that file it is the identity. ``T_camera_lidar`` comes
+    from ``calib_velo_to_cam.txt`` and is of the rectified camera if ``calib_cam_to_cam.txt`` has ``R_rect_00``.
+
+    Args:
+        drive: the drive's folder.
+        needs_imu: whether there are inertial data, which need ``calib_imu_to_velo.txt``.
+
+    Raises:
+        DataError: ``calib_imu_to_velo.txt`` is needed and missing, or a file is malformed.
+    """
+    imu_to_velo, velo_to_cam, cam_to_cam = (
+        calibration_file(drive, f"calib_{name}.txt") for name in ("imu_to_velo", "velo_to_cam", "cam_to_cam")
+    )
+    if needs_imu and not imu_to_velo.is_file():
+        raise DataError(
+            f"{imu_to_velo}: missing calibration, which inertial data need; download it, or write the rows 'R:' with 9 "
+            "numbers and 'T:' with 3, a transform that maps IMU points into the lidar frame"
+        )
+    T_imu_lidar = se3.inverse(read_rigid(imu_to_velo)) if imu_to_velo.is_file() else np.eye(4)
+    T_camera_lidar = read_rigid(velo_to_cam) if velo_to_cam.is_file() else None
+    if T_camera_lidar is not None and cam_to_cam.is_file():
+        (R_rect,) = rows_of(read_calibration(cam_to_cam), cam_to_cam, "R_rect_00")
+        T_camera_lidar = se3.make(R_rect, np.zeros(3)) @ T_camera_lidar
+    return Calibration(T_imu_lidar, T_camera_lidar)
+
+
+def calibration_file(drive: Path, name: str) -> Path:
+    """Return the path of a calibration file: the drive's own if it exists, else its date's."""
+    own = drive / name
+    return own if own.is_file() else drive.parent / name
+
+
+def numbered(folder: Path, suffix: str) -> tuple[Index, tuple[Path, ...]]:
+    """List the files of a folder that are named by a number: the numbers ``(N,)``, ascending, and the paths."""
     found = sorted((int(p.stem), p) for p in folder.glob(f"*{suffix}") if p.stem.isdigit()) if folder.is_dir() else []
     return np.array([number for number, _ in found], dtype=np.int64), tuple(path for _, path in found)
 
 
-def read_bin(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Points ``(N, 3)`` in metres and reflectances ``(N,)`` of a ``.bin`` scan.
+def read_bin(path: Path) -> tuple[Floats, Floats]:
+    """Read points ``(N, 3)`` in metres and reflectances ``(N,)`` of a ``.bin`` scan: float32 x y z reflectance.
 
     Raises:
-        DataError: the file is missing, empty, or no whole number of points long, as after an interrupted copy.
+        DataError: the file is missing, empty, or truncated (its size is no multiple of 16 bytes).
     """
     try:
         data = path.read_bytes()
@@ -73,31 +116,33 @@ def read_bin(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         raise DataError(f"{path}: cannot read the scan ({error.strerror})") from None
     if not data:
         raise DataError(f"{path}: the scan has no points (0 bytes)")
-    if len(data) % 16:
-        raise DataError(f"{path}: truncated scan, {len(data)} bytes is no multiple of 16 (x y z reflectance, float32)")
+    if len(data) % _BYTES_PER_POINT:
+        raise DataError(
+            f"{path}: truncated scan, {len(data)} bytes is no multiple of {_BYTES_PER_POINT} (4 float32 a point)"
+        )
     values = np.frombuffer(data, dtype="<f4").reshape(-1, 4)
     return values[:, :3], values[:, 3]
 
 
 @dataclass(frozen=True)
 class BinScans:
-    """Loads scan ``k`` from ``paths[k]``; an object rather than a closure, so that it can go to another process.
+    """Loads scan ``k`` from ``paths[k]``. An object rather than a closure, so that it can be pickled.
 
     Attributes:
-        paths: one ``.bin`` file a scan.
-        stamps_ns: one stamp a scan.
-        offsets: a folder with each point's time offset, ``<scan's name>.npy`` of int64 nanoseconds, or None.
+        paths: one ``.bin`` file per scan.
+        stamps_ns: one stamp per scan.
+        offsets: a folder with the time offset of each point, ``<scan's name>.npy`` of int64 nanoseconds, or None.
     """
 
     paths: tuple[Path, ...]
-    stamps_ns: NDArray[np.int64]
+    stamps_ns: Stamps
     offsets: Path | None = None
 
     def __call__(self, k: int) -> Scan:
-        """Scan ``k``.
+        """Load scan ``k``.
 
         Raises:
-            DataError: the file is missing, truncated, or without a finite point; names the frame and the file.
+            DataError: the file is missing, truncated, or without a finite point; the message names frame and file.
         """
         path = self.paths[k]
         try:
@@ -109,7 +154,7 @@ class BinScans:
             raise DataError(f"frame {k}: {path}: the scan has no finite points")
         return scan
 
-    def _offsets_ns(self, scan: Path) -> NDArray[np.int64] | None:
+    def _offsets_ns(self, scan: Path) -> Stamps | None:
         if self.offsets is None:
             return None
         path = self.offsets / f"{scan.stem}.npy"
@@ -117,3 +162,46 @@ class BinScans:
             return np.asarray(np.load(path, allow_pickle=False), dtype=np.int64)
         except (OSError, ValueError, EOFError) as error:
             raise DataError(f"{path}: cannot read the points' time offsets ({error})") from None
+
+
+@dataclass(frozen=True)
+class SimulatedSensors:
+    """The sensors that a simulated drive describes in ``simulation.json``."""
+
+    lidar: LidarModel
+    imu_noise: ImuNoise | None
+
+
+def read_simulation(path: Path) -> SimulatedSensors | None:
+    """Read the sensors from ``simulation.json``; None if the file does not exist.
+
+    Raises:
+        DataError: the file is not JSON, the lidar is unknown, or a noise value is not a number of 0 or more.
+    """
+    if not path.is_file():
+        return None
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise DataError(f"{path}: not JSON ({error})") from None
+    if not isinstance(content, dict):
+        raise DataError(f"{path}: expected an object with 'lidar' and 'imu_noise'")
+    return SimulatedSensors(_lidar(path, content), _imu_noise(path, content.get("imu_noise")))
+
+
+def _lidar(path: Path, content: dict[str, Any]) -> LidarModel:
+    name = content.get("lidar")
+    if name not in LIDAR_MODELS:
+        raise DataError(f"{path}: unknown lidar {name!r}; known: {', '.join(LIDAR_MODELS)}")
+    return LIDAR_MODELS[name]
+
+
+def _imu_noise(path: Path, values: Any) -> ImuNoise | None:
+    if not values:
+        return None
+    if not isinstance(values, dict):
+        raise DataError(f"{path}: imu_noise: expected an object of numbers")
+    try:
+        return ImuNoise(**{f.name: float(values[f.name]) for f in fields(ImuNoise) if f.name in values})
+    except (ValueError, TypeError) as error:
+        raise DataError(f"{path}: imu_noise: {error}") from None

@@ -1,8 +1,18 @@
-"""KITTI raw data: a drive ``<date>/<date>_drive_NNNN_sync`` with its date's calibration, and what the simulator writes.
+"""Reader of KITTI raw data: a drive ``<date>/<date>_drive_NNNN_sync`` with the calibration in its date's folder.
 
-Beside the scans a drive may hold what the simulator adds: ``poses.txt`` (exact lidar poses, preferred as reference),
-``simulation.json`` (sensor names and noise), ``gps.csv`` and per-point times in ``velodyne_points/offsets``.
-KITTI's own scans carry no times.
+    <date>/
+        calib_imu_to_velo.txt                      needed with inertial data
+        calib_velo_to_cam.txt calib_cam_to_cam.txt optional
+        <date>_drive_NNNN_sync/
+            velodyne_points/data/NNNNNNNNNN.bin    scans: float32 x y z reflectance, lidar frame
+            velodyne_points/timestamps.txt         stamps of the scans; without it, those of the navigation rows
+            oxts/data/NNNNNNNNNN.txt               optional: navigation rows, about 10 Hz
+            oxts/timestamps.txt
+        <date>_drive_NNNN_extract/oxts/            optional: navigation rows at 100 Hz
+
+The simulator adds ``poses.txt`` (exact lidar poses, preferred as reference), ``simulation.json`` (lidar and IMU noise),
+``gps.csv`` and ``velodyne_points/offsets/NNNNNNNNNN.npy`` (time of each point relative to the scan's stamp, int64 ns).
+The scans of KITTI itself have no point times.
 """
 
 from __future__ import annotations
@@ -10,29 +20,48 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hybridlio.core import se3
+from hybridlio.core.arrays import Array, Index, Stamps
 from hybridlio.core.errors import DataError
-from hybridlio.core.sensors import LIDAR_MODELS, Calibration
+from hybridlio.core.sensors import Calibration
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.core.trajectory_files import read_kitti
 from hybridlio.datasets.drive_imu import drive_imu, fast_rows
-from hybridlio.datasets.extras import note_fixes, read_gps_csv, read_simulation
-from hybridlio.datasets.kitti_files import BinScans, numbered, read_calibration, read_rigid, rows_of
+from hybridlio.datasets.gps_csv import note_fixes, read_gps_csv
+from hybridlio.datasets.kitti_files import (
+    KITTI_LIDAR,
+    BinScans,
+    calibration_file,
+    numbered,
+    read_calibration,
+    read_drive_calibration,
+    read_simulation,
+    rows_of,
+)
+from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.oxts import OxtsRows, read_oxts
-from hybridlio.datasets.sequence import Notes, Sequence
-from hybridlio.datasets.stamps import MISSING_STAMP, note_coverage, note_gaps, read_stamps, usable_scans
+from hybridlio.datasets.reference import poses_at
+from hybridlio.datasets.sequence import Sequence
+from hybridlio.datasets.stamps import (
+    MISSING_STAMP,
+    SCAN_GAP_FACTOR,
+    note_coverage,
+    note_gaps,
+    read_stamps,
+    usable_scans,
+)
 from hybridlio.datasets.vertical_angle import kitti_raised
 
 LAYOUT = "a drive folder with velodyne_points/data/NNNNNNNNNN.bin, or the date or root folder above it"
 
-_LEAST_ROW_STEP_NS = 30_000_000
+_MIN_ROW_STEP_NS = 30_000_000  # rows closer than this are of the 100 Hz recording, not one per scan
+_MIN_COMPARED_M = 5.0  # directions of paths that leave the start by less are not compared
+_MIN_COSINE = 0.7  # of the angle between paths: 45°; the axes of a camera frame are 90° off
 
 
 def find(path: Path) -> dict[str, Path]:
-    """The drives at or directly below ``path``: folder by name, such as ``2011_09_26_drive_0005``."""
-    here = [path, *list(path.parents)[:2]]  # also from inside, as velodyne_points/data
+    """Find the drives at, directly below or above ``path``: folders by name, such as ``2011_09_26_drive_0005``."""
+    here = [path, *list(path.parents)[:2]]  # a path inside a drive, such as velodyne_points/data, works too
     drives = [p for p in here if (p / "velodyne_points").is_dir()][:1]
     below = (p.parent for depth in ("*", "*/*") for p in path.glob(f"{depth}/velodyne_points"))
     drives = drives or sorted(d for d in below if not any(part.startswith(".") for part in d.relative_to(path).parts))
@@ -40,15 +69,20 @@ def find(path: Path) -> dict[str, Path]:
 
 
 def open_drive(drive: Path, raw_root: Path | None = None, vertical_angle_deg: float | None = None) -> Sequence:
-    """One drive. ``raw_root`` is not needed here: calibration and 100 Hz data lie beside the drive.
+    """Open one drive.
 
-    Stamps are the scans' own, or else those of the navigation rows with the same numbers. The inertial samples are
-    the 100 Hz ones of the sibling ``*_extract`` folder where it exists, else the 10 Hz ones, with a warning; see
-    :func:`hybridlio.datasets.drive_imu.drive_imu`. Points are raised by ``vertical_angle_deg``, without it by KITTI's
-    known error where the drive is KITTI's own (:mod:`hybridlio.datasets.vertical_angle`).
+    The scans' stamps are their own, or those of the navigation rows with the same numbers. IMU samples are the 100 Hz
+    ones of the sibling ``*_extract`` folder if it exists, else the 10 Hz ones, with a note
+    (:func:`hybridlio.datasets.drive_imu.drive_imu`).
+
+    Args:
+        drive: the drive's folder.
+        raw_root: not used, because calibration and 100 Hz data are beside the drive.
+        vertical_angle_deg: angle by which points are raised; by default KITTI's known error if the drive is KITTI's
+            own, else 0 (:mod:`hybridlio.datasets.vertical_angle`).
 
     Raises:
-        DataError: no scans, stamps that do not match them, malformed navigation rows, or a missing calibration.
+        DataError: no scans, scans without stamps, malformed navigation rows, or a missing calibration.
         ConfigError: ``vertical_angle_deg`` is over 5°.
     """
     del raw_root
@@ -70,103 +104,80 @@ def open_drive(drive: Path, raw_root: Path | None = None, vertical_angle_deg: fl
         load_scan=kitti_raised(scans, len(paths), _imu_to_velo(drive), vertical_angle_deg, notes),
         imu=imu,
         calibration=calibration,
-        reference=_reference(drive, numbers, stamps, oxts, calibration, notes),
+        reference=_reference(drive, numbers, stamps, _navigated(oxts, stamps, calibration, notes), notes),
         gps=gps,
-        lidar=simulation.lidar if simulation else LIDAR_MODELS["hdl-64e"],
+        lidar=simulation.lidar if simulation else KITTI_LIDAR,
         forward_speed_m_s=oxts.forward_speed_at(stamps) if oxts else None,
         imu_noise=simulation.imu_noise if simulation else None,
         notes=tuple(notes.texts),
     )
 
 
-def scan_stamps(drive: Path, notes: Notes) -> NDArray[np.int64]:
-    """Stamps by scan number: the scans' own or, where KITTI has none, those of the navigation rows.
+def _stamp_lines(drive: Path, notes: Notes) -> Stamps:
+    """Return the stamps by scan number: the scans' own, or those of the navigation rows.
 
     Raises:
-        DataError: the drive has neither, or rows too close in time to be one a scan.
+        DataError: the drive has neither, or its rows are too close in time to be one per scan.
     """
     own, rows = drive / "velodyne_points/timestamps.txt", drive / "oxts/timestamps.txt"
     if own.is_file():
         return read_stamps(own)
     if not rows.is_file():
-        raise DataError(f"{own}: no such file, and no {rows} to use instead; the scans have no stamps")
+        raise DataError(f"{own}: no such file, and no {rows} to use instead; write one stamp per scan")
     stamps = read_stamps(rows)
-    if len(stamps) > 1 and np.median(np.diff(stamps)) < _LEAST_ROW_STEP_NS:
-        raise DataError(f"{own}: no such file, and the rows of {rows} are too many to be one a scan; write the scans'")
-    notes.add(f"no {own.name} in velodyne_points: scans get the stamps of the navigation rows with their numbers")
+    if len(stamps) > 1 and np.median(np.diff(stamps)) < _MIN_ROW_STEP_NS:
+        raise DataError(
+            f"{own}: no such file, and {rows} has more than one row per scan; write one stamp per scan to the former"
+        )
+    notes.add(f"no {own.name} in velodyne_points: scans get the stamps of the navigation rows with the same numbers")
     return stamps
 
 
-def _scans(drive: Path, notes: Notes) -> tuple[NDArray[np.int64], NDArray[np.int64], tuple[Path, ...]]:
-    """Numbers, stamps and files of the scans to use: those present, with stamps that increase."""
+def _scans(drive: Path, notes: Notes) -> tuple[Index, Stamps, tuple[Path, ...]]:
+    """Return numbers, stamps and files of the scans that exist, without those whose stamps do not increase."""
     folder = drive / "velodyne_points/data"
     numbers, paths = numbered(folder, ".bin")
     if not len(numbers):
         raise DataError(f"{folder}: no scans NNNNNNNNNN.bin")
-    lines = scan_stamps(drive, notes)
+    lines = _stamp_lines(drive, notes)
     if numbers[-1] >= len(lines) or (lines[numbers] == MISSING_STAMP).any():
         raise DataError(f"{drive}: {len(lines)} lines of stamps do not cover every scan up to {paths[-1].name}")
     missing = int(numbers[-1] - numbers[0] + 1 - len(numbers))
     if missing:
         first = int(np.setdiff1d(np.arange(numbers[0], numbers[-1]), numbers)[0])
-        notes.add(f"{missing} scans are missing in {folder}, the first is number {first}; motion there is bridged")
+        notes.add(f"{missing} scans are missing in {folder}, the first is number {first}; their motion is bridged")
     keep = usable_scans(lines[numbers], drive / "velodyne_points/timestamps.txt")
     if len(keep) < len(numbers):
         dropped = np.setdiff1d(numbers, numbers[keep])
         notes.add(f"dropped {len(dropped)} scans whose stamps repeat or go backwards, first number {dropped[0]}")
     numbers = numbers[keep]
-    note_gaps(lines[numbers], "scans", notes, factor=1.5)
+    note_gaps(lines[numbers], "scans", notes, SCAN_GAP_FACTOR)
     return numbers, lines[numbers], tuple(paths[k] for k in keep)
 
 
-def read_drive_calibration(drive: Path, needs_imu: bool) -> Calibration:
-    """Extrinsics from the drive's date folder, or the drive's own; the camera is the rectified one where known.
-
-    Only ``calib_imu_to_velo.txt`` is needed, and only with inertial data. ``calib_velo_to_cam.txt``, and
-    ``calib_cam_to_cam.txt`` for the rectification, are read where they are there.
-
-    Raises:
-        DataError: ``calib_imu_to_velo.txt`` is missing although the drive has inertial data, or a file is malformed.
-    """
-    imu_to_velo, velo_to_cam, cam_to_cam = (
-        _calibration_file(drive, f"calib_{name}.txt") for name in ("imu_to_velo", "velo_to_cam", "cam_to_cam")
-    )
-    if needs_imu and not imu_to_velo.is_file():
-        raise DataError(
-            f"{imu_to_velo}: missing calibration, which inertial data needs; download it, or write where the sensors "
-            "are: rows 'R:' with 9 numbers and 'T:' with 3, which map IMU points into the lidar frame"
-        )
-    T_imu_lidar = se3.inverse(read_rigid(imu_to_velo)) if imu_to_velo.is_file() else np.eye(4)
-    T_camera_lidar = read_rigid(velo_to_cam) if velo_to_cam.is_file() else None
-    if T_camera_lidar is not None and cam_to_cam.is_file():
-        (R_rect,) = rows_of(read_calibration(cam_to_cam), cam_to_cam, "R_rect_00")
-        T_camera_lidar = se3.make(R_rect, np.zeros(3)) @ T_camera_lidar
-    return Calibration(T_imu_lidar, T_camera_lidar)
-
-
-def _calibration_file(drive: Path, name: str) -> Path:
-    own = drive / name
-    return own if own.is_file() else drive.parent / name
-
-
-def _imu_to_velo(drive: Path) -> NDArray[np.float64]:
-    """The numbers of ``calib_imu_to_velo.txt`` as they stand there, none without it."""
-    path = _calibration_file(drive, "calib_imu_to_velo.txt")
+def _imu_to_velo(drive: Path) -> Array:
+    """Return the 12 numbers of ``calib_imu_to_velo.txt`` as written; none without the file."""
+    path = calibration_file(drive, "calib_imu_to_velo.txt")
     if not path.is_file():
         return np.empty(0)
     return np.concatenate([row.ravel() for row in rows_of(read_calibration(path), path, "R", "T")])
 
 
+def _navigated(oxts: OxtsRows | None, stamps: Stamps, calibration: Calibration, notes: Notes) -> Trajectory | None:
+    """Return lidar poses at the scans, in the first one's frame, from the navigation rows; None if they have none."""
+    if oxts is None:
+        return None
+    rows = oxts.with_positions
+    if rows is None:
+        notes.add("no reference poses: the navigation rows have no positions")
+        return None
+    return poses_at(stamps, rows.stamps_ns, rows.T_enu_imu @ calibration.T_imu_lidar, "navigation rows", notes)
+
+
 def _reference(
-    drive: Path,
-    numbers: NDArray[np.int64],
-    stamps: NDArray[np.int64],
-    oxts: OxtsRows | None,
-    calibration: Calibration,
-    notes: Notes,
+    drive: Path, numbers: Index, stamps: Stamps, navigated: Trajectory | None, notes: Notes
 ) -> Trajectory | None:
-    """Exact poses where the drive holds them, or lie beside it as its date's only drive, else from navigation rows."""
-    navigated = oxts.lidar_poses_at(stamps, calibration.T_imu_lidar, notes) if oxts else None
+    """Return the exact poses if there is a ``poses.txt``, else those of the navigation rows."""
     exact = _exact_poses(drive)
     if exact is None:
         return navigated
@@ -184,6 +195,7 @@ def _reference(
 
 
 def _exact_poses(drive: Path) -> Path | None:
+    """Return the drive's ``poses.txt``, or that of its date if the date has no other drive."""
     own, beside = drive / "poses.txt", drive.parent / "poses.txt"
     if own.is_file():
         return own
@@ -191,8 +203,8 @@ def _exact_poses(drive: Path) -> Path | None:
 
 
 def _note_other_frame(path: Path, poses: Trajectory, navigated: Trajectory, notes: Notes) -> None:
-    """Say if the poses move in another direction than the navigation rows do, as those of a camera would."""
+    """Note if the poses move in another direction than the navigation rows, as poses of a camera would."""
     there, here = (max(t.poses[:, :3, 3], key=lambda p: float(p @ p)) for t in (poses, navigated))
     lengths = float(np.linalg.norm(there)), float(np.linalg.norm(here))
-    if min(lengths) > 5.0 and there @ here < 0.7 * lengths[0] * lengths[1]:
+    if min(lengths) > _MIN_COMPARED_M and there @ here < _MIN_COSINE * lengths[0] * lengths[1]:
         notes.add(f"{path} moves in another direction than the navigation rows; it must hold poses of the lidar")

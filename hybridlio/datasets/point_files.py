@@ -1,8 +1,13 @@
-"""One scan from a file: ``.bin`` (KITTI's), ``.npy``, ``.pcd`` or ``.ply``.
+"""Scan files: ``.bin`` (KITTI's float32 x y z reflectance), ``.npy``, ``.pcd`` and ``.ply``.
 
-Columns are told by name where the format has names: ``x y z``, ``intensity`` (or ``reflectivity``, ``reflectance``)
-and a time, ``t``, ``time``, ``timestamp`` or ``time_offset``: integers are nanoseconds, floating-point numbers seconds,
-either from the scan's stamp or (above 10⁶ s) absolute on the stamps' clock. Intensities above 1 are taken as 0..255.
+Columns are found by name if the format has names:
+
+* ``x y z`` in metres, lidar frame (x forward, y left, z up);
+* ``intensity``, ``reflectivity`` or ``reflectance``: 0..1, or 0..255 if any value is above 1;
+* ``t``, ``time``, ``timestamp`` or ``time_offset``: integers are nanoseconds, floating-point numbers seconds; relative
+  to the scan's stamp or, if above 10⁶ s, absolute on the stamps' clock.
+
+A ``.npy`` file holds a structured array with these names, or rows of x y z or x y z intensity.
 """
 
 from __future__ import annotations
@@ -13,24 +18,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridlio.core.arrays import Floats, Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import NS_PER_S, Scan
-from hybridlio.datasets.cloud_headers import check_whole
+from hybridlio.datasets.cloud_headers import read_header
 from hybridlio.datasets.kitti_files import read_bin
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
 
 _INTENSITIES = ("intensity", "reflectivity", "reflectance")
 _TIMES = ("t", "time", "timestamp", "time_offset")
-_ABSOLUTE_NS = 10**15
+_MIN_ABSOLUTE_NS = 10**15  # 12 days: far above any offset, far below seconds since 1970
+_MAX_OFFSET_NS = NS_PER_S  # no lidar turns slower than once a second
+_MIN_SWEEP_NS = 1_000_000  # no lidar sweeps within 1 ms: the unit is wrong
 Columns = dict[str, NDArray[Any]]
 
 
 def read_scan(path: Path, stamp_ns: int) -> Scan:
-    """The scan in ``path``.
+    """Read the scan in ``path``.
 
     Raises:
-        DataError: the file is missing, truncated, of no points, or its columns cannot be used; names the file.
+        DataError: the file is missing or truncated, has no finite point, or has unusable columns; the message names the
+            file.
     """
     points, columns = _read(path)
     try:
@@ -44,7 +53,7 @@ def read_scan(path: Path, stamp_ns: int) -> Scan:
 
 def _read(path: Path) -> tuple[NDArray[Any], Columns]:
     if not path.is_file():
-        raise DataError(f"{path}: no such scan")
+        raise DataError(f"{path}: no such file")
     if path.suffix == ".bin":
         points, intensity = read_bin(path)
         return points, {"intensity": intensity}
@@ -52,7 +61,6 @@ def _read(path: Path) -> tuple[NDArray[Any], Columns]:
 
 
 def _read_npy(path: Path) -> tuple[NDArray[Any], Columns]:
-    """Rows of x y z or x y z intensity, or a structured array with those names."""
     try:
         values = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
@@ -70,12 +78,12 @@ def _read_npy(path: Path) -> tuple[NDArray[Any], Columns]:
 def _read_open3d(path: Path) -> tuple[NDArray[Any], Columns]:
     import open3d as o3d
 
-    header = check_whole(path)
+    header = read_header(path)
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         cloud = o3d.t.io.read_point_cloud(path)
     columns: Columns = {name: cloud.point[name].numpy() for name in cloud.point}
     if "positions" not in columns or not len(columns["positions"]):
-        raise DataError(f"{path}: no points, or malformed so that Open3D cannot read them")
+        raise DataError(f"{path}: Open3D finds no points; the file is empty or malformed")
     lost = [name for name in header.fields if name in _TIMES and name not in columns]
     if lost:
         raise DataError(
@@ -84,7 +92,7 @@ def _read_open3d(path: Path) -> tuple[NDArray[Any], Columns]:
     return columns.pop("positions"), {name: values.ravel() for name, values in columns.items()}
 
 
-def _intensity(columns: Columns) -> NDArray[np.float32] | None:
+def _intensity(columns: Columns) -> Floats | None:
     values = next((columns[name] for name in _INTENSITIES if name in columns), None)
     if values is None:
         return None
@@ -92,24 +100,24 @@ def _intensity(columns: Columns) -> NDArray[np.float32] | None:
     return np.asarray(values, dtype=np.float32) / np.float32(full_scale)
 
 
-def _offsets_ns(columns: Columns, stamp_ns: int) -> NDArray[np.int64] | None:
-    """Time offsets from the scan's stamp.
+def _offsets_ns(columns: Columns, stamp_ns: int) -> Stamps | None:
+    """Return the points' times relative to the scan's stamp; None without such a column.
 
     Raises:
-        DataError: not finite, over a second away from the stamp, or all within a millisecond though not equal.
+        DataError: a time is not finite or over 1 s from the stamp, or all are within 1 ms but differ.
     """
     name = next((name for name in _TIMES if name in columns), None)
     if name is None:
         return None
     values = columns[name]
     if not np.isfinite(values).all():
-        raise DataError(f"column '{name}' holds a time that is not finite")
+        raise DataError(f"column '{name}' has times that are not finite")
     whole = np.issubdtype(values.dtype, np.integer)
     ns = values.astype(np.int64) if whole else np.round(values.astype(np.float64) * NS_PER_S).astype(np.int64)
-    offsets = ns - stamp_ns if len(ns) and np.median(np.abs(ns)) > _ABSOLUTE_NS else ns
+    offsets = ns - stamp_ns if len(ns) and np.median(np.abs(ns)) > _MIN_ABSOLUTE_NS else ns
     unit = "integers are nanoseconds" if whole else "floating-point numbers are seconds"
-    if len(offsets) and np.abs(offsets).max() > NS_PER_S:
-        raise DataError(f"column '{name}' lies over 1 s from the scan's stamp; {unit}, of the stamps' clock")
-    if len(offsets) and 0 < np.ptp(offsets) < NS_PER_S // 1000:
+    if len(offsets) and np.abs(offsets).max() > _MAX_OFFSET_NS:
+        raise DataError(f"column '{name}' is over 1 s from the scan's stamp; {unit}, on the stamps' clock")
+    if len(offsets) and 0 < np.ptp(offsets) < _MIN_SWEEP_NS:
         raise DataError(f"column '{name}' spans under 1 ms, too short for a sweep; {unit}")
     return offsets

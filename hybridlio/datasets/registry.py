@@ -1,4 +1,4 @@
-"""The readers by name, and :func:`open_sequence`, which finds the one that fits a path."""
+"""The readers by name, and :func:`open_sequence`, which chooses the reader that fits a path."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.tables import counted
 from hybridlio.datasets import folder, kitti_odometry, kitti_raw
 from hybridlio.datasets.imu_faults import without_spikes
-from hybridlio.datasets.sequence import Notes, Sequence
+from hybridlio.datasets.notes import Notes
+from hybridlio.datasets.sequence import Sequence
 from hybridlio.datasets.vertical_angle import check_angle
 
 
 @dataclass(frozen=True)
 class Reader:
-    """How recordings of one layout are found and opened.
+    """Finds and opens recordings of one layout.
 
     Attributes:
-        layout: what the reader expects, for messages.
-        find: the recordings at or just below a path, by name; empty where the layout does not fit.
-        open: opens one of them; the second argument is the root of raw drives to join, or None, the third the angle by
-            which to raise points in degrees, or None for what the recording needs.
+        layout: description of the layout, for messages.
+        find: returns the recordings at or directly below a path, folders by name; empty if the layout does not match.
+        open: opens one of the folders. The second argument is the root of raw drives to join, or None; the third the
+            angle in degrees by which points are raised, or None to decide by the recording.
     """
 
     layout: str
@@ -33,7 +34,7 @@ class Reader:
     open: Callable[[Path, Path | None, float | None], Sequence]
 
 
-READERS: dict[str, Reader] = {  # in the order in which they are tried
+READERS: dict[str, Reader] = {  # tried in this order
     "kitti-raw": Reader(kitti_raw.LAYOUT, kitti_raw.find, kitti_raw.open_drive),
     "kitti-odometry": Reader(kitti_odometry.LAYOUT, kitti_odometry.find, kitti_odometry.open_sequence_folder),
     "folder": Reader(folder.LAYOUT, folder.find, folder.open_folder),
@@ -51,16 +52,16 @@ def open_sequence(
     """Open the recording at ``path``.
 
     Args:
-        path: a recording, or a folder that holds recordings.
-        sequence: which one, where there are several: its name, or its number alone (``0005``, ``09``).
-        reader: a name of :data:`READERS`; guessed from what lies at ``path`` without it.
-        raw_root: for KITTI odometry, the folder of the raw data's date folders, to join inertial data from.
-        vertical_angle_deg: raise each point, as seen from the lidar, by this angle against an error of the lidar's
-            vertical angles. By default 0.205 for KITTI's own scans, which have it, and 0 for all others.
+        path: a recording's folder, or a folder that holds recordings.
+        sequence: which of several recordings: its name, or its number alone (``0005``, ``09``).
+        reader: a name of :data:`READERS`; by default the first whose layout matches.
+        raw_root: for KITTI odometry, the folder that holds the raw data's date folders, to join inertial data from.
+        vertical_angle_deg: angle by which each point's elevation is raised, to correct an error of the lidar's vertical
+            angles. By default 0.205 for KITTI's own scans, which have this error, and 0 for all others.
 
     Raises:
-        DataError: nothing there, no reader fits (lists what was tried), several recordings and no ``sequence`` that
-            picks one, or what the reader raises.
+        DataError: no such folder, no reader fits (the message lists those tried), several recordings without a
+            ``sequence`` that selects one, or a recording that the reader cannot open.
         ConfigError: unknown ``reader``, or ``vertical_angle_deg`` is over 5°.
     """
     root = Path(path).expanduser().resolve()
@@ -71,24 +72,24 @@ def open_sequence(
 
 
 def _without_spikes(sequence: Sequence) -> Sequence:
-    """The sequence without inertial samples that nobody measured, which is noted."""
+    """Return the sequence without spikes in its IMU samples; note how many there were."""
     imu, left_out_ns = without_spikes(sequence.imu)
     if not len(left_out_ns):
         return sequence
     notes = Notes(sequence.name, list(sequence.notes))
     after_s = (left_out_ns[0] - sequence.stamps_ns[0]) / NS_PER_S
     notes.add(
-        f"left out {counted(len(left_out_ns), 'inertial sample')} far off those around, the first {after_s:.2f} s "
+        f"dropped {counted(len(left_out_ns), 'IMU sample')} far from the neighbouring ones, the first {after_s:.2f} s "
         "after the first scan"
     )
     return replace(sequence, imu=imu, notes=tuple(notes.texts))
 
 
 def sequence_names(path: str | os.PathLike[str], *, reader: str | None = None) -> tuple[str, ...]:
-    """Names of the recordings at or just below ``path``, each good as ``open_sequence``'s ``sequence``.
+    """Return the names of the recordings at or directly below ``path``, as :func:`open_sequence` takes them.
 
     Raises:
-        DataError: nothing there, or no reader fits.
+        DataError: no such folder, or no reader fits.
         ConfigError: unknown ``reader``.
     """
     return tuple(_find(Path(path).expanduser().resolve(), reader)[1])
@@ -99,21 +100,21 @@ def check_options(
     raw_root: str | os.PathLike[str] | None = None,
     vertical_angle_deg: float | None = None,
 ) -> None:
-    """Check what is said of many recordings at once, before any of them is opened.
+    """Check options for many recordings before any of them is opened.
 
     Raises:
-        ConfigError: unknown ``reader``, no folder ``raw_root``, or ``vertical_angle_deg`` is over 5°.
+        ConfigError: unknown ``reader``, ``raw_root`` is not a folder, or ``vertical_angle_deg`` is over 5°.
     """
     if vertical_angle_deg is not None:
         check_angle(vertical_angle_deg)
     if reader is not None and reader not in READERS:
         raise ConfigError(f"unknown reader {reader!r}; choose one of {', '.join(READERS)}")
     if raw_root is not None and not Path(raw_root).expanduser().is_dir():
-        raise ConfigError(f"raw root {raw_root}: no such folder; give the one that holds KITTI's date folders")
+        raise ConfigError(f"raw root {raw_root}: no such folder; give the folder that holds KITTI's date folders")
 
 
 def _find(root: Path, reader: str | None) -> tuple[str, dict[str, Path]]:
-    """The first reader that finds recordings at ``root``, and what it finds."""
+    """Return the name of the first reader that finds recordings at ``root``, and the recordings."""
     check_options(reader)
     if not root.is_dir():
         raise DataError(f"{root}: {'not a folder' if root.exists() else 'no such folder'}; give a recording's folder")
@@ -123,11 +124,11 @@ def _find(root: Path, reader: str | None) -> tuple[str, dict[str, Path]]:
         if found:
             return name, found
     wanted = "\n".join(f"  {name}: {READERS[name].layout}" for name in tried)
-    raise DataError(f"{root}: no recording found there. Tried\n{wanted}")
+    raise DataError(f"{root}: no recording found. Layouts tried:\n{wanted}")
 
 
 def _pick(root: Path, found: dict[str, Path], sequence: str | None) -> str:
-    """The name in ``found`` that ``sequence`` means."""
+    """Return the name in ``found`` that ``sequence`` selects."""
     wanted = sequence.removesuffix("_sync") if sequence is not None else None
     matches = [name for name in found if wanted is None or name == wanted]
     if not matches and wanted is not None and wanted.isdigit():

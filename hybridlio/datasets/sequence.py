@@ -1,58 +1,48 @@
-"""What a reader returns: a recording as a sequence of frames, scans loaded when asked for."""
+"""A recording as a sequence of frames, whose scans are loaded on demand; what every reader returns."""
 
 from __future__ import annotations
 
-import logging
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hybridlio.core.arrays import Array, Stamps
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, GpsFix, ImuNoise, ImuSamples, LidarModel, Scan
 from hybridlio.core.trajectory import Trajectory
 
-_log = logging.getLogger(__name__)
-
-
-@dataclass
-class Notes:
-    """Remarks on what is unusual in a recording: each is logged as a warning once, and kept with the sequence."""
-
-    name: str
-    texts: list[str] = field(default_factory=list)
-
-    def add(self, text: str) -> None:
-        """Log and keep one remark."""
-        if text not in self.texts:
-            self.texts.append(text)
-            _log.warning("%s: %s", self.name, text)
-
 
 @dataclass(frozen=True, eq=False)
 class Sequence:
-    """A recording.
+    """A recording: ``N`` scans and what other sensors measured meanwhile, all stamps on one clock.
+
+    ``len()`` is the number of scans; indexing and iterating return :class:`~hybridlio.core.sensors.Frame` objects.
 
     Attributes:
         name: short name for tables and run folders.
         stamps_ns: ``(N,)`` int64, one per scan, strictly increasing.
-        load_scan: gives scan ``k`` of ``N``; called each time a frame is asked for.
-        imu: every inertial sample; empty where there are none.
+        load_scan: returns scan ``k``; called each time a frame is requested. Must be picklable to run recordings in
+            other processes.
+        imu: all IMU samples; may be empty.
         calibration: the extrinsics.
-        reference: ground truth lidar poses in the first scan's frame, one per scan, or None.
-        gps: fixes in time order.
-        lidar: the sensor, where known; decides the vertex map's limits.
-        pose_file_frame: ``lidar`` or ``camera``: the frame that KITTI pose files of this recording use.
-        forward_speed_m_s: ``(N,)`` the vehicle's speed at the scans as its own navigation system gives it, or None;
-            for judging a trajectory's length where positions are poor.
-        imu_noise: the IMU's noise where the recording says it.
-        notes: what was found unusual when opening (gaps, dropped stamps, substitutes); also logged then.
+        reference: ground-truth lidar poses in the first scan's frame, one per scan, or None.
+        gps: fixes in order of time.
+        lidar: the lidar's model, or None if unknown; sets the limits of vertex maps.
+        pose_file_frame: ``lidar`` or ``camera``, the frame that KITTI pose files of this recording use.
+        forward_speed_m_s: ``(N,)`` forward speed at the scans from the vehicle's navigation system, or None; a check
+            of a trajectory's length if reference positions are poor.
+        imu_noise: the IMU's noise densities, or None if the recording does not give them.
+        notes: what the reader found unusual (gaps, dropped stamps, substitutes); also logged when opening.
+
+    Raises:
+        DataError: no scans, stamps that do not increase, ``reference`` or ``forward_speed_m_s`` of another length, or
+            GPS fixes out of order.
     """
 
     name: str
-    stamps_ns: NDArray[np.int64]
+    stamps_ns: Stamps
     load_scan: Callable[[int], Scan]
     imu: ImuSamples = field(default_factory=ImuSamples.empty)
     calibration: Calibration = field(default_factory=Calibration)
@@ -60,7 +50,7 @@ class Sequence:
     gps: tuple[GpsFix, ...] = ()
     lidar: LidarModel | None = None
     pose_file_frame: str = "lidar"
-    forward_speed_m_s: NDArray[np.float64] | None = None
+    forward_speed_m_s: Array | None = None
     imu_noise: ImuNoise | None = None
     notes: tuple[str, ...] = ()
 
@@ -74,7 +64,7 @@ class Sequence:
             if values is not None and len(values) != len(self.stamps_ns):
                 raise DataError(f"{self.name}: {what} has {len(values)} entries for {len(self.stamps_ns)} scans")
         if any(a.stamp_ns > b.stamp_ns for a, b in zip(self.gps, self.gps[1:], strict=False)):
-            raise DataError(f"{self.name}: GPS fixes are not in time order; sort them by stamp")
+            raise DataError(f"{self.name}: GPS fixes are not in order of time; sort them by stamp")
 
     def __repr__(self) -> str:
         return f"Sequence({self.name!r}, {len(self)} scans, {len(self.imu)} inertial samples)"
@@ -83,26 +73,27 @@ class Sequence:
         return len(self.stamps_ns)
 
     def __getitem__(self, index: int) -> Frame:
-        """Frame ``index`` (negative counts from the end), its scan read now.
+        """Load frame ``index``; negative indices count from the end.
 
         Raises:
-            DataError: the scan cannot be read; :meth:`without_scan` gives the frame all the same.
+            IndexError: there is no such frame.
+            DataError: the scan cannot be read. :meth:`without_scan` returns the frame without it.
         """
         k = range(len(self))[index]
         return self._frame(k, self.load_scan(k))
 
     def without_scan(self, index: int) -> Frame:
-        """Frame ``index`` with a scan of no points, for going on where the scan cannot be read."""
+        """Return frame ``index`` with an empty scan, to continue after a scan that cannot be read."""
         k = range(len(self))[index]
         return self._frame(k, Scan(int(self.stamps_ns[k]), np.empty((0, 3), np.float32)))
 
     def part(self, start: int | None, stop: int | None) -> Sequence:
-        """Frames ``start`` to before ``stop`` as a sequence of its own, counted from 0, in its first scan's frame.
+        """Return frames ``start`` to ``stop`` (exclusive) as a sequence; index 0 and the reference start at ``start``.
 
-        All inertial samples are kept: those before the first scan help to find where down is.
+        All IMU samples are kept: those before the first scan help to estimate the vertical.
 
         Raises:
-            DataError: no frame is left.
+            DataError: the range is empty.
         """
         rows = slice(*slice(start, stop).indices(len(self))[:2])
         if rows.start >= rows.stop:
@@ -138,7 +129,7 @@ class Sequence:
         )
 
     def _during(self, scan: Scan) -> ImuSamples:
-        """The samples from the scan's first point to its last, where points carry times."""
+        """Return the samples from the scan's first point to its last; none if the points have no times."""
         if scan.time_offsets_ns is None or not len(scan):
             return ImuSamples.empty()
         first, last = scan.time_offsets_ns.min(), scan.time_offsets_ns.max()
@@ -148,7 +139,7 @@ class Sequence:
         return (self[k] for k in range(len(self)))
 
     def _first_stamp_ns(self) -> int:
-        """The earliest stamp of any sensor, for what the first frame carries."""
+        """Return the earliest stamp of any sensor, where the first frame's interval starts."""
         firsts = [int(self.stamps_ns[0])]
         firsts += [int(self.imu.stamps_ns[0])] if len(self.imu) else []
         firsts += [self.gps[0].stamp_ns] if self.gps else []
@@ -159,19 +150,12 @@ class Sequence:
         """Seconds from the first scan to the last."""
         return float(self.stamps_ns[-1] - self.stamps_ns[0]) / NS_PER_S
 
-    @property
-    def gaps(self) -> tuple[tuple[int, float], ...]:
-        """Where scans are missing: ``(k, seconds since scan k-1)`` for each step over 1.5 times the median one."""
-        steps = np.diff(self.stamps_ns) / NS_PER_S
-        large = np.flatnonzero(steps > 1.5 * np.median(steps)) if len(steps) else np.empty(0, np.int64)
-        return tuple((int(k) + 1, float(steps[k])) for k in large)
-
 
 def frame_range(frames: str) -> tuple[int | None, int | None]:
-    """The ends of a range ``A:B``; None for one that is left out.
+    """Parse a range ``A:B``, ``A:`` or ``:B``; an omitted end is None.
 
     Raises:
-        ConfigError: it is no range.
+        ConfigError: ``frames`` is not such a range.
     """
     try:
         start, stop = (int(end) if end.strip() else None for end in frames.split(":"))
@@ -181,10 +165,10 @@ def frame_range(frames: str) -> tuple[int | None, int | None]:
 
 
 def part_of(sequence: Sequence, frames: str | None) -> Sequence:
-    """The frames ``A:B`` of a sequence, as Python counts them; all without a range.
+    """Return the frames ``A:B`` of a sequence, as a Python slice; the whole sequence for None.
 
     Raises:
-        ConfigError: ``frames`` is no range.
-        DataError: no frame is left.
+        ConfigError: ``frames`` is not a range.
+        DataError: the range is empty.
     """
     return sequence if frames is None else sequence.part(*frame_range(frames))

@@ -1,4 +1,4 @@
-"""Time stamps as recordings write them: read to nanoseconds, put in order, and their gaps described."""
+"""Time stamps of recordings: read exactly to nanoseconds, checked and sorted; their gaps are noted."""
 
 from __future__ import annotations
 
@@ -11,53 +11,62 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridlio.core.arrays import Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import NS_PER_S
-from hybridlio.datasets.sequence import Notes
+from hybridlio.core.tables import counted
+from hybridlio.datasets.notes import Notes
 
-Stamps = NDArray[np.int64]
+MISSING_STAMP = int(np.iinfo(np.int64).min)  # stands for a blank line; NumPy's NaT has the same bits
 
-_LEAST_STEP_NS = 5_000_000
-_LARGEST_STEP_S = 10.0
+SCAN_GAP_FACTOR = 1.5  # a step over 1.5 times the median one: a scan is missing, jitter alone is far smaller
+IMU_GAP_FACTOR = 5.0  # IMU drivers deliver in bursts; shorter gaps are interpolated without harm
+_MIN_SCAN_STEP_NS = 5_000_000  # no lidar makes 200 scans a second: the unit is wrong
+_MAX_STEP_S = 10.0  # no sensor is slower: the unit is wrong
+_MIN_WHOLE_STEP_NS = 1000  # no sensor delivers whole nanoseconds at over 1 MHz: these are seconds
+_MAX_UNCOVERED_S = 0.15  # beyond the first or last scan: one and a half scans at 10 Hz
+_YEARS = (1678, 2261)  # whole years that fit int64 nanoseconds; NumPy wraps others around without an error
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d.*?)(?:Z|([+-])(\d\d):?(\d\d))?")
-MISSING_STAMP = int(np.iinfo(np.int64).min)  # what a blank line reads as; NumPy's "not a time" has the same bits
 
 
 def _iso_ns(text: str) -> int:
     date, sign, hours, minutes = _ISO.fullmatch(text).groups(default="0")  # type: ignore[union-attr]
-    if not 1678 <= int(date[:4]) <= 2261:  # NumPy would wrap around without a word
+    if not _YEARS[0] <= int(date[:4]) <= _YEARS[1]:
         raise OverflowError
     east_ns = int(f"{sign}1") * (60 * int(hours) + int(minutes)) * 60 * NS_PER_S if sign != "0" else 0
     return int(np.datetime64(date.replace(" ", "T"), "ns").astype(np.int64)) - east_ns
 
 
-def _seconds_ns(text: str) -> int:
-    return int((Decimal(text) * NS_PER_S).to_integral_value())  # a float64 would round seconds since 1970 to 0.2 µs
+def seconds_ns(text: str) -> int:
+    """Convert decimal seconds to nanoseconds exactly; a float64 would round seconds since 1970 to 0.2 µs."""
+    return int((Decimal(text) * NS_PER_S).to_integral_value())
 
 
 def _parser(lines: list[str]) -> Callable[[str], int]:
     first = next(filter(None, lines))
     if re.match(r"\d{4}-\d\d-\d\d", first):
         return _iso_ns
-    seconds = any(re.search(r"[.eE]", line) for line in lines)  # one whole second among others is no nanosecond
-    return _seconds_ns if seconds or not re.fullmatch(r"[+-]?\d+", first) else int
+    # all lines, because a single stamp among seconds may be written without a point
+    is_seconds = any(re.search(r"[.eE]", line) for line in lines)
+    return seconds_ns if is_seconds or not re.fullmatch(r"[+-]?\d+", first) else int
 
 
 def read_stamps(path: Path) -> Stamps:
-    """Stamps ``(N,)`` of a text file with one a line: whole numbers are nanoseconds, or seconds where any line has a
-    point or an exponent, and dates such as ``2011-09-26 13:04:32.349659964`` ISO 8601, in UTC unless they say how far
-    off it they are (``+02:00``).
+    """Read the stamps ``(N,)`` of a text file with one per line.
 
-    A blank line, as for a frame that was not recorded, reads as ``MISSING_STAMP``.
+    A file has one of three formats: ISO 8601 dates such as ``2011-09-26 13:04:32.349659964``, in UTC or with an offset
+    (``+02:00``); seconds, if any line has a decimal point or exponent; else whole nanoseconds. A blank line, as for a
+    frame that was not recorded, reads as :data:`MISSING_STAMP`.
 
     Raises:
-        DataError: the file is missing, empty, or a row does not read like the first; names file and row.
+        DataError: the file is missing or empty, a line does not have the format of the first (the message names file
+            and line), or whole numbers are too close together to be nanoseconds.
     """
     if not path.is_file():
-        raise DataError(f"{path}: no such file; expected one time stamp a line")
+        raise DataError(f"{path}: no such file; expected one time stamp per line")
     lines = [line.strip() for line in path.read_text(encoding="utf-8", errors="replace").rstrip().splitlines()]
     if not any(lines):
-        raise DataError(f"{path}: empty; expected one time stamp a line")
+        raise DataError(f"{path}: empty; expected one time stamp per line")
     parse = _parser(lines)
     stamps = np.full(len(lines), MISSING_STAMP)
     for row, line in enumerate(lines):
@@ -66,19 +75,21 @@ def read_stamps(path: Path) -> Stamps:
         except (ValueError, InvalidOperation, OverflowError, AttributeError):
             raise DataError(f"{path}, line {row + 1}: cannot read {line[:40]!r} as a time stamp") from None
     known = stamps[stamps != MISSING_STAMP]
-    if parse is int and len(known) > 1 and 0 < np.median(np.abs(np.diff(known))) < 1000:
-        raise DataError(f"{path}: whole numbers are nanoseconds, yet these are under 1 µs apart; write seconds as 1.0")
+    if parse is int and len(known) > 1 and 0 < np.median(np.abs(np.diff(known))) < _MIN_WHOLE_STEP_NS:
+        raise DataError(
+            f"{path}: whole numbers are read as nanoseconds, but these are under 1 µs apart; write seconds as 1.0"
+        )
     return stamps
 
 
 def increasing(stamps: Stamps) -> NDArray[np.intp]:
-    """Indices of a longest strictly increasing part of ``stamps``: what is left when the fewest are dropped.
+    """Return the indices of a longest strictly increasing subsequence: the fewest stamps are dropped.
 
-    Of rows with the same stamp the first is kept: whoever writes one twice has missed the second's own.
+    Of rows with the same stamp the first is kept, because a writer that repeats a stamp has missed the second's own.
     """
     if (np.diff(stamps) > 0).all():
         return np.arange(len(stamps))
-    tails: list[int] = []  # smallest last stamp of an increasing run, by its length
+    tails: list[int] = []  # smallest last stamp of an increasing subsequence, by its length
     tail_at: list[int] = []
     before: list[int] = []
     for k, stamp in enumerate(stamps.tolist()):
@@ -97,68 +108,76 @@ def increasing(stamps: Stamps) -> NDArray[np.intp]:
 
 
 def usable_scans(stamps: Stamps, path: Path) -> NDArray[np.intp]:
-    """Indices of the scans to keep: a longest part of ``stamps`` that increases.
+    """Return the indices of the scans to keep: those of a longest strictly increasing subsequence of ``stamps``.
 
     Raises:
-        DataError: that is less than half of them, or scans would follow each other within 5 ms: stamps with too few
-            digits or in another unit; names ``path``, their file.
+        DataError: it holds less than half of the scans, or scans are under 5 ms apart: the stamps lack digits or have
+            another unit. The message names ``path``, their file.
     """
     keep = increasing(stamps)
     if 2 * len(keep) < len(stamps):
         raise DataError(
-            f"{path}: only {len(keep)} of {len(stamps)} scans have stamps that increase; do they lack digits?"
+            f"{path}: only {len(keep)} of {len(stamps)} scans have increasing stamps; write them with more digits"
         )
-    step_ns = float(np.median(np.diff(stamps[keep]))) if len(keep) > 1 else _LEAST_STEP_NS
-    if step_ns < _LEAST_STEP_NS:
-        raise DataError(f"{path}: scans are {step_ns / 1e6:g} ms apart; whole numbers are nanoseconds, write s as 1.0")
+    step_ns = float(np.median(np.diff(stamps[keep]))) if len(keep) > 1 else _MIN_SCAN_STEP_NS
+    if step_ns < _MIN_SCAN_STEP_NS:
+        raise DataError(
+            f"{path}: scans are {step_ns / 1e6:g} ms apart; whole numbers are read as nanoseconds: write seconds as 1.0"
+        )
     return keep
 
 
 def sorted_unique(stamps: Stamps, what: str, notes: Notes) -> NDArray[np.intp]:
-    """Indices that put ``stamps`` in order, each stamp once (the first row that has it); says how many were wrong."""
+    """Return the indices that sort ``stamps``, of equal stamps the first; note how many were out of order."""
     backwards = int((np.diff(stamps) < 0).sum())
     _, first = np.unique(stamps, return_index=True)
     repeats = len(stamps) - len(first)
     if backwards or repeats:
         notes.add(
-            f"{what}: {backwards} of {len(stamps)} stamps go backwards and {repeats} repeat; sorted, repeats dropped"
+            f"{what}: of {len(stamps)} stamps {backwards} go backwards and {repeats} repeat; sorted, repeats dropped"
         )
     return first
 
 
 def note_gaps(stamps: Stamps, what: str, notes: Notes, factor: float) -> None:
-    """Say how many steps in ``stamps`` exceed ``factor`` times the median step, and which is the longest.
+    """Note how many steps between ``stamps`` exceed ``factor`` times the median step, and the longest.
 
-    A median step of over 10 s is told too: stamps may be in another unit.
+    Also notes a median step over 10 s, a sign of another unit.
     """
     steps = np.diff(stamps) / NS_PER_S
     if not len(steps):
         return
-    if len(steps) > 1 and np.median(steps) > _LARGEST_STEP_S:
-        notes.add(f"{what}: {np.median(steps):g} s apart; check that their stamps are in seconds, or whole nanoseconds")
+    if len(steps) > 1 and np.median(steps) > _MAX_STEP_S:
+        notes.add(f"{what}: {np.median(steps):g} s apart; check that stamps are in seconds, or whole nanoseconds")
     large = int((steps > factor * np.median(steps)).sum())
     if large:
         worst = int(steps.argmax())
-        notes.add(f"{what}: {large} gaps, the longest {steps[worst]:.3f} s after row {worst}")
+        notes.add(f"{what}: {counted(large, 'gap')}, the longest {steps[worst]:.3f} s after row {worst}")
 
 
-def note_coverage(stamps: Stamps, scans: Stamps, what: str, notes: Notes, of: str = "scan") -> None:
-    """Say where ``stamps``, if there are any, begin after the first scan or end before the last by over 0.15 s.
+def note_coverage(stamps: Stamps, scans: Stamps, what: str, notes: Notes, reference: str = "scan") -> None:
+    """Note if ``stamps``, unless empty, start over 0.15 s after the first scan or end over 0.15 s before the last.
 
-    ``of`` is what to call ``scans`` where they are something else.
+    Args:
+        stamps: ``(N,)`` of the sensor, sorted.
+        scans: ``(M,)`` to compare with, sorted.
+        what: name of the sensor's data.
+        notes: receives the notes.
+        reference: name of one of ``scans``, if they are not scans.
 
     Raises:
-        DataError: the two share no time at all, as with clocks of different origin.
+        DataError: the two do not overlap, as with clocks of different origin.
     """
     if not len(stamps):
         return
     if stamps[0] > scans[-1] or stamps[-1] < scans[0]:
-        away = float(stamps[0] - scans[0]) / NS_PER_S
+        offset_s = float(stamps[0] - scans[0]) / NS_PER_S
         raise DataError(
-            f"{notes.name}: {what} begins {away:+.1f} s from the first {of} and shares no time with the {of}s"
+            f"{notes.name}: {what} starts {offset_s:+.1f} s from the first {reference} and does not overlap the "
+            f"{reference}s in time; bring both to one clock"
         )
     late, early = (stamps[0] - scans[0]) / NS_PER_S, (scans[-1] - stamps[-1]) / NS_PER_S
-    if late > 0.15:
-        notes.add(f"{what} starts {late:.2f} s after the first {of}")
-    if early > 0.15:
-        notes.add(f"{what} ends {early:.2f} s before the last {of}")
+    if late > _MAX_UNCOVERED_S:
+        notes.add(f"{what} starts {late:.2f} s after the first {reference}")
+    if early > _MAX_UNCOVERED_S:
+        notes.add(f"{what} ends {early:.2f} s before the last {reference}")

@@ -1,8 +1,8 @@
-"""The error of the vertical angles in KITTI's scans, and its correction.
+"""Correction of the vertical angles in KITTI's scans.
 
-KITTI's lidar delivers every point about 0.2° too low, so that flat ground bends into a cone and scans taken from two
-places do not fit. The correction, a rotation of each point about the horizontal axis perpendicular to its direction, is
-that of Deschaud, "IMLS-SLAM: scan-to-model matching based on 3D data", ICRA 2018; 0.205° is what KISS-ICP takes.
+KITTI's lidar reports every point about 0.2° too low. Flat ground then becomes a cone, and scans from two places do not
+fit. The correction rotates each point about the horizontal axis perpendicular to its direction (Deschaud, "IMLS-SLAM:
+scan-to-model matching based on 3D data", ICRA 2018).
 """
 
 from __future__ import annotations
@@ -13,27 +13,28 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hybridlio.core.arrays import Array, Floats
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.sensors import Scan
-from hybridlio.datasets.sequence import Notes
+from hybridlio.datasets.notes import Notes
 
-KITTI_VERTICAL_ANGLE_DEG = 0.205
+KITTI_VERTICAL_ANGLE_DEG = 0.205  # KISS-ICP's value; registration of two drives finds 0.18 to 0.20 (docs/datasets.md)
 
-# digests of what calib_imu_to_velo.txt (the same on all dates) and calib.txt's Tr (of 00-02, 03 and 04-21) hold
+# digests of KITTI's calib_imu_to_velo.txt (the same on all dates) and of calib.txt's Tr (of 00-02, 03 and 04-21)
 _KITTI_CALIBRATIONS = frozenset({"416e61ca9ac1b4ea", "eca64c0091f55929", "328069dfec6ced4f", "31474ac6c25ac7ea"})
-_LARGEST_DEG = 5.0
-_SCANS_TO_LOOK_AT = 5
-_LEAST_REFLECTANCES = 20
-_ELEVATIONS_DEG = np.linspace(-20.0, 1.0, 1051)
-_SHARE_SEEN = 0.5  # KITTI's scans have returns at 72 % or more of these elevations, beams from one origin at 5 %
+_MAX_ANGLE_DEG = 5.0  # a larger error is not a calibration error: the angle is probably in another unit
+_MAX_SCANS_TRIED = 5  # for one that can be read
+_MIN_REFLECTANCES = 20  # distinct values in a scan; a constant column proves nothing, KITTI's scans have dozens
+_ELEVATIONS_DEG = np.linspace(-20.0, 1.0, 1051)  # bins of 0.02°, within the lidar's field of view
+_RANGE_M = (5.0, 60.0)  # horizontal; nearer, the laser's offset changes the elevation, farther points are few
+_MIN_ELEVATION_SHARE = 0.5  # KITTI's scans have returns in 72 % or more of the bins, beams from one origin in 5 %
 
 
-def raise_points(points: NDArray[np.float32], angle_deg: float) -> NDArray[np.float32]:
-    """Points ``(N, 3)`` whose elevation seen from the sensor is ``angle_deg`` higher; ranges and azimuths stay.
+def raise_points(points: Floats, angle_deg: float) -> Floats:
+    """Raise the elevation of points ``(N, 3)``, lidar frame, by ``angle_deg``; ranges and azimuths stay.
 
-    Points on the vertical axis have no azimuth to rotate along and only lose the cosine of their height.
+    A point on the vertical axis has no azimuth; only its height is scaled, by the cosine of the angle.
     """
     sine, cosine = np.float32(math.sin(math.radians(angle_deg))), np.float32(math.cos(math.radians(angle_deg)))
     x, y, z = np.ascontiguousarray(points.T, dtype=np.float32)
@@ -46,19 +47,19 @@ def raise_points(points: NDArray[np.float32], angle_deg: float) -> NDArray[np.fl
 
 @dataclass(frozen=True)
 class RaisedScans:
-    """Scans of ``load`` with every point raised by ``angle_deg``; an object, so that it can go to another process."""
+    """Loads scans with points raised by ``angle_deg``. An object rather than a closure, so that it can be pickled."""
 
     load: Callable[[int], Scan]
     angle_deg: float
 
     def __call__(self, k: int) -> Scan:
-        """Scan ``k``; raises what ``load`` raises."""
+        """Load scan ``k``; raises the errors of ``load``."""
         scan = self.load(k)
         return replace(scan, points=raise_points(scan.points, self.angle_deg))
 
 
 def raised(load: Callable[[int], Scan], angle_deg: float | None) -> Callable[[int], Scan]:
-    """``load`` with its points raised by ``angle_deg``; itself at 0 or None.
+    """Return ``load`` with its points raised by ``angle_deg``; ``load`` itself for 0 or None.
 
     Raises:
         ConfigError: the angle is not finite or over 5°.
@@ -70,52 +71,64 @@ def raised(load: Callable[[int], Scan], angle_deg: float | None) -> Callable[[in
 
 
 def check_angle(angle_deg: float) -> None:
-    """Check an angle to raise points by.
+    """Check a correction of the vertical angle.
 
     Raises:
         ConfigError: it is not finite or over 5°.
     """
-    if not abs(angle_deg) <= _LARGEST_DEG:
-        raise ConfigError(f"vertical_angle_deg: {angle_deg} is no calibration error; give at most {_LARGEST_DEG:.0f}°")
+    if not abs(angle_deg) <= _MAX_ANGLE_DEG:
+        raise ConfigError(f"vertical_angle_deg: must be within ±{_MAX_ANGLE_DEG:.0f}°, got {angle_deg}")
 
 
 def kitti_raised(
-    load: Callable[[int], Scan], count: int, calibration: NDArray[np.float64], angle_deg: float | None, notes: Notes
+    load: Callable[[int], Scan], count: int, calibration: Array, angle_deg: float | None, notes: Notes
 ) -> Callable[[int], Scan]:
-    """``load`` with its points raised by ``angle_deg``, or where that is None by KITTI's error if it is there.
+    """Return ``load`` with its points raised by ``angle_deg``, or by KITTI's error if the recording is KITTI's own.
 
-    Only KITTI's own recordings have it: those with the numbers of KITTI's ``calibration`` ``(12,)`` and with scans
-    like its lidar's. Others in the same layout stay as they are.
+    KITTI's own recordings have the numbers of KITTI's calibration, and scans that look like those of its lidar. Other
+    recordings in the same layout are not changed.
+
+    Args:
+        load: loads scan ``k``.
+        count: number of scans.
+        calibration: ``(12,)``, the numbers of the calibration file.
+        angle_deg: the correction, or None to decide by the recording.
+        notes: receives a note of a correction that was not asked for.
+
+    Raises:
+        ConfigError: ``angle_deg`` is not finite or over 5°.
     """
-    if angle_deg is not None or not _is_kittis(calibration) or not _looks_like_kittis(load, count):
+    if angle_deg is not None or not _is_kitti_calibration(calibration) or not _is_kitti_lidar(load, count):
         return raised(load, angle_deg)
     notes.add(
-        f"KITTI's own scans: points are raised by {KITTI_VERTICAL_ANGLE_DEG}° against the error of the lidar's "
-        "vertical angles; vertical_angle_deg=0 (--vertical-angle 0) leaves them as they are"
+        f"KITTI's own scans: points are raised by {KITTI_VERTICAL_ANGLE_DEG}° to correct the lidar's vertical angles; "
+        "vertical_angle_deg=0 (--vertical-angle 0) turns this off"
     )
     return raised(load, KITTI_VERTICAL_ANGLE_DEG)
 
 
-def _is_kittis(calibration: NDArray[np.float64]) -> bool:
+def _is_kitti_calibration(calibration: Array) -> bool:
     text = " ".join(f"{value:.6e}" for value in np.ravel(calibration))
     return hashlib.sha256(text.encode()).hexdigest()[:16] in _KITTI_CALIBRATIONS
 
 
-def _looks_like_kittis(load: Callable[[int], Scan], count: int) -> bool:
-    """Whether the first scan that can be read is as from KITTI's lidar, and not simulated with its calibration.
+def _is_kitti_lidar(load: Callable[[int], Scan], count: int) -> bool:
+    """Return whether the first readable scan looks like KITTI's lidar, rather than a simulated one.
 
-    Its reflectances are hundredths, and its beams, which do not start at one point, fill nearly all elevations.
+    The reflectances of KITTI's lidar are hundredths. Its lasers do not share one origin, so its points fill nearly all
+    elevations, whereas those of a simulated lidar lie on one elevation per beam.
     """
-    for k in range(min(count, _SCANS_TO_LOOK_AT)):
+    for k in range(min(count, _MAX_SCANS_TRIED)):
         try:
             scan = load(k)
         except DataError:
             continue
         x, y, z = scan.points.T
         across = np.hypot(x, y)
-        far = (across > 5) & (across < 60)
+        far = (across > _RANGE_M[0]) & (across < _RANGE_M[1])
         seen = np.histogram(np.degrees(np.arctan2(z[far], across[far])), _ELEVATIONS_DEG)[0] > 0
         hundredths = 100 * (np.zeros(0) if scan.intensity is None else scan.intensity)
-        whole = np.abs(hundredths - np.round(hundredths)) < 1e-3
-        return bool(seen.mean() > _SHARE_SEEN and whole.all() and len(np.unique(hundredths)) >= _LEAST_REFLECTANCES)
+        whole = np.abs(hundredths - np.round(hundredths)) < 1e-3  # float32 rounding
+        various = len(np.unique(hundredths)) >= _MIN_REFLECTANCES
+        return bool(seen.mean() > _MIN_ELEVATION_SHARE and whole.all() and various)
     return False

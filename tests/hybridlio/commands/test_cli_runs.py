@@ -152,7 +152,7 @@ def test_a_disk_without_links_keeps_the_run_and_says_so(tiny_drive, tmp_path, mo
 
 def test_the_vertical_angle_can_be_set(tiny_drive, tmp_path, without_pages):
     said = refused(2, "odometry", tiny_drive, "--vertical-angle", 9)
-    assert "vertical_angle_deg: 9.0 is no calibration error" in said
+    assert "vertical_angle_deg: must be within ±5°, got 9.0" in said
     heights = []
     for name, angle in (("as-is", 0), ("raised", 1)):
         ok("odometry", tiny_drive, "--vertical-angle", angle, "--frames", ":3", "-o", tmp_path / name)

@@ -1,4 +1,4 @@
-"""One short ride, known in closed form, written in each layout that a reader reads."""
+"""A short ride in closed form, written in the layout of every reader."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MS = 1_000_000
 
 @dataclass(frozen=True)
 class Ride:
-    """A circle driven at constant speed: a constant twist, so geodesics between its poses are the ride itself."""
+    """A circle at constant speed: the twist is constant, so interpolation along geodesics is exact."""
 
     count: int = 12
     start_ns: int = 1_317_384_000_123_456_789  # 2011-09-30 12:00:00.123456789
@@ -58,7 +58,7 @@ class Ride:
         return np.random.default_rng(k).uniform(-20, 20, size=(50 + k, 4)) * [1, 1, 0.1, 0.02] + [0, 0, 0, 0.5]
 
     def oxts_rows(self, stamps_ns: NDArray[np.int64]) -> Array:
-        """KITTI's 30 columns; the inverse of the Mercator projection about the ride's start."""
+        """Return KITTI's 30 columns, with the inverse of the Mercator projection at the ride's start."""
         T, imu = self.T_enu_imu(stamps_ns), self.imu(np.arange(len(stamps_ns)))  # the same at all times
         scale = EARTH_RADIUS_M * np.cos(np.radians(LATITUDE_DEG))
         north = np.arcsinh(np.tan(np.radians(LATITUDE_DEG))) + T[:, 1, 3] / scale
@@ -107,7 +107,7 @@ def put_calibration(date: Path, ride: Ride) -> None:
 def write_raw(
     root: Path, ride: Ride, name: str = "2011_09_30_drive_0016", extract: bool = True, own_stamps: bool = True
 ) -> Path:
-    """The ride as a KITTI raw drive; returns its ``_sync`` folder."""
+    """Write the ride as a KITTI raw drive; return its ``_sync`` folder."""
     date = root / name[:10]
     drive = date / f"{name}_sync"
     put_calibration(date, ride)
@@ -123,7 +123,7 @@ def write_raw(
 
 
 def write_odometry(root: Path, ride: Ride, name: str = "04") -> Path:
-    """The ride as a KITTI odometry sequence; returns its folder."""
+    """Write the ride as a KITTI odometry sequence; return its folder."""
     folder = root / "sequences" / name
     Tr = " ".join(map(str, ride.T_camera_lidar[:3].ravel()))
     put(folder / "calib.txt", f"P0: {'1 ' * 12}\nTr: {Tr}\n")
@@ -144,7 +144,7 @@ def calibration_yaml(ride: Ride) -> str:
 
 
 def write_folder(root: Path, ride: Ride, write_scan: Callable[[Path, Array], Any] | None = None) -> Path:
-    """The ride as a plain folder; returns it. Scans are ``.npy`` unless ``write_scan`` writes ``scans/<k>`` itself."""
+    """Write the ride as a plain folder; return it. Scans are ``.npy`` unless ``write_scan`` writes ``scans/<k>``."""
     folder = root / "ride"
     for k in range(ride.count):
         path = folder / f"scans/{k}"
@@ -161,7 +161,7 @@ def write_folder(root: Path, ride: Ride, write_scan: Callable[[Path, Array], Any
 
 
 class Recordings:
-    """The ride and the writers, for tests to use by one fixture."""
+    """The ride and the writers, as one fixture."""
 
     ride = Ride()
     write_raw = staticmethod(write_raw)

@@ -1,4 +1,4 @@
-"""What every reader promises, on the same ride written in each reader's layout."""
+"""The contract of every reader, on the same ride written in each reader's layout."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ WRITERS: dict[str, Callable[[Any, Path], dict[str, Any]]] = {
 }
 
 
-def test_every_reader_is_under_contract() -> None:
+def test_every_reader_is_tested_here() -> None:
     assert set(WRITERS) == set(READERS)
 
 
 @pytest.fixture(scope="module", params=list(READERS))
 def opened(request: pytest.FixtureRequest, recordings: Any, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """Reader's name, the arguments that open the ride, and the sequence."""
+    """The reader's name, the arguments that open the ride, and the sequence."""
     arguments = WRITERS[request.param](recordings, tmp_path_factory.mktemp(request.param))
     return request.param, arguments, open_sequence(**arguments)
 
@@ -42,14 +42,14 @@ def sequence(opened: tuple[str, dict[str, Any], Sequence]) -> Sequence:
     return opened[2]
 
 
-def test_the_reader_is_guessed_as_if_it_were_named(opened: tuple[str, dict[str, Any], Sequence]) -> None:
+def test_the_guessed_reader_equals_the_named_one(opened: tuple[str, dict[str, Any], Sequence]) -> None:
     name, arguments, sequence = opened
     named = open_sequence(**arguments, reader=name)
     assert named.name == sequence.name
     np.testing.assert_array_equal(named.stamps_ns, sequence.stamps_ns)
 
 
-def test_names_found_at_a_path_open_there(opened: tuple[str, dict[str, Any], Sequence]) -> None:
+def test_listed_names_can_be_opened(opened: tuple[str, dict[str, Any], Sequence]) -> None:
     _, arguments, sequence = opened
     (name,) = sequence_names(arguments["path"].parent)
     again = open_sequence(arguments["path"].parent, sequence=name, raw_root=arguments.get("raw_root"))
@@ -57,14 +57,14 @@ def test_names_found_at_a_path_open_there(opened: tuple[str, dict[str, Any], Seq
     assert len(again) == len(sequence)
 
 
-def test_stamps_increase_and_are_the_rides(sequence: Sequence, recordings: Any) -> None:
+def test_stamps_increase_and_equal_those_of_the_ride(sequence: Sequence, recordings: Any) -> None:
     stamps = sequence.stamps_ns
     assert stamps.dtype == np.int64
     assert (np.diff(stamps) > 0).all()
     np.testing.assert_array_equal(stamps - stamps[0], recordings.ride.stamps_ns - recordings.ride.start_ns)
 
 
-def test_frames_carry_the_scans_that_were_written(sequence: Sequence, recordings: Any) -> None:
+def test_frames_hold_the_scans_that_were_written(sequence: Sequence, recordings: Any) -> None:
     for k, frame in enumerate(sequence):
         assert frame.index == k
         assert frame.scan.stamp_ns == sequence.stamps_ns[k]
@@ -74,7 +74,7 @@ def test_frames_carry_the_scans_that_were_written(sequence: Sequence, recordings
         np.testing.assert_array_equal(frame.scan.intensity, written[:, 3])
 
 
-def test_frames_carry_the_inertial_samples_since_the_scan_before(sequence: Sequence) -> None:
+def test_frames_hold_the_imu_samples_since_the_previous_scan(sequence: Sequence) -> None:
     for k in range(1, len(sequence)):
         imu = sequence[k].imu
         assert imu.stamps_ns[0] == sequence.stamps_ns[k - 1]
@@ -85,7 +85,7 @@ def test_frames_carry_the_inertial_samples_since_the_scan_before(sequence: Seque
     assert first.stamps_ns[0] == sequence.imu.stamps_ns[0]
 
 
-def test_the_inertial_samples_are_the_rides_at_the_rides_times(sequence: Sequence, recordings: Any) -> None:
+def test_imu_samples_equal_those_of_the_ride(sequence: Sequence, recordings: Any) -> None:
     ride = recordings.ride
     expected = ride.imu(ride.imu_stamps_ns(10))
     since_start = sequence.imu.stamps_ns - sequence.stamps_ns[0]
@@ -94,11 +94,11 @@ def test_the_inertial_samples_are_the_rides_at_the_rides_times(sequence: Sequenc
     np.testing.assert_allclose(sequence.imu.accel_m_s2, expected.accel_m_s2, atol=1e-12)
 
 
-def test_the_extrinsics_are_the_rides(sequence: Sequence, recordings: Any) -> None:
+def test_the_extrinsics_equal_those_of_the_ride(sequence: Sequence, recordings: Any) -> None:
     np.testing.assert_allclose(sequence.calibration.T_imu_lidar, recordings.ride.T_imu_lidar, atol=1e-12)
 
 
-def test_the_reference_starts_at_the_identity_and_is_the_rides_lidar_path(sequence: Sequence, recordings: Any) -> None:
+def test_the_reference_is_the_lidar_path_of_the_ride_from_the_identity(sequence: Sequence, recordings: Any) -> None:
     reference = sequence.reference
     assert reference is not None
     np.testing.assert_array_equal(reference.stamps_ns, sequence.stamps_ns)
@@ -107,7 +107,7 @@ def test_the_reference_starts_at_the_identity_and_is_the_rides_lidar_path(sequen
     np.testing.assert_allclose(reference.poses, recordings.ride.lidar.poses, atol=1e-5)
 
 
-def test_negative_indices_count_from_the_end_and_others_end_the_sequence(sequence: Sequence) -> None:
+def test_negative_indices_count_from_the_end_and_indices_out_of_range_raise(sequence: Sequence) -> None:
     last = len(sequence) - 1
     assert sequence[-1].index == last
     np.testing.assert_array_equal(sequence[-1].scan.points, sequence[last].scan.points)
@@ -116,14 +116,14 @@ def test_negative_indices_count_from_the_end_and_others_end_the_sequence(sequenc
             sequence[outside]
 
 
-def test_going_through_it_again_gives_the_same(sequence: Sequence) -> None:
+def test_iterating_twice_gives_the_same_frames(sequence: Sequence) -> None:
     for a, b in zip(sequence, sequence, strict=True):
         assert (a.index, a.scan.stamp_ns) == (b.index, b.scan.stamp_ns)
         np.testing.assert_array_equal(a.scan.points, b.scan.points)
         np.testing.assert_array_equal(a.imu.stamps_ns, b.imu.stamps_ns)
 
 
-def test_a_scan_is_read_once_each_time_its_frame_is_asked_for(sequence: Sequence) -> None:
+def test_a_scan_is_loaded_once_per_requested_frame(sequence: Sequence) -> None:
     asked = []
 
     def load(k: int) -> Scan:
@@ -135,12 +135,12 @@ def test_a_scan_is_read_once_each_time_its_frame_is_asked_for(sequence: Sequence
     assert asked == [4]
 
 
-def test_it_can_be_sent_to_another_process(sequence: Sequence) -> None:
+def test_a_sequence_can_be_pickled(sequence: Sequence) -> None:
     copy = pickle.loads(pickle.dumps(sequence))
     np.testing.assert_array_equal(copy[3].scan.points, sequence[3].scan.points)
 
 
-def test_a_scan_cut_short_is_named_when_it_is_asked_for_and_others_still_load(
+def test_a_truncated_scan_raises_on_access_and_the_others_still_load(
     opened: tuple[str, dict[str, Any], Sequence], recordings: Any, tmp_path: Path
 ) -> None:
     arguments = WRITERS[opened[0]](recordings, tmp_path)

@@ -22,28 +22,28 @@ def folder(recordings: Any, tmp_path: Path) -> Path:
 
 
 class TestScans:
-    def test_scans_come_in_natural_order(self, recordings: Any, folder: Path) -> None:
+    def test_scans_are_in_natural_order(self, recordings: Any, folder: Path) -> None:
         # 0.npy 1.npy 10.npy 11.npy 2.npy … as text
         sizes = [len(frame.scan) for frame in open_sequence(folder)]
         assert sizes == [len(recordings.ride.points(k)) for k in range(12)]
 
-    def test_scans_may_lie_in_the_folder_itself(self, folder: Path) -> None:
+    def test_scans_may_be_in_the_folder_itself(self, folder: Path) -> None:
         for path in (folder / "scans").glob("*.npy"):
             path.rename(folder / path.name)
         (folder / "scans").rmdir()
         assert len(open_sequence(folder)) == 12
 
-    def test_a_map_beside_the_scans_folder_is_no_scan(self, recordings: Any, folder: Path) -> None:
+    def test_a_map_beside_the_scans_folder_is_not_read_as_a_scan(self, recordings: Any, folder: Path) -> None:
         recordings.put_bin(folder / "map.bin", recordings.ride.points(3))
         assert len(open_sequence(folder)) == 12
 
     @pytest.mark.filterwarnings("error")
-    def test_a_scan_of_no_finite_value_is_refused_in_one_line_alone(self, folder: Path) -> None:
+    def test_a_scan_without_finite_points_raises_one_line(self, folder: Path) -> None:
         np.save(folder / "scans/0.npy", np.full((10, 4), np.nan))
         with pytest.raises(DataError, match="no finite points"):
             open_sequence(folder)[0]
 
-    def test_scans_of_several_kinds_are_refused(self, recordings: Any, folder: Path) -> None:
+    def test_scans_of_several_kinds_are_rejected(self, recordings: Any, folder: Path) -> None:
         recordings.put_bin(folder / "scans/3.bin", recordings.ride.points(3))
         with pytest.raises(DataError, match=r"\.bin, \.npy"):
             open_sequence(folder)
@@ -59,7 +59,7 @@ class TestScans:
 class TestStamps:
     @pytest.mark.parametrize("kind", ["seconds", "nanoseconds", "iso"])
     @pytest.mark.parametrize("name", ["timestamps.txt", "times.txt"])
-    def test_each_notation_is_read_to_the_nanosecond(self, recordings: Any, folder: Path, kind: str, name: str) -> None:
+    def test_each_format_is_read_to_the_nanosecond(self, recordings: Any, folder: Path, kind: str, name: str) -> None:
         write = {
             "seconds": lambda t: f"{t // 10**9}.{t % 10**9:09d}",
             "nanoseconds": str,
@@ -69,13 +69,13 @@ class TestStamps:
         (folder / name).write_text("".join(f"{write(int(t))}\n" for t in recordings.ride.stamps_ns))
         np.testing.assert_array_equal(open_sequence(folder).stamps_ns, recordings.ride.stamps_ns)
 
-    def test_without_stamps_it_says_what_to_write(self, folder: Path) -> None:
+    def test_missing_stamps_raise_an_error_that_says_what_to_write(self, folder: Path) -> None:
         (folder / "timestamps.txt").unlink()
-        with pytest.raises(DataError, match=r"timestamps\.txt or times\.txt; write one stamp a line"):
+        with pytest.raises(DataError, match=r"timestamps\.txt or times\.txt; write one stamp per line"):
             open_sequence(folder)
 
     @pytest.mark.parametrize("lines", [[], ["1.0"], ["1.0"] * 11 + ["now"], [str(k) for k in range(12)]])
-    def test_stamps_that_do_not_fit_are_named(self, folder: Path, lines: list[str]) -> None:
+    def test_stamps_that_do_not_match_the_scans_are_rejected(self, folder: Path, lines: list[str]) -> None:
         (folder / "timestamps.txt").write_text("\n".join(lines))
         with pytest.raises(DataError, match=r"timestamps\.txt"):
             open_sequence(folder)
@@ -107,12 +107,12 @@ class TestInertialData:
         (folder / "imu.csv").write_text(csv)
         assert any("check the unit" in note for note in open_sequence(folder).notes)
 
-    def test_degrees_taken_for_radians_are_noted(self, recordings: Any, folder: Path) -> None:
+    def test_degrees_in_columns_of_radians_are_noted(self, recordings: Any, folder: Path) -> None:
         imu = recordings.ride.imu(recordings.ride.imu_stamps_ns(10))
         (folder / "imu.csv").write_text(
             recordings.imu_csv(type(imu)(imu.stamps_ns, np.degrees(imu.gyro_rad_s), imu.accel_m_s2))
         )
-        assert any("rad/s are no vehicle's; check the unit" in note for note in open_sequence(folder).notes)
+        assert any("rad/s; check the unit" in note for note in open_sequence(folder).notes)
 
     def test_gravity_of_the_wrong_sign_is_noted(self, recordings: Any, folder: Path) -> None:
         imu = recordings.ride.imu(recordings.ride.imu_stamps_ns(10))
@@ -125,12 +125,12 @@ class TestInertialData:
         ["t_s,gx,gy,gz,ax,ay,az\n".encode("utf-16"), b"t_s,temperature \xb0C\n", b't_s\n"' + b"1" * 200_000],
     )
     @pytest.mark.parametrize("name", ["imu.csv", "gps.csv"])
-    def test_what_is_no_csv_is_named(self, folder: Path, name: str, content: bytes) -> None:
+    def test_files_that_are_not_csv_are_named_in_the_error(self, folder: Path, name: str, content: bytes) -> None:
         (folder / name).write_bytes(content)
         with pytest.raises(DataError, match=rf"{name}: "):
             open_sequence(folder)
 
-    def test_rows_out_of_order_repeated_or_not_finite_are_sorted_out_with_notes(
+    def test_rows_out_of_order_are_sorted_and_repeated_or_non_finite_ones_dropped_with_notes(
         self, recordings: Any, folder: Path
     ) -> None:
         header, *rows = (folder / "imu.csv").read_text().splitlines()
@@ -142,7 +142,7 @@ class TestInertialData:
         expected = np.delete(recordings.ride.imu_stamps_ns(10), 30)
         np.testing.assert_array_equal(sequence.imu.stamps_ns, expected)
         assert any("dropped 1 rows that are not finite" in note for note in sequence.notes)
-        assert any("1 of" in note and "1 repeat" in note for note in sequence.notes)
+        assert any("1 go backwards and 1 repeat" in note for note in sequence.notes)
 
     @pytest.mark.parametrize(
         ("content", "says"),
@@ -156,12 +156,12 @@ class TestInertialData:
             ("stamp_ns,gx,gy,gz,ax,ay,az\n1.5,0,0,0,0,0,9\n", "line 2"),
         ],
     )
-    def test_a_malformed_file_is_named_by_line(self, folder: Path, content: str, says: str) -> None:
+    def test_the_error_names_the_line_of_a_malformed_file(self, folder: Path, content: str, says: str) -> None:
         (folder / "imu.csv").write_text(content)
         with pytest.raises(DataError, match=rf"imu\.csv.*{says}"):
             open_sequence(folder)
 
-    def test_without_it_the_recording_opens_and_says_so(self, folder: Path) -> None:
+    def test_a_recording_without_imu_opens_with_a_note(self, folder: Path) -> None:
         (folder / "imu.csv").unlink()
         (folder / "calibration.yaml").unlink()
         sequence = open_sequence(folder)
@@ -170,7 +170,7 @@ class TestInertialData:
 
 
 class TestCalibration:
-    def test_inertial_data_without_the_sensors_places_are_refused_with_what_to_write(self, folder: Path) -> None:
+    def test_imu_data_without_extrinsics_raise_an_error_that_says_what_to_write(self, folder: Path) -> None:
         (folder / "calibration.yaml").unlink()
         with pytest.raises(DataError, match=r"(?s)calibration\.yaml: missing.*T_imu_lidar:\n  - \[1, 0, 0") as caught:
             open_sequence(folder)
@@ -178,7 +178,7 @@ class TestCalibration:
         (folder / "calibration.yaml").write_text("T_imu_lidar:" + str(caught.value).rpartition("T_imu_lidar:")[2])
         np.testing.assert_array_equal(open_sequence(folder).calibration.T_imu_lidar[:3, 3], [0.1, 0.0, 0.3])
 
-    def test_without_inertial_data_the_camera_alone_may_be_there(self, folder: Path) -> None:
+    def test_without_imu_the_camera_extrinsics_alone_suffice(self, folder: Path) -> None:
         (folder / "imu.csv").unlink()
         (folder / "calibration.yaml").write_text(f"T_camera_lidar: {se3.exp([0, 0, 0.1, 1, 2, 3]).tolist()}")
         calibration = open_sequence(folder).calibration
@@ -189,12 +189,12 @@ class TestCalibration:
         (folder / "calibration.yaml").write_text(f"T_imu_lidar: {se3.make(np.eye(3), [810, -320, 800]).tolist()}")
         assert any("must be in metres" in note for note in open_sequence(folder).notes)
 
-    def test_the_lidar_can_be_named(self, folder: Path) -> None:
+    def test_the_lidar_model_is_read(self, folder: Path) -> None:
         with (folder / "calibration.yaml").open("a") as file:
             file.write("lidar: 32-beam\n")
         assert open_sequence(folder).lidar is LIDAR_MODELS["32-beam"]
 
-    def test_the_gps_antenna_can_be_placed(self, folder: Path) -> None:
+    def test_the_gps_antenna_is_read(self, folder: Path) -> None:
         assert open_sequence(folder).calibration.antenna_imu_m is None
         with (folder / "calibration.yaml").open("a") as file:
             file.write("antenna_imu_m: [-0.3, 0.4, 1]\n")
@@ -220,7 +220,7 @@ class TestCalibration:
             "",
         ],
     )
-    def test_a_malformed_file_is_named(self, folder: Path, content: str) -> None:
+    def test_a_malformed_file_is_named_in_the_error(self, folder: Path, content: str) -> None:
         (folder / "calibration.yaml").write_text(content)
         with pytest.raises(DataError, match=r"calibration\.yaml"):
             open_sequence(folder)
@@ -235,14 +235,14 @@ class TestReference:
         assert reference is not None
         np.testing.assert_allclose(reference.poses, ride.lidar.poses, atol=1e-7)
 
-    def test_poses_that_do_not_reach_every_scan_are_left_out_with_a_note(self, recordings: Any, folder: Path) -> None:
+    def test_poses_that_do_not_cover_all_scans_are_ignored_with_a_note(self, recordings: Any, folder: Path) -> None:
         whole = recordings.ride.lidar
         write_tum(folder / "poses_tum.txt", Trajectory(whole.stamps_ns[:6], whole.poses[:6]))
         sequence = open_sequence(folder)
         assert sequence.reference is None
         assert any("no reference poses" in note for note in sequence.notes)
 
-    def test_a_malformed_file_is_named(self, folder: Path) -> None:
+    def test_a_malformed_file_is_named_in_the_error(self, folder: Path) -> None:
         (folder / "poses_tum.txt").write_text("0 1 2 3\n")
         with pytest.raises(DataError, match=r"poses_tum\.txt"):
             open_sequence(folder)
@@ -256,9 +256,9 @@ def test_extrinsics_are_read_as_written(recordings: Any, folder: Path) -> None:
     np.testing.assert_allclose(calibration.T_camera_lidar, se3.inverse(T), atol=1e-14)
 
 
-def test_fixes_of_another_clock_are_noted_and_places_not_on_earth_refused(folder: Path) -> None:
+def test_fixes_on_another_clock_are_noted_and_impossible_latitudes_rejected(folder: Path) -> None:
     (folder / "gps.csv").write_text("stamp_ns,sigma,east,north,up\n1,1,8,49,100\n")
-    assert any("no GPS fix lies within the scans' time" in note for note in open_sequence(folder).notes)
+    assert any("no GPS fix is between the first and the last scan" in note for note in open_sequence(folder).notes)
     (folder / "gps.csv").write_text("stamp_ns,sigma,latitude,longitude,height\n1,1,8,49,100\n2,1,115,49,100\n")
     with pytest.raises(DataError, match=r"gps\.csv, line 3: a latitude"):
         open_sequence(folder)

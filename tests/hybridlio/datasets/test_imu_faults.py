@@ -1,4 +1,4 @@
-"""Inertial samples that nobody measured. Filled gaps are tested with what they were found in, georeferencing."""
+"""Spikes in IMU samples. Filled gaps are tested with georeferencing, in smoothing/test_georeference.py."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hybridlio.datasets.registry import open_sequence
 
 
 def driving(rng: np.random.Generator, count: int = 1000) -> ImuSamples:
-    """Hard turns and braking at 100 Hz, vibration of a metre a square second."""
+    """Hard turns and braking at 100 Hz, with vibration of 1 m/s²."""
     t = np.arange(count) / 100
     gyro = np.column_stack([0.1 * np.sin(9 * t), 0.2 * np.sin(5 * t), 1.2 * np.sin(2 * t)])
     accel = np.column_stack([7 * np.sin(t), 6 * np.cos(2 * t), np.full(count, 9.81)])
@@ -26,7 +26,7 @@ def driving(rng: np.random.Generator, count: int = 1000) -> ImuSamples:
     ("gyro", "accel"), [([0, 0, 35], None), ([20, 20, 20], None), (None, [0, 0, 1e3]), (None, [-300, 0, 0])]
 )
 @pytest.mark.parametrize("row", [0, 1, 500, 998, 999])
-def test_a_sample_that_no_vehicle_can_have_caused_is_found_wherever_it_lies(rng, row, gyro, accel):
+def test_a_spike_is_found_at_any_row(rng, row, gyro, accel):
     imu = driving(rng)
     for values, spike in ((imu.gyro_rad_s, gyro), (imu.accel_m_s2, accel)):
         if spike is not None:
@@ -40,7 +40,7 @@ def test_two_spikes_in_a_row_are_found(rng):
     assert spikes(imu).tolist() == [500, 501]
 
 
-def test_driving_has_none_and_neither_have_a_hand_another_unit_or_a_handful_of_samples(rng):
+def test_driving_handheld_wrong_units_and_short_recordings_have_no_spikes(rng):
     imu = driving(rng)
     hand = ImuSamples(imu.stamps_ns, 4 * imu.gyro_rad_s, 3 * imu.accel_m_s2)
     degrees = ImuSamples(
@@ -51,7 +51,7 @@ def test_driving_has_none_and_neither_have_a_hand_another_unit_or_a_handful_of_s
         assert len(spikes(one)) == 0
 
 
-def test_a_recording_is_opened_without_them_and_says_so(tiny_drive: Path, tmp_path: Path):
+def test_opening_a_recording_drops_spikes_with_a_note(tiny_drive: Path, tmp_path: Path):
     date = shutil.copytree(tiny_drive.parent, tmp_path / tiny_drive.parent.name)
     clean = open_sequence(date)
     (rows,) = date.glob("*_extract/oxts/data")
@@ -63,4 +63,4 @@ def test_a_recording_is_opened_without_them_and_says_so(tiny_drive: Path, tmp_pa
     assert len(opened.imu) == len(clean.imu) - 1
     assert np.abs(opened.imu.gyro_rad_s).max() < 2
     (note,) = set(opened.notes) - set(clean.notes)
-    assert "left out 1 inertial sample far off those around" in note
+    assert "dropped 1 IMU sample far from the neighbouring ones" in note

@@ -1,4 +1,4 @@
-"""Recordings of other origin laid out as KITTI raw: what they may lack or do differently."""
+"""Recordings of other origin in KITTI's raw layout: what may be missing or different."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MS = 1_000_000
 
 
 def change_rows(recordings: Any, drive: Path, columns: slice | int, value: float) -> None:
-    """Write ``value`` into ``columns`` of all of the drive's rows."""
+    """Write ``value`` into ``columns`` of all rows of the drive."""
     for k, row in enumerate(recordings.ride.oxts_rows(recordings.ride.stamps_ns + 4 * MS)):
         row[columns] = value
         recordings.put(drive / f"oxts/data/{k:010d}.txt", " ".join(f"{v:.14g}" for v in row))
@@ -31,26 +31,26 @@ class TestStamps:
         path.write_text("\n".join(line[: 20 + digits] for line in path.read_text().splitlines()))
         np.testing.assert_allclose(open_sequence(drive).stamps_ns, recordings.ride.stamps_ns, atol=10 ** (9 - digits))
 
-    def test_stamps_of_whole_seconds_are_refused_instead_of_dropping_most_scans(self, drive: Path) -> None:
+    def test_stamps_of_whole_seconds_are_rejected(self, drive: Path) -> None:
         path = drive / "velodyne_points/timestamps.txt"
         path.write_text("\n".join(line[:19] for line in path.read_text().splitlines()))
-        with pytest.raises(DataError, match="lack digits"):
+        with pytest.raises(DataError, match="more digits"):
             open_sequence(drive)
 
-    def test_stamps_may_be_seconds_of_which_some_are_whole(self, recordings: Any, drive: Path) -> None:
+    def test_stamps_may_be_seconds_some_without_a_point(self, recordings: Any, drive: Path) -> None:
         path = drive / "velodyne_points/timestamps.txt"
         start = recordings.ride.start_ns // 10**9
         path.write_text("\n".join(f"{start + k / 10:.12g}" for k in range(12)) + "\n")
         sequence = open_sequence(drive)
         np.testing.assert_array_equal(sequence.stamps_ns, start * 10**9 + np.arange(12) * 100 * MS)
 
-    def test_stamps_in_microseconds_are_refused(self, recordings: Any, drive: Path) -> None:
+    def test_stamps_in_microseconds_are_rejected(self, recordings: Any, drive: Path) -> None:
         path = drive / "velodyne_points/timestamps.txt"
         path.write_text("\n".join(str(t // 1000) for t in recordings.ride.stamps_ns))
         with pytest.raises(DataError, match=r"timestamps\.txt: scans are 0\.1 ms apart"):
             open_sequence(drive)
 
-    def test_fast_rows_do_not_lend_their_stamps_to_scans(self, recordings: Any, drive: Path) -> None:
+    def test_stamps_of_100_hz_rows_are_not_used_for_scans(self, recordings: Any, drive: Path) -> None:
         (drive / "velodyne_points/timestamps.txt").unlink()
         shutil.rmtree(drive / "oxts")
         recordings.put_oxts(drive / "oxts", recordings.ride, recordings.ride.imu_stamps_ns(10))
@@ -72,7 +72,7 @@ class TestRows:
         assert any("no 100 Hz" in note for note in sequence.notes) == (period_ms == 40)
 
     @pytest.mark.parametrize("value", [0.0, np.nan])
-    def test_rows_without_positions_give_no_reference_but_inertial_data(
+    def test_rows_without_positions_have_inertial_data_but_no_reference(
         self, recordings: Any, drive: Path, value: float
     ) -> None:
         change_rows(recordings, drive, slice(0, 11), value)
@@ -81,9 +81,9 @@ class TestRows:
         assert len(sequence.imu) == 12
         assert sequence.reference is None
         assert sequence.forward_speed_m_s is None
-        assert any("give no positions" in note for note in sequence.notes)
+        assert any("have no positions" in note for note in sequence.notes)
 
-    def test_positions_that_stay_while_the_vehicle_drives_are_none(self, recordings: Any, drive: Path) -> None:
+    def test_constant_positions_of_a_moving_vehicle_count_as_missing(self, recordings: Any, drive: Path) -> None:
         change_rows(recordings, drive, slice(0, 2), 49.0)
         sequence = open_sequence(drive)
         assert sequence.reference is None
@@ -97,21 +97,21 @@ class TestRows:
         assert reference is not None
         np.testing.assert_allclose(reference.poses, np.tile(np.eye(4), (12, 1, 1)), atol=1e-9)
 
-    def test_a_description_of_the_columns_is_not_needed(self, drive: Path) -> None:
+    def test_dataformat_txt_is_not_needed(self, drive: Path) -> None:
         assert not list(drive.rglob("dataformat.txt"))
         (drive / "oxts/dataformat.txt").write_text("lat: latitude\n")
         assert len(open_sequence(drive)) == 12
 
 
 class TestCalibration:
-    def test_it_may_lie_in_the_drive(self, recordings: Any, drive: Path) -> None:
+    def test_the_calibration_may_be_in_the_drive(self, recordings: Any, drive: Path) -> None:
         for path in drive.parent.glob("calib_*.txt"):
             path.rename(drive / path.name)
         calibration = open_sequence(drive).calibration
         np.testing.assert_allclose(calibration.T_imu_lidar, recordings.ride.T_imu_lidar, atol=1e-12)
         assert calibration.T_camera_lidar is not None
 
-    def test_only_the_imus_place_is_needed_and_the_error_says_how_to_write_it(self, drive: Path) -> None:
+    def test_only_the_imu_calibration_is_needed_and_the_error_says_how_to_write_it(self, drive: Path) -> None:
         (drive.parent / "calib_velo_to_cam.txt").unlink()
         assert open_sequence(drive).calibration.T_camera_lidar is None
         (drive.parent / "calib_imu_to_velo.txt").unlink()
@@ -120,7 +120,7 @@ class TestCalibration:
         ):
             open_sequence(drive)
 
-    def test_it_is_needed_too_where_only_the_fast_recording_has_inertial_data(self, drive: Path) -> None:
+    def test_the_calibration_is_needed_with_100_hz_data_alone(self, drive: Path) -> None:
         shutil.rmtree(drive / "oxts")
         (drive.parent / "calib_imu_to_velo.txt").unlink()
         with pytest.raises(DataError, match=r"calib_imu_to_velo\.txt"):
@@ -133,7 +133,7 @@ class TestPoses:
         poses[:, 0, 3] *= 1.01
         return Trajectory(recordings.ride.stamps_ns, poses)
 
-    def test_they_may_lie_beside_the_drive_if_it_is_the_only_one_there(self, recordings: Any, drive: Path) -> None:
+    def test_poses_may_be_beside_the_only_drive_of_a_date(self, recordings: Any, drive: Path) -> None:
         exact = self.exact(recordings)
         write_kitti(drive.parent / "poses.txt", exact)
         reference = open_sequence(drive).reference
@@ -144,7 +144,7 @@ class TestPoses:
         assert reference is not None
         np.testing.assert_allclose(reference.poses, recordings.ride.lidar.poses, atol=1e-5)
 
-    def test_one_a_scan_will_do_where_the_scans_numbers_do_not_start_at_0(self, recordings: Any, drive: Path) -> None:
+    def test_one_pose_per_scan_suffices_if_scan_numbers_do_not_start_at_0(self, recordings: Any, drive: Path) -> None:
         for k in range(3):
             (drive / f"velodyne_points/data/{k:010d}.bin").unlink()
         exact = self.exact(recordings)
@@ -153,7 +153,7 @@ class TestPoses:
         assert reference is not None
         np.testing.assert_allclose(reference.poses, np.linalg.inv(exact.poses[3]) @ exact.poses[3:], atol=1e-9)
 
-    def test_poses_of_a_camera_are_remarked_on(self, recordings: Any, drive: Path) -> None:
+    def test_poses_of_a_camera_are_noted(self, recordings: Any, drive: Path) -> None:
         write_kitti(drive / "poses.txt", self.exact(recordings))
         assert not any("another direction" in note for note in open_sequence(drive).notes)
         write_kitti(drive / "poses.txt", self.exact(recordings), recordings.ride.T_camera_lidar)

@@ -1,4 +1,4 @@
-"""KITTI raw drives with what the simulator adds."""
+"""KITTI raw drives with the files that the simulator adds."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MS = 1_000_000
 
 
 class TestSimulatorsAdditions:
-    def test_exact_poses_come_before_those_of_the_navigation_rows(self, recordings: Any, drive: Path) -> None:
+    def test_exact_poses_take_precedence_over_navigation_rows(self, recordings: Any, drive: Path) -> None:
         exact = recordings.ride.lidar.poses.copy()
         exact[:, 0, 3] *= 1.01
         write_kitti(drive / "poses.txt", Trajectory(recordings.ride.stamps_ns, exact))
@@ -28,13 +28,13 @@ class TestSimulatorsAdditions:
         assert reference is not None
         np.testing.assert_allclose(reference.poses, exact, atol=1e-11)
 
-    def test_too_few_poses_are_refused(self, recordings: Any, drive: Path) -> None:
+    def test_too_few_poses_are_rejected(self, recordings: Any, drive: Path) -> None:
         ride = recordings.ride
         write_kitti(drive / "poses.txt", Trajectory(ride.stamps_ns[:-1], ride.lidar.poses[:-1]))
         with pytest.raises(DataError, match=r"poses\.txt"):
             open_sequence(drive)
 
-    def test_the_lidar_and_the_noise_are_what_the_simulation_says(self, drive: Path) -> None:
+    def test_lidar_and_imu_noise_come_from_simulation_json(self, drive: Path) -> None:
         noise = ImuNoise(gyro_rad_s_sqrt_hz=3e-4)
         (drive / "simulation.json").write_text(json.dumps({"lidar": "16-beam", "imu_noise": asdict(noise), "seed": 1}))
         sequence = open_sequence(drive)
@@ -48,12 +48,12 @@ class TestSimulatorsAdditions:
             *(f'{{"lidar": "16-beam", "imu_noise": {noise}}}' for noise in ('{"gyro_rad_s_sqrt_hz": -1}', "[1]", "7")),
         ],
     )
-    def test_a_malformed_description_is_named(self, drive: Path, content: str) -> None:
+    def test_a_malformed_simulation_json_is_named_in_the_error(self, drive: Path, content: str) -> None:
         (drive / "simulation.json").write_text(content)
         with pytest.raises(DataError, match=r"simulation\.json"):
             open_sequence(drive)
 
-    def test_fixes_come_with_the_frame_they_fall_into(self, recordings: Any, drive: Path) -> None:
+    def test_frames_hold_the_fixes_since_the_previous_scan(self, recordings: Any, drive: Path) -> None:
         stamps = recordings.ride.stamps_ns[[0, 3, 3, 11]] + np.array([-MS, 0, 1, 5])
         rows = [f"{t},{k},{2 * k},{3 * k},{0.5 * k}" for k, t in enumerate(stamps)]
         (drive / "gps.csv").write_text("\n".join(["stamp_ns,east,north,up,sigma", *rows]))
@@ -76,12 +76,12 @@ class TestSimulatorsAdditions:
             ("stamp_ns,east,north,up,sigma\n1,2\n", "line 2"),
         ],
     )
-    def test_malformed_fixes_are_named_by_line(self, drive: Path, content: str, says: str) -> None:
+    def test_the_error_names_the_line_of_a_malformed_fix(self, drive: Path, content: str, says: str) -> None:
         (drive / "gps.csv").write_text(content)
         with pytest.raises(DataError, match=rf"gps\.csv.*{says}"):
             open_sequence(drive)
 
-    def test_points_carry_their_times_where_the_drive_has_them(self, recordings: Any, drive: Path) -> None:
+    def test_points_have_times_if_the_drive_has_offsets(self, recordings: Any, drive: Path) -> None:
         folder = drive / "velodyne_points/offsets"
         folder.mkdir()
         offsets = np.arange(len(recordings.ride.points(1)), dtype=np.int64) * 1000 - 20_000
@@ -94,7 +94,7 @@ class TestSimulatorsAdditions:
         with pytest.raises(DataError, match=r"frame 2: .*time_offsets_ns"):
             sequence[2]
 
-    def test_a_simulated_drive_reads_back_whole(self, tmp_path: Path) -> None:
+    def test_a_simulated_drive_is_read_completely(self, tmp_path: Path) -> None:
         pytest.importorskip("open3d")
         from hybridlio.simulation.config import SimulationConfig
         from hybridlio.simulation.simulate import simulate

@@ -1,4 +1,4 @@
-"""KITTI's navigation rows: angular rates moved to when they were, and what real rows say about that."""
+"""KITTI's navigation rows: shifting lagging angular rates, in closed form and on real rows."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from hybridlio.core import se3
 from hybridlio.core.sensors import ImuSamples
+from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.oxts import OxtsRows, read_oxts
-from hybridlio.datasets.sequence import Notes
 
 START_NS = 1_317_042_272_000_000_000
 MS = 1_000_000
 
 
 def rate(seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-    """An angular velocity ``(N, 3)`` that swings at up to 1.2 Hz."""
+    """Return an angular velocity ``(N, 3)`` that oscillates at up to 1.2 Hz."""
     return np.column_stack([0.1 * np.sin(7 * seconds), 0.05 * np.cos(5 * seconds), 0.3 * np.sin(3 * seconds)])
 
 
@@ -35,7 +35,7 @@ def rows(period_ms: int, lag_ns: int) -> OxtsRows:
 
 
 def turned(imu: ImuSamples) -> NDArray[np.float64]:
-    """The rotation ``(3, 3)`` that samples integrate to."""
+    """Integrate the samples to a rotation ``(3, 3)``."""
     R = np.eye(3)
     steps = np.diff(imu.stamps_ns)[:, None] / 1e9 * (imu.gyro_rad_s[1:] + imu.gyro_rad_s[:-1]) / 2
     for step in se3.so3_exp(steps):
@@ -44,7 +44,7 @@ def turned(imu: ImuSamples) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("period_ms", [10, 100])
-def test_late_rates_come_at_the_time_they_were(period_ms: int) -> None:
+def test_late_rates_are_shifted_to_their_time(period_ms: int) -> None:
     lag_ns = 56 * MS
     imu = rows(period_ms, lag_ns).imu(lag_ns)
     seconds = (imu.stamps_ns - START_NS) / 1e9
@@ -64,7 +64,7 @@ def test_slow_rows_keep_every_sample_of_both_sensors() -> None:
     np.testing.assert_allclose(imu.gyro_rad_s[at_rates], slow.values[1:, 17:20], atol=1e-15)
 
 
-def test_without_a_lag_the_rows_are_left_as_they_are() -> None:
+def test_without_a_lag_the_rows_are_unchanged() -> None:
     for period_ms in (10, 100):
         plain = rows(period_ms, 0)
         imu = plain.imu(0)
@@ -73,7 +73,7 @@ def test_without_a_lag_the_rows_are_left_as_they_are() -> None:
         np.testing.assert_array_equal(imu.accel_m_s2, plain.values[:, 11:14])
 
 
-def test_real_rates_agree_with_the_attitudes_of_their_rows_once_moved(kitti_raw_root: Path) -> None:
+def test_shifted_real_rates_agree_with_the_attitudes(kitti_raw_root: Path) -> None:
     real = read_oxts(kitti_raw_root / "2011_09_26/2011_09_26_drive_0005_sync/oxts", Notes("drive"))
     R = real.T_enu_imu[:, :3, :3]
 

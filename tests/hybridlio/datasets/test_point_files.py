@@ -1,4 +1,4 @@
-"""One scan from each kind of file, with its points' times where the file has them."""
+"""Scans of every file format, with and without point times."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PLY_TYPES = {"<f4": "float", "<f8": "double", "<i4": "int", "<u4": "uint", "|u1"
 
 
 def cloud(**extra: NDArray[np.generic]) -> NDArray[np.void]:
-    """A structured array of x y z and more columns."""
+    """Return a structured array of x y z and further columns."""
     xyz = np.random.default_rng(0).uniform(-30, 30, size=(COUNT, 3)).astype("<f4")
     columns = {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2], **extra}
     out = np.zeros(COUNT, dtype=[(name, values.dtype.str) for name, values in columns.items()])
@@ -86,12 +86,12 @@ class TestEveryKindWithNamedColumns:
         assert scan.time_offsets_ns is None
         assert scan.stamp_ns == STAMP_NS
 
-    def test_intensities_of_a_byte_are_brought_to_one(self, tmp_path: Path, kind: str) -> None:
+    def test_intensities_up_to_255_are_scaled_to_one(self, tmp_path: Path, kind: str) -> None:
         points = cloud(intensity=np.linspace(0, 255, COUNT).astype("<f4"))
         scan = read_scan(write(tmp_path, kind, points), STAMP_NS)
         np.testing.assert_allclose(scan.intensity, np.linspace(0, 1, COUNT), atol=1e-6)
 
-    def test_whole_times_are_nanoseconds_from_the_stamp(self, tmp_path: Path, kind: str) -> None:
+    def test_integer_times_are_nanoseconds_from_the_stamp(self, tmp_path: Path, kind: str) -> None:
         scan = read_scan(write(tmp_path, kind, cloud(t=OFFSETS_NS.astype("<i4"))), STAMP_NS)
         np.testing.assert_array_equal(scan.time_offsets_ns, OFFSETS_NS)
 
@@ -99,7 +99,7 @@ class TestEveryKindWithNamedColumns:
         scan = read_scan(write(tmp_path, kind, cloud(time=(OFFSETS_NS / 1e9).astype("<f4"))), STAMP_NS)
         np.testing.assert_allclose(scan.time_offsets_ns, OFFSETS_NS, atol=5)
 
-    def test_absolute_times_are_told_from_relative_ones(self, tmp_path: Path, kind: str) -> None:
+    def test_absolute_times_are_recognised(self, tmp_path: Path, kind: str) -> None:
         scan = read_scan(write(tmp_path, kind, cloud(timestamp=(STAMP_NS + OFFSETS_NS) / 1e9)), STAMP_NS)
         # a float64 has 0.24 µs steps there
         np.testing.assert_allclose(scan.time_offsets_ns, OFFSETS_NS, atol=240)
@@ -113,7 +113,7 @@ class TestEveryKindWithNamedColumns:
         ],
         ids=["microseconds as seconds", "microseconds as nanoseconds", "not finite"],
     )
-    def test_times_of_another_unit_are_refused(
+    def test_times_in_another_unit_are_rejected(
         self, tmp_path: Path, kind: str, times: NDArray[np.float64], says: str
     ) -> None:
         path = write(tmp_path, kind, cloud(time=times))
@@ -126,7 +126,7 @@ class TestEveryKindWithNamedColumns:
         scan = read_scan(write(tmp_path, kind, points), STAMP_NS)
         np.testing.assert_array_equal(scan.time_offsets_ns, np.delete(OFFSETS_NS, 4))
 
-    def test_a_file_cut_anywhere_is_refused(self, tmp_path: Path, kind: str) -> None:
+    def test_a_truncated_file_is_rejected(self, tmp_path: Path, kind: str) -> None:
         path = write(tmp_path, kind, cloud(t=OFFSETS_NS.astype("<i4")))
         data = path.read_bytes()
         for keep in (0, 10, len(data) // 4, len(data) // 2, len(data) - 90, len(data) - 15):
@@ -134,12 +134,12 @@ class TestEveryKindWithNamedColumns:
             with pytest.raises(DataError, match=kind):
                 read_scan(path, STAMP_NS)
 
-    def test_a_scan_of_no_points_is_refused(self, tmp_path: Path, kind: str) -> None:
+    def test_a_scan_without_points_is_rejected(self, tmp_path: Path, kind: str) -> None:
         with pytest.raises(DataError, match=kind):
             read_scan(write(tmp_path, kind, cloud()[:0]), STAMP_NS)
 
 
-def test_a_time_column_that_open3d_skips_is_refused_rather_than_lost(tmp_path: Path) -> None:
+def test_a_time_column_that_open3d_cannot_read_is_rejected(tmp_path: Path) -> None:
     path = write(tmp_path, "binary.ply", cloud(t=(OFFSETS_NS - OFFSETS_NS[0]).astype("<u4")))
     with pytest.raises(DataError, match="time column 't'"):
         read_scan(path, STAMP_NS)
@@ -147,7 +147,7 @@ def test_a_time_column_that_open3d_skips_is_refused_rather_than_lost(tmp_path: P
 
 @pytest.mark.parametrize("form", ["ascii", "binary", "compressed"])
 @pytest.mark.parametrize("suffix", [".pcd", ".ply"])
-def test_files_that_open3d_writes_are_read_and_refused_when_cut(tmp_path: Path, suffix: str, form: str) -> None:
+def test_files_written_by_open3d_are_read_and_rejected_if_truncated(tmp_path: Path, suffix: str, form: str) -> None:
     o3d = pytest.importorskip("open3d")
     points = cloud()
     xyz = np.column_stack([points[c] for c in "xyz"])
@@ -162,7 +162,7 @@ def test_files_that_open3d_writes_are_read_and_refused_when_cut(tmp_path: Path, 
 
 @pytest.mark.parametrize("columns", [3, 4])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_plain_arrays_are_x_y_z_and_perhaps_intensity(tmp_path: Path, columns: int, dtype: type) -> None:
+def test_plain_arrays_hold_x_y_z_and_optionally_intensity(tmp_path: Path, columns: int, dtype: type) -> None:
     values = np.random.default_rng(1).uniform(0, 1, size=(9, columns)).astype(dtype)
     np.save(tmp_path / "scan.npy", values)
     scan = read_scan(tmp_path / "scan.npy", 5)
@@ -171,13 +171,13 @@ def test_plain_arrays_are_x_y_z_and_perhaps_intensity(tmp_path: Path, columns: i
 
 
 @pytest.mark.parametrize("shape", [(9, 2), (9, 5), (9,), (3, 9, 3)])
-def test_plain_arrays_of_other_shapes_are_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
+def test_plain_arrays_of_other_shapes_are_rejected(tmp_path: Path, shape: tuple[int, ...]) -> None:
     np.save(tmp_path / "scan.npy", np.zeros(shape))
     with pytest.raises(DataError, match=r"scan\.npy: expected \(N, 3\)"):
         read_scan(tmp_path / "scan.npy", 5)
 
 
-def test_arrays_of_python_objects_are_refused(tmp_path: Path) -> None:
+def test_arrays_of_python_objects_are_rejected(tmp_path: Path) -> None:
     np.save(tmp_path / "scan.npy", np.array([{"x": 1}], dtype=object), allow_pickle=True)
     with pytest.raises(DataError, match=r"scan\.npy"):
         read_scan(tmp_path / "scan.npy", 5)

@@ -1,4 +1,4 @@
-"""Finding the reader that fits a path, and saying what was tried where none does."""
+"""Choosing the reader that fits a path, and the errors if none does."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.datasets import READERS, open_sequence, sequence_names
 
 
-def test_where_no_reader_fits_every_layout_tried_is_listed(tmp_path: Path) -> None:
+def test_if_no_reader_fits_the_error_lists_all_layouts(tmp_path: Path) -> None:
     with pytest.raises(DataError) as caught:
         open_sequence(tmp_path)
     for name, reader in READERS.items():
         assert f"{name}: {reader.layout}" in str(caught.value)
 
 
-def test_a_named_reader_alone_is_tried(recordings: Any, tmp_path: Path) -> None:
+def test_only_the_named_reader_is_tried(recordings: Any, tmp_path: Path) -> None:
     folder = recordings.write_folder(tmp_path, recordings.ride)
     with pytest.raises(DataError, match="kitti-raw") as caught:
         open_sequence(folder, reader="kitti-raw")
     assert "kitti-odometry" not in str(caught.value)
 
 
-def test_an_unknown_reader_lists_those_there_are(tmp_path: Path) -> None:
+def test_an_unknown_reader_lists_the_known_ones(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="kitti-raw, kitti-odometry, folder"):
         open_sequence(tmp_path, reader="rosbag2")
 
 
-def test_a_path_that_is_no_folder_is_named(tmp_path: Path) -> None:
+def test_a_path_that_is_not_a_folder_is_named_in_the_error(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"nowhere: no such folder"):
         open_sequence(tmp_path / "nowhere")
     file = tmp_path / "scan.bin"
@@ -41,7 +41,7 @@ def test_a_path_that_is_no_folder_is_named(tmp_path: Path) -> None:
         open_sequence(str(file))
 
 
-def test_names_of_all_recordings_at_a_path_are_listed(recordings: Any, tmp_path: Path) -> None:
+def test_sequence_names_lists_all_recordings_at_a_path(recordings: Any, tmp_path: Path) -> None:
     for name in ("00", "04", "11"):
         recordings.write_odometry(tmp_path, recordings.ride, name=name)
     assert sequence_names(tmp_path) == ("00", "04", "11")

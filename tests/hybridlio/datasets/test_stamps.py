@@ -1,4 +1,4 @@
-"""Time stamps: read exactly, put in order with as little lost as can be."""
+"""Time stamps: read exactly, and sorted with the fewest dropped."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridlio.core.errors import DataError
-from hybridlio.datasets.sequence import Notes
+from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.stamps import MISSING_STAMP, increasing, note_gaps, read_stamps, sorted_unique
 
 
@@ -41,7 +41,7 @@ def test_stamps_are_read_exactly(tmp_path: Path, text: str, expected: list[int])
     "text",
     ["", "\n\n", "soon", "1.0\nlater", "2011-09-26 13:04:32\n5.0", "1\n2\n3", "1e400", "nan", "3000-01-01 00:00:00"],
 )
-def test_what_is_no_stamp_is_refused_with_the_file(tmp_path: Path, text: str) -> None:
+def test_unreadable_stamps_raise_an_error_that_names_the_file(tmp_path: Path, text: str) -> None:
     path = tmp_path / "timestamps.txt"
     path.write_text(text)
     with pytest.raises(DataError, match=r"timestamps\.txt"):
@@ -50,7 +50,7 @@ def test_what_is_no_stamp_is_refused_with_the_file(tmp_path: Path, text: str) ->
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(st.lists(st.integers(0, 12), min_size=1, max_size=9))
-def test_as_few_stamps_as_possible_are_dropped(values: list[int]) -> None:
+def test_the_fewest_possible_stamps_are_dropped(values: list[int]) -> None:
     stamps = np.array(values, dtype=np.int64)
     kept = increasing(stamps)
     assert (np.diff(kept) > 0).all()
@@ -61,7 +61,7 @@ def test_as_few_stamps_as_possible_are_dropped(values: list[int]) -> None:
 
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.lists(st.integers(-5, 50), min_size=1, max_size=30))
-def test_sorting_keeps_each_stamp_once_and_the_first_row_that_has_it(values: list[int]) -> None:
+def test_sorting_keeps_the_first_row_of_each_stamp(values: list[int]) -> None:
     stamps = np.array(values, dtype=np.int64)
     notes = Notes("test")
     order = sorted_unique(stamps, "rows", notes)
@@ -70,7 +70,7 @@ def test_sorting_keeps_each_stamp_once_and_the_first_row_that_has_it(values: lis
     assert bool(notes.texts) == (values != sorted(set(values)))
 
 
-def test_scans_that_lie_many_seconds_apart_are_noted_as_perhaps_in_another_unit() -> None:
+def test_scans_many_seconds_apart_are_noted_as_a_wrong_unit() -> None:
     for step_s, told in ((100, 1), (0.1, 0)):
         notes = Notes("ride")
         note_gaps((np.arange(5) * step_s * 1e9).astype(np.int64), "scans", notes, factor=1.5)

@@ -1,4 +1,4 @@
-"""Correcting the lidar's vertical angles: the geometry in closed form, and which recordings are corrected."""
+"""Correction of vertical angles: the geometry in closed form, and which recordings are corrected."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def elevation_deg(points: Any) -> Any:
 
 
 @pytest.mark.parametrize("angle_deg", [0.205, -0.3, 2.0])
-def test_elevations_rise_by_the_angle_while_ranges_and_azimuths_stay(
+def test_elevations_increase_by_the_angle_and_ranges_and_azimuths_stay(
     rng: np.random.Generator, angle_deg: float
 ) -> None:
     points = cloud(rng)
@@ -39,14 +39,14 @@ def test_elevations_rise_by_the_angle_while_ranges_and_azimuths_stay(
     )
 
 
-def test_it_is_the_rotation_about_the_horizontal_axis_perpendicular_to_each_point(rng: np.random.Generator) -> None:
+def test_points_rotate_about_the_horizontal_axis_perpendicular_to_them(rng: np.random.Generator) -> None:
     points = cloud(rng, 200)
     axes = np.cross(points.astype(float), [0, 0, 1])
     axes *= np.radians(0.205) / np.linalg.norm(axes, axis=1, keepdims=True)
     np.testing.assert_allclose(raise_points(points, 0.205), Rotation.from_rotvec(axes).apply(points), atol=1e-5)
 
 
-def test_it_flattens_the_cone_that_the_error_makes_of_flat_ground(rng: np.random.Generator) -> None:
+def test_raising_points_flattens_the_cone_of_flat_ground(rng: np.random.Generator) -> None:
     ground = cloud(rng)
     ground[:, 2] = -1.73
     cone = raise_points(ground, -0.205)
@@ -61,7 +61,7 @@ def test_points_on_the_vertical_axis_and_at_the_origin_stay_finite() -> None:
 
 class TestWhichRecordings:
     @pytest.mark.parametrize("write", ["write_raw", "write_odometry", "write_folder"])
-    def test_the_angle_asked_for_is_applied_by_every_reader(self, recordings: Any, tmp_path: Path, write: str) -> None:
+    def test_every_reader_applies_the_given_angle(self, recordings: Any, tmp_path: Path, write: str) -> None:
         path = getattr(recordings, write)(tmp_path, recordings.ride)
         plain, asked = open_sequence(path), open_sequence(path, vertical_angle_deg=0.4)
         for k in (0, 5):
@@ -71,14 +71,12 @@ class TestWhichRecordings:
         np.testing.assert_array_equal(again[3].scan.points, asked[3].scan.points)
 
     @pytest.mark.parametrize("angle_deg", [5.1, -90.0, float("nan"), float("inf")])
-    def test_an_angle_that_is_no_calibration_error_is_refused(
-        self, recordings: Any, tmp_path: Path, angle_deg: float
-    ) -> None:
+    def test_angles_over_5_degrees_are_rejected(self, recordings: Any, tmp_path: Path, angle_deg: float) -> None:
         path = recordings.write_raw(tmp_path, recordings.ride)
         with pytest.raises(ConfigError, match="vertical_angle_deg"):
             open_sequence(path, vertical_angle_deg=angle_deg)
 
-    def test_kittis_own_drives_are_corrected_unless_told_otherwise(self, kitti_raw_root: Path) -> None:
+    def test_kitti_drives_are_corrected_by_default(self, kitti_raw_root: Path) -> None:
         for name in ("0005", "0048", "0060"):
             sequence = open_sequence(kitti_raw_root, sequence=name)
             plain = open_sequence(kitti_raw_root, sequence=name, vertical_angle_deg=0)
@@ -87,20 +85,20 @@ class TestWhichRecordings:
             assert any("0.205" in note for note in sequence.notes)
             assert not any("0.205" in note for note in plain.notes)
 
-    def test_kittis_own_sequences_are_corrected_unless_told_otherwise(self, kitti_odometry_root: Path) -> None:
+    def test_kitti_odometry_sequences_are_corrected_by_default(self, kitti_odometry_root: Path) -> None:
         sequence = open_sequence(kitti_odometry_root, sequence="00")
         plain = open_sequence(kitti_odometry_root, sequence="00", vertical_angle_deg=0)
         expected = raise_points(plain[3].scan.points, KITTI_VERTICAL_ANGLE_DEG)
         np.testing.assert_array_equal(sequence[3].scan.points, expected)
 
-    def test_a_first_scan_that_cannot_be_read_does_not_decide(self, kitti_raw_root: Path, tmp_path: Path) -> None:
+    def test_an_unreadable_first_scan_is_skipped(self, kitti_raw_root: Path, tmp_path: Path) -> None:
         date = tmp_path / "2011_09_26"
         shutil.copytree(kitti_raw_root / date.name, date, ignore=shutil.ignore_patterns("*0005*", "*0060*"))
         drive = date / "2011_09_26_drive_0048_sync"
         (drive / "velodyne_points/data/0000000000.bin").write_bytes(b"")
         assert any("0.205" in note for note in open_sequence(drive).notes)
 
-    def test_others_scans_beside_kittis_calibration_stay_as_they_are(
+    def test_other_scans_with_kitti_calibration_are_not_corrected(
         self, recordings: Any, kitti_raw_root: Path, kitti_odometry_root: Path, tmp_path: Path
     ) -> None:
         raw = recordings.write_raw(tmp_path, recordings.ride, name="2011_09_26_drive_0005")
@@ -113,7 +111,7 @@ class TestWhichRecordings:
             np.testing.assert_array_equal(sequence[2].scan.points, written)
             assert not any("0.205" in note for note in sequence.notes)
 
-    def test_simulated_scans_beside_kittis_calibration_stay_as_they_are(
+    def test_simulated_scans_with_kitti_calibration_are_not_corrected(
         self, kitti_raw_root: Path, tmp_path: Path
     ) -> None:
         from hybridlio.simulation import SimulationConfig, simulate
@@ -123,7 +121,7 @@ class TestWhichRecordings:
         (drive / "simulation.json").unlink()
         assert not any("0.205" in note for note in open_sequence(drive).notes)
 
-    def test_kittis_scans_with_another_calibration_stay_as_they_are(
+    def test_kitti_scans_with_another_calibration_are_not_corrected(
         self, recordings: Any, kitti_raw_root: Path, tmp_path: Path
     ) -> None:
         drive = recordings.write_raw(tmp_path, recordings.ride)

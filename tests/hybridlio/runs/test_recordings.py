@@ -80,7 +80,7 @@ def test_points_are_raised_as_a_recording_says_and_else_as_the_option_does(drive
 
 
 def test_an_angle_that_is_no_calibration_error_is_refused_before_any_recording_is_looked_for(tmp_path):
-    with pytest.raises(ConfigError, match="vertical_angle_deg: 9"):
+    with pytest.raises(ConfigError, match="vertical_angle_deg: must be within"):
         find_recordings([tmp_path / "gone"], vertical_angle_deg=9.0)
 
 
@@ -95,7 +95,7 @@ def test_an_angle_that_is_no_calibration_error_is_refused_before_any_recording_i
         ("a.yaml", "- x\n- {path: x, frames: 3}\n", "entry 2: frames '3': give a range"),
         ("a.yaml", "- {path: x, reader: tape}\n", "entry 1: unknown reader 'tape'"),
         ("a.yaml", "- {path: x, vertical_angle_deg: high}\n", "entry 1: vertical_angle_deg 'high': give a number"),
-        ("a.yaml", "- {path: x, vertical_angle_deg: 9}\n", "entry 1: vertical_angle_deg: 9 is no calibration error"),
+        ("a.yaml", "- {path: x, vertical_angle_deg: 9}\n", "entry 1: vertical_angle_deg: must be within ±5°, got 9"),
         ("a.yaml", "- [", r"a\.yaml: not YAML at line 1"),
     ],
 )
