@@ -175,6 +175,9 @@ class OptimiserSettings:
         initial_noise_rad, initial_noise_m: standard deviation by axis of what initial poses are shaken by before the
             residual network sees them.
         velocity_noise_m_s: standard deviation by axis of what the last velocity is shaken by.
+        mirrored, swapped: share of pairs that are seen in a mirror that swaps left and right, and that run backwards,
+            from the current scan to the last one.
+        points: points of the current cloud that the loss takes, drawn anew each time; 0 takes all.
     """
 
     epochs: int = 100
@@ -191,6 +194,9 @@ class OptimiserSettings:
     initial_noise_rad: float = 0.0
     initial_noise_m: float = 0.0
     velocity_noise_m_s: float = 0.0
+    mirrored: float = 0.0
+    swapped: float = 0.0
+    points: int = 0
 
     def __post_init__(self) -> None:
         _check_choices(self)
@@ -198,8 +204,12 @@ class OptimiserSettings:
         if len(self.betas) != 2 or not all(0 <= beta < 1 for beta in self.betas):
             raise ConfigError(f"optimiser: betas are two numbers from 0 to below 1, got {self.betas}")
         noises = (self.initial_noise_rad, self.initial_noise_m, self.velocity_noise_m_s)
-        if min(self.weight_decay, self.clip_norm, *noises) < 0:
-            raise ConfigError("optimiser: weight decay, clip_norm and noise must not be negative")
+        if min(self.weight_decay, self.clip_norm, self.points, *noises) < 0:
+            raise ConfigError("optimiser: weight_decay, clip_norm, noise and points must be 0 or more")
+        if not (0 <= self.mirrored <= 1 and 0 <= self.swapped <= 1):
+            raise ConfigError(
+                f"optimiser: mirrored and swapped are shares from 0 to 1, got {self.mirrored}, {self.swapped}"
+            )
 
 
 @dataclass(frozen=True)

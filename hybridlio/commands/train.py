@@ -122,22 +122,20 @@ def _run(
     device: str,
     steps: int | None,
 ) -> None:
-    from hybridlio.learned.training.train import WEIGHTS, RunOptions
+    from hybridlio.learned.training.train import WEIGHTS, RunOptions, Watchers
     from hybridlio.learned.training.train import train as run
     from hybridlio.runs.recipes import lasting
 
     if steps is not None:
         recipe = lasting(recipe, steps, len(pairs))
-    options = RunOptions(device=None if device == "auto" else device, max_steps=steps)
+    options = RunOptions(device=None if device == "auto" else device, max_steps=steps, about=about)
     tensors = None if start is None else start.fitting(recipe.network)
     if leads():
         say(f"{recipe.name}: {len(pairs)} pairs of {len(pairs.shards)} recordings, in {folder}")
     try:
         with shown("training", "steps") as tick:
-            run(
-                recipe, pairs, folder, tests, tensors, options, lambda p: tick(p.step, p.steps, _where(p)),
-                validated=_say_validation, about=about,
-            )  # fmt: skip
+            watchers = Watchers(lambda p: tick(p.step, p.steps, _where(p)), _say_validation)
+            run(recipe, pairs, folder, tests, tensors, options, watchers)
     except KeyboardInterrupt:
         complain("interrupted; the same command goes on where this one stopped")
         raise typer.Exit(INTERRUPTED) from None
@@ -167,9 +165,9 @@ def shown(what: str, unit: str) -> Iterator[Tick]:
 
 def clear(folder: Path) -> None:
     """Delete what a training run leaves, and nothing else."""
-    from hybridlio.learned.training.train import CHECKPOINT, WEIGHTS
+    from hybridlio.learned.training.train import BEST, CHECKPOINT, WEIGHTS
 
-    for name in (CHECKPOINT, WEIGHTS, "recipe.json", "log.jsonl"):
+    for name in (CHECKPOINT, WEIGHTS, BEST, "recipe.json", "log.jsonl"):
         (folder / name).unlink(missing_ok=True)
     shutil.rmtree(folder / "tensorboard", ignore_errors=True)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -11,12 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hybridlio.core import se3
 from hybridlio.core.errors import DataError
 from hybridlio.learned.data.shards import Shard
 from hybridlio.learned.losses.correspondences import Clouds
-from hybridlio.learned.networks import torch_se3 as se3
 from hybridlio.learned.networks.odometry_network import NetworkInput
-from hybridlio.learned.settings import NetworkSettings, OptimiserSettings
+from hybridlio.learned.settings import NetworkSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,24 +89,65 @@ class Pairs:
         number, k = self._rows[index]
         return self.shards[number], k
 
-    def batch(self, indices: Sequence[int]) -> PairBatch:
-        """These pairs together, clouds padded to the largest."""
-        places = [self.where(index) for index in indices]
-        steps = NetworkInput(
-            last=_stack([shard.vertex_map(k - 1) for shard, k in places]),
-            current=_stack([shard.vertex_map(k) for shard, k in places]),
-            imu=_stack([shard.imu[k] for shard, k in places]),
-            dt_s=torch.tensor([float(shard.dt_s[k]) for shard, k in places]),
-            velocity_m_s=_stack([np.nan_to_num(shard.velocity_m_s[k]) for shard, k in places]),
-            initial=_stack([_or_identity(shard.initial[k]) for shard, k in places]),
+    def swappable(self, index: int) -> bool:
+        """Return whether :meth:`batch` can run a pair backwards: the velocity after it is known."""
+        shard, k = self.where(index)
+        if k + 2 >= len(shard):
+            return False
+        return bool(shard.imu_there[k + 1]) and bool(np.isfinite(shard.velocity_m_s[k + 2]).all())
+
+    def batch(self, indices: Sequence[int], backwards: Collection[int] = ()) -> PairBatch:
+        """Return these pairs together, clouds padded to the largest.
+
+        Args:
+            indices: of the pairs.
+            backwards: those of them that run backwards in time, from the current scan to the last one.
+        """
+        steps = [(_backward_step if index in backwards else _forward_step)(*self.where(index)) for index in indices]
+        given = NetworkInput(
+            last=_stack([step.shard.vertex_map(step.last) for step in steps]),
+            current=_stack([step.shard.vertex_map(step.current) for step in steps]),
+            imu=_stack([step.imu for step in steps]),
+            dt_s=torch.tensor([step.dt_s for step in steps]),
+            velocity_m_s=_stack([np.nan_to_num(step.velocity_m_s) for step in steps]),
+            initial=_stack([_or_identity(step.initial) for step in steps]),
         )
         return PairBatch(
-            steps,
-            padded([shard.loss_cloud(k - 1) for shard, k in places]),
-            padded([shard.loss_cloud(k) for shard, k in places]),
-            _stack([shard.reference[k] for shard, k in places]),
+            given,
+            padded([step.shard.loss_cloud(step.last) for step in steps]),
+            padded([step.shard.loss_cloud(step.current) for step in steps]),
+            _stack([step.reference for step in steps]),
             torch.tensor(list(indices)),
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """A pair as it lies in a shard, or its reverse: scan numbers and what belongs to the step between them."""
+
+    shard: Shard
+    last: int
+    current: int
+    imu: NDArray[np.float32]
+    dt_s: float
+    velocity_m_s: NDArray[np.float32]
+    initial: NDArray[np.float64]
+    reference: NDArray[np.float64]
+
+
+def _forward_step(shard: Shard, k: int) -> _Step:
+    poses = shard.initial[k], shard.reference[k]
+    return _Step(shard, k - 1, k, shard.imu[k], float(shard.dt_s[k]), shard.velocity_m_s[k], *poses)
+
+
+def _backward_step(shard: Shard, k: int) -> _Step:
+    """The step from scan k to k-1. Time runs backwards: angular velocities change sign, specific forces do not."""
+    imu = shard.imu[k, ::-1] * np.array([-1, -1, -1, 1, 1, 1], np.float32)
+    # row k+2 holds the mean velocity from k to k+1, in the axes of k+1; the mean rate between them leads to those of k
+    turned = se3.so3_exp(shard.imu[k + 1, :, :3].mean(axis=0).astype(np.float64) * float(shard.dt_s[k + 1]))
+    velocity = -(turned @ shard.velocity_m_s[k + 2])
+    poses = se3.inverse(shard.initial[k]), se3.inverse(shard.reference[k])
+    return _Step(shard, k, k - 1, imu, float(shard.dt_s[k]), velocity.astype(np.float32), *poses)
 
 
 def padded(clouds: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> Clouds:
@@ -119,21 +160,6 @@ def padded(clouds: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]]) ->
         normals[row, : len(its_points)] = its_normals
         there[row, : len(its_points)] = True
     return Clouds(torch.from_numpy(points), torch.from_numpy(normals), torch.from_numpy(there))
-
-
-def shaken(batch: PairBatch, settings: OptimiserSettings, seed: int) -> PairBatch:
-    """The batch with initial poses to be perturbed on the right, and velocities perturbed, each by a draw of its own.
-
-    A pair's draw depends on the seed and on the pair alone, so it is the same in every process and after resuming.
-    """
-    pose = np.r_[np.full(3, settings.initial_noise_rad), np.full(3, settings.initial_noise_m)]
-    sigmas = np.r_[pose, np.full(3, settings.velocity_noise_m_s)]
-    if not sigmas.any():
-        return batch
-    draws = np.array([np.random.default_rng([seed, int(index)]).normal(size=9) * sigmas for index in batch.index])
-    noise = torch.tensor(draws, dtype=torch.float32, device=batch.reference.device)
-    velocity = batch.network.velocity_m_s + noise[:, 6:]
-    return replace(batch, network=replace(batch.network, shake=se3.exp(noise[:, :6]), velocity_m_s=velocity))
 
 
 def _stack(arrays: Sequence[NDArray[Any]]) -> Tensor:

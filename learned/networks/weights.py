@@ -115,12 +115,20 @@ def save_weights(
 
 
 def weights_path(name: str | os.PathLike[str]) -> Path:
-    """The file of a name as settings have it: a path, or ``shipped``.
+    """Return the file of a name as settings have it.
+
+    Args:
+        name: a path; ``shipped``; or the name of weights that come with the package, such as ``published``. A file of
+            that name in the working directory goes first.
 
     Raises:
-        ConfigError: no weights are shipped.
+        ConfigError: no weights of that name are shipped; lists those that are.
     """
-    return shipped() if str(name) == SHIPPED else Path(name).expanduser()
+    if str(name) == SHIPPED:
+        return shipped()
+    path = Path(name).expanduser()
+    is_name = len(path.parts) == 1 and not path.suffix and not path.exists()
+    return shipped(str(name)) if is_name else path
 
 
 def load_weights(path: str | os.PathLike[str]) -> Weights:

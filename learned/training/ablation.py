@@ -18,7 +18,7 @@ from hybridlio.learned.data.shards import Shard
 from hybridlio.learned.settings import Recipe, from_dict, to_dict
 from hybridlio.learned.training import checkpoints
 from hybridlio.learned.training.driving import drive
-from hybridlio.learned.training.train import RunOptions, TrainingProgress, train
+from hybridlio.learned.training.train import RunOptions, TrainingProgress, Watchers, train
 
 RESULT = "result.json"
 
@@ -113,7 +113,7 @@ def _row(
     options = replace(options or RunOptions(), max_steps=steps)
     began = time.monotonic()
     tick = None if progress is None else lambda done: progress(recipe, done)
-    network = train(recipe, pairs, folder, options=options, progress=tick)
+    network = train(recipe, pairs, folder, options=options, watchers=Watchers(tick))
     seconds = time.monotonic() - began
     drifts = [{s.info.name: drive(network, s).drift for s in part} for part in (shards.train, shards.test)]
     seen = sum(min(recipe.optimiser.batch, len(pairs) - k % an_epoch * recipe.optimiser.batch) for k in range(steps))

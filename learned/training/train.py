@@ -4,6 +4,7 @@ The result does not depend on the number of processes beyond rounding, with one 
 (see :meth:`hybridlio.learned.training.processes.Processes.joined`).
 
 Source: UnDeepLIO, "Implementation Details". A run is a folder with ``recipe.json``, ``log.jsonl``, ``checkpoint.pt``
+``best.safetensors`` where there is something to validate on,
 and, when it has come to its end, ``weights.safetensors``; given the same folder again, it goes on exactly where its
 last checkpoint was.
 """
@@ -14,31 +15,33 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hybridlio.core.errors import ConfigError, EstimationError
 from hybridlio.core.files import write_whole
-from hybridlio.learned.data.pairs import PairBatch, Pairs, shaken
+from hybridlio.learned.data.pairs import PairBatch, Pairs
 from hybridlio.learned.losses.loss import LossValue
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
 from hybridlio.learned.networks.weights import put_weights, save_weights
 from hybridlio.learned.settings import Recipe, to_dict
 from hybridlio.learned.training import checkpoints
+from hybridlio.learned.training.best_weights import BestWeights
 from hybridlio.learned.training.checkpoints import Checkpoint
+from hybridlio.learned.training.feed import Feed
 from hybridlio.learned.training.objective import Objective
 from hybridlio.learned.training.processes import Processes, processes
-from hybridlio.learned.training.schedule import epoch_order, learning_rate
+from hybridlio.learned.training.schedule import learning_rate
 from hybridlio.learned.training.training_log import TrainingLog
 from hybridlio.learned.training.validation import Validation, validate
 
 CHECKPOINT = "checkpoint.pt"
 WEIGHTS = "weights.safetensors"
+BEST = "best.safetensors"
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ class TrainingProgress:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a run is carried out; none of it changes what it gives.
+    """How a run is carried out; none of it changes the weights that it ends with.
 
     Attributes:
         device: where to compute; by default a GPU where there is one.
@@ -75,6 +78,7 @@ class RunOptions:
         validate_every: epochs between validations.
         max_steps: end after so many steps in all.
         max_seconds: stop after so long, with a checkpoint.
+        about: text for the metadata of the weights.
     """
 
     device: str | None = None
@@ -82,6 +86,20 @@ class RunOptions:
     validate_every: int = 1
     max_steps: int | None = None
     max_seconds: float | None = None
+    about: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Watchers:
+    """Functions that a run calls in the first process.
+
+    Attributes:
+        progress: called after every step.
+        validated: called after every validation, with the steps done and the figures.
+    """
+
+    progress: Callable[[TrainingProgress], None] | None = None
+    validated: Callable[[int, Validation], None] | None = None
 
 
 def train(
@@ -91,9 +109,7 @@ def train(
     validation: Pairs | None = None,
     start: Mapping[str, Tensor] | None = None,
     options: RunOptions | None = None,
-    progress: Callable[[TrainingProgress], None] | None = None,
-    validated: Callable[[int, Validation], None] | None = None,
-    about: Mapping[str, str] | None = None,
+    watchers: Watchers | None = None,
 ) -> OdometryNetwork:
     """Train a network, or go on training it, and return it.
 
@@ -101,13 +117,12 @@ def train(
         recipe: settings.
         pairs: to train on.
         out: the run's folder.
-        validation: pairs on which the error left and the drift are measured as training goes.
+        validation: pairs on which the error left and the drift are measured as training goes. The weights that are best
+            there are kept beside the last ones.
         start: weights to start from, such as shipped ones, named as by
             :func:`hybridlio.learned.networks.weights.own_tensors`; ignored when resuming.
         options: how to carry it out.
-        progress: called after every step, in the first process only.
-        validated: called after every validation with the steps done and what was found, in the first process only.
-        about: more to say in the weights' metadata.
+        watchers: functions to call as it goes.
 
     Raises:
         ConfigError: the folder holds a run of another recipe or on other data, or the weights to start from do not fit;
@@ -117,9 +132,10 @@ def train(
     """
     options = options or RunOptions()
     with processes(options.device) as place:
-        run = _Run(recipe, pairs, Path(out), place, options, start, about or {})
+        run = _Run(recipe, pairs, Path(out), place, options, watchers or Watchers())
         try:
-            run.train(validation, progress, validated)
+            run.begin(start)
+            run.train(validation)
         finally:
             run.log.close() if run.log else None
         return run.network
@@ -129,17 +145,10 @@ class _Run:
     """A run's state, between its steps."""
 
     def __init__(
-        self,
-        recipe: Recipe,
-        pairs: Pairs,
-        out: Path,
-        place: Processes,
-        options: RunOptions,
-        start: Mapping[str, Tensor] | None,
-        about: Mapping[str, str],
+        self, recipe: Recipe, pairs: Pairs, out: Path, place: Processes, options: RunOptions, watchers: Watchers
     ) -> None:
         self.recipe, self.pairs, self.out, self.place, self.options = recipe, pairs, out, place, options
-        self.about = about
+        self.watchers = watchers
         settings = recipe.optimiser
         torch.manual_seed(settings.seed)
         self.network = OdometryNetwork(recipe.network).to(place.device)
@@ -147,37 +156,41 @@ class _Run:
         self.optimiser = torch.optim.Adam(
             self.network.parameters(), settings.learning_rate, settings.betas, weight_decay=settings.weight_decay
         )
+        self.feed = Feed(pairs, settings, place.rank, place.count)
+        self.steps_an_epoch = math.ceil(len(pairs) / settings.batch)
+        whole = self.steps_an_epoch * settings.epochs
+        self.steps = min(whole, options.max_steps or whole)
         self.step, self._between_steps = 0, True
-        found = _checkpoint_in(out, recipe, len(pairs))
+        self.best = BestWeights(out / BEST)
+        self.log: TrainingLog | None = None
+        self.objective: nn.Module = self.network
+
+    def begin(self, start: Mapping[str, Tensor] | None) -> None:
+        """Go on from the folder's checkpoint, or start from the given weights, and write the recipe."""
+        found = _checkpoint_in(self.out, self.recipe, len(self.pairs))
         if found is not None:
             checkpoints.restore(found, self.network, self.optimiser)
             self.step = found.step
         elif start is not None:
             put_weights(self.network, start, "the weights to start from")
-        place.wait()  # before the first process writes where the others look
-        self.log = TrainingLog(out, self.step) if place.leads else None
-        if place.leads:
-            write_whole(out / "recipe.json", json.dumps(to_dict(recipe), indent=2) + "\n")
-        self.objective = place.joined(Objective(self.network, recipe.loss))
-        self.steps_an_epoch = math.ceil(len(pairs) / settings.batch)
-        whole = self.steps_an_epoch * settings.epochs
-        self.steps = min(whole, options.max_steps or whole)
+        self.place.wait()  # before the first process writes where the others look
+        if self.place.leads:
+            self.log = TrainingLog(self.out, self.step)
+            self.best.forget_after(self.step)
+            write_whole(self.out / "recipe.json", json.dumps(to_dict(self.recipe), indent=2) + "\n")
+        self.objective = self.place.joined(Objective(self.network, self.recipe.loss))
 
-    def train(
-        self,
-        validation: Pairs | None,
-        progress: Callable[[TrainingProgress], None] | None,
-        validated: Callable[[int, Validation], None] | None,
-    ) -> None:
+    def train(self, validation: Pairs | None) -> None:
+        """Take the remaining steps."""
         began, first = time.monotonic(), self.step
         self.network.train()
         try:
-            for indices, batch in self._batches():
+            for indices, batch in self.feed.batches(self.step, self.steps):
                 loss, po2pl = self._step(indices, batch)
                 seconds = time.monotonic() - began
-                self._after_step(loss, po2pl, (self.step - first) / seconds, progress)
+                self._after_step(loss, po2pl, (self.step - first) / seconds)
                 if self.step % self.steps_an_epoch == 0:
-                    self._after_epoch(validation, validated)
+                    self._after_epoch(validation)
                 if self.options.max_seconds is not None and self._agreed(seconds > self.options.max_seconds):
                     break
         except KeyboardInterrupt:
@@ -186,37 +199,7 @@ class _Run:
             raise
         self._save()
         if self.step >= self.steps and self.place.leads:
-            save_weights(self.out / WEIGHTS, self.network, self.recipe, self._told())
-
-    def _batches(self) -> Iterator[tuple[list[int], PairBatch]]:
-        """The pairs of each remaining step and this process's share of them, read one step ahead."""
-        with ThreadPoolExecutor(1) as reader:
-            plan = self._plan()
-            ahead = next(plan, None)
-            reading = reader.submit(self._read, ahead) if ahead else None
-            while ahead is not None and reading is not None:
-                indices, batch = ahead, reading.result()
-                ahead = next(plan, None)
-                reading = reader.submit(self._read, ahead) if ahead else None
-                yield indices[1], batch
-
-    def _plan(self) -> Iterator[tuple[int, list[int]]]:
-        epoch, skip = divmod(self.step, self.steps_an_epoch)
-        step = self.step
-        while step < self.steps:
-            for indices in epoch_order(self.recipe.optimiser, epoch, len(self.pairs))[skip:]:
-                if step >= self.steps:
-                    return
-                yield epoch, indices
-                step += 1
-            epoch, skip = epoch + 1, 0
-
-    def _read(self, planned: tuple[int, list[int]]) -> PairBatch:
-        epoch, indices = planned
-        # a share is never empty: a short last batch is dealt out again from its start
-        mine = indices[self.place.rank :: self.place.count] or indices[:1]
-        batch, settings = self.pairs.batch(mine), self.recipe.optimiser
-        return shaken(batch, settings, seed=settings.seed * 1_000_003 + epoch)
+            save_weights(self.out / WEIGHTS, self.network, self.recipe, self._origin())
 
     def _step(self, indices: list[int], batch: PairBatch) -> tuple[float, float]:
         """One step of the optimiser; the loss and the mean distance over all processes' pairs."""
@@ -249,35 +232,34 @@ class _Run:
             + "lower optimiser.learning_rate or set optimiser.clip_norm"
         )
 
-    def _after_step(
-        self, loss: float, po2pl: float, steps_per_s: float, progress: Callable[[TrainingProgress], None] | None
-    ) -> None:
+    def _after_step(self, loss: float, po2pl: float, steps_per_s: float) -> None:
         rate = float(self.optimiser.param_groups[0]["lr"])
         if self.log is not None:
             self.log.write(self.step, loss=loss, po2pl_m=po2pl, learning_rate=rate)
-        if progress is not None and self.place.leads:
+        if self.watchers.progress is not None and self.place.leads:
             epoch = (self.step - 1) // self.steps_an_epoch
             left = (self.steps - self.step) / steps_per_s
             pairs_per_s = steps_per_s * self.recipe.optimiser.batch
-            progress(TrainingProgress(self.step, self.steps, epoch, loss, po2pl, rate, pairs_per_s, left))
+            self.watchers.progress(TrainingProgress(self.step, self.steps, epoch, loss, po2pl, rate, pairs_per_s, left))
         if self.step % self.options.checkpoint_every == 0:
             self._save()
 
-    def _after_epoch(self, validation: Pairs | None, validated: Callable[[int, Validation], None] | None) -> None:
+    def _after_epoch(self, validation: Pairs | None) -> None:
         due = self.step // self.steps_an_epoch % self.options.validate_every == 0
         if validation is not None and due and self.log is not None:
             found = validate(self.network, validation, self.recipe, self.place.device)
             self.log.write(self.step, **{f"validation/{name}": value for name, value in asdict(found).items()})
-            if validated is not None:
-                validated(self.step, found)
+            self.best.offer(found, self.step, self.network, self.recipe, self._origin())
+            if self.watchers.validated is not None:
+                self.watchers.validated(self.step, found)
         self._save()
 
-    def _told(self) -> dict[str, str]:
+    def _origin(self) -> dict[str, str]:
         data = ", ".join(f"{shard.info.name} ({len(shard)} scans)" for shard in self.pairs.shards)
-        return {"data": data, "pairs": str(len(self.pairs)), "steps": str(self.step), **self.about}
+        return {"data": data, "pairs": str(len(self.pairs)), "steps": str(self.step), **self.options.about}
 
     def _agreed(self, mine: bool) -> bool:
-        """Whether any process says so: all stop at the same step."""
+        """Return whether any process says so: all stop at the same step."""
         return bool(self.place.total(torch.tensor(float(mine), device=self.place.device)) > 0)
 
     def _save(self) -> None:

@@ -10,7 +10,8 @@ import torch
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.learned.data.pairs import Pairs, shaken
+from hybridlio.learned.data.augmentation import perturbed
+from hybridlio.learned.data.pairs import Pairs
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
 from hybridlio.learned.settings import Recipe
 from hybridlio.learned.training.driving import drift_of
@@ -37,6 +38,13 @@ class Validation:
     initial_translation_rms_m: float | None = None
     t_rel_percent: float | None = None
     r_rel_deg_per_100m: float | None = None
+
+    @property
+    def score(self) -> float:
+        """What selects weights, lower is better: t_rel [%] + r_rel [°/100 m], or where drift is not known, the loss."""
+        if self.t_rel_percent is None or self.r_rel_deg_per_100m is None:
+            return self.loss
+        return self.t_rel_percent + self.r_rel_deg_per_100m
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +77,7 @@ def run_steps(
     parts: list[tuple[Array, ...]] = []
     for start in range(0, len(pairs), size):
         batch = pairs.batch(range(start, min(start + size, len(pairs))))
-        batch = shaken(batch, recipe.optimiser, seed=0).to(device)
+        batch = perturbed(batch, recipe.optimiser, seed=0).to(device)
         out = network(batch.network)
         value = objective(out, batch, recipe.loss, recipe.network.geometry)
         tensors = (out.pose, out.initial, batch.reference, value.total, value.po2pl_m)

@@ -11,7 +11,8 @@ from hybridlio.cloud.preparation import PreparationOptions, prepare
 from hybridlio.cloud.projection import MapGeometry
 from hybridlio.core import se3
 from hybridlio.core.errors import DataError
-from hybridlio.learned.data.pairs import Pairs, padded, shaken
+from hybridlio.learned.data.augmentation import perturbed
+from hybridlio.learned.data.pairs import Pairs, padded
 from hybridlio.learned.data.preparing import prepare_shard
 from hybridlio.learned.data.shards import ScanRecord, Shard, write_shard
 from hybridlio.learned.settings import NetworkSettings, OptimiserSettings
@@ -136,12 +137,12 @@ def test_a_shard_that_fails_to_be_written_leaves_nothing_behind(tmp_path):
 def test_noise_of_initial_pose_and_velocity_depends_on_the_pair_and_the_seed_alone(tmp_path):
     pairs = Pairs([shard_of(tmp_path, [record(k) for k in range(5)])], replace(SETTINGS, imu="given"))
     noise = OptimiserSettings(initial_noise_rad=0.01, initial_noise_m=0.1, velocity_noise_m_s=0.2)
-    whole, part = shaken(pairs.batch([0, 1, 2, 3]), noise, seed=7), shaken(pairs.batch([2]), noise, seed=7)
-    other = shaken(pairs.batch([2]), noise, seed=8)
+    whole, part = perturbed(pairs.batch([0, 1, 2, 3]), noise, seed=7), perturbed(pairs.batch([2]), noise, seed=7)
+    other = perturbed(pairs.batch([2]), noise, seed=8)
     for name in ("shake", "velocity_m_s"):
         assert torch.equal(getattr(whole.network, name)[2], getattr(part.network, name)[0])
         assert not torch.allclose(getattr(other.network, name), getattr(part.network, name))
-    assert shaken(pairs.batch([2]), OptimiserSettings(), seed=7).network.shake is None
+    assert perturbed(pairs.batch([2]), OptimiserSettings(), seed=7).network.shake is None
 
 
 def test_clouds_are_padded_to_the_largest():

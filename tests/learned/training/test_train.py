@@ -16,7 +16,7 @@ from hybridlio.learned.networks.weights import load_weights
 from hybridlio.learned.settings import OptimiserSettings, to_dict
 from hybridlio.learned.training import checkpoints
 from hybridlio.learned.training.schedule import epoch_order, learning_rate
-from hybridlio.learned.training.train import RunOptions, train
+from hybridlio.learned.training.train import RunOptions, Watchers, train
 from hybridlio.learned.training.training_log import TrainingLog, read_log
 from hybridlio.learned.training.validation import validate
 
@@ -105,8 +105,8 @@ def test_a_diverging_run_stops_and_keeps_its_last_good_checkpoint(rooms, tiny_re
         train(tiny_recipe, pairs, tmp_path, options=replace(CPU, max_steps=step))
     batch = pairs.batch
 
-    def broken(indices):
-        good = batch(indices)
+    def broken(*indices):
+        good = batch(*indices)
         return replace(good, network=replace(good.network, imu=good.network.imu * torch.nan))
 
     monkeypatch.setattr(pairs, "batch", broken)
@@ -125,7 +125,7 @@ def test_an_interrupted_run_keeps_what_it_did(rooms, tiny_recipe, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(tiny_recipe, Pairs(rooms[:1], tiny_recipe.network), tmp_path, options=CPU, progress=stop)
+        train(tiny_recipe, Pairs(rooms[:1], tiny_recipe.network), tmp_path, options=CPU, watchers=Watchers(stop))
     assert checkpoints.load(tmp_path / "checkpoint.pt").step == 3
 
 
@@ -136,6 +136,18 @@ def test_a_folder_of_another_run_is_refused_and_what_differs_is_named(rooms, tin
         train(with_optimiser(tiny_recipe, batch=2), pairs, tmp_path, options=CPU)
     with pytest.raises(ConfigError, match=r"pairs: \d+ → \d+"):
         train(tiny_recipe, Pairs(rooms, tiny_recipe.network), tmp_path, options=CPU)
+
+
+def test_the_weights_that_validate_best_are_kept_beside_the_last(rooms, tiny_recipe, tmp_path):
+    pairs, scores = Pairs(rooms[:1], tiny_recipe.network), []
+    watchers = Watchers(validated=lambda _step, found: scores.append(found.score))
+    train(tiny_recipe, pairs, tmp_path, validation=pairs, options=replace(CPU, max_steps=8), watchers=watchers)
+    kept = load_weights(tmp_path / "best.safetensors")
+    assert float(kept.about["score"]) == min(scores)
+    assert validate(kept.network(), pairs, kept.recipe).score == pytest.approx(min(scores))
+    train(tiny_recipe, pairs, tmp_path, validation=pairs, options=CPU, watchers=watchers)
+    assert float(load_weights(tmp_path / "best.safetensors").about["score"]) == min(scores)
+    assert len(scores) == 3
 
 
 def test_a_damaged_checkpoint_is_named(rooms, tiny_recipe, tmp_path):
@@ -155,7 +167,7 @@ def test_training_starts_from_given_weights(rooms, tiny_recipe, tmp_path):
 
 def test_progress_tells_rate_and_remaining_time(rooms, tiny_recipe, tmp_path):
     seen = []
-    train(tiny_recipe, Pairs(rooms[:1], tiny_recipe.network), tmp_path, options=CPU, progress=seen.append)
+    train(tiny_recipe, Pairs(rooms[:1], tiny_recipe.network), tmp_path, options=CPU, watchers=Watchers(seen.append))
     assert [p.step for p in seen] == list(range(1, 13))
     assert [p.epoch for p in seen] == [0] * 4 + [1] * 4 + [2] * 4
     assert seen[-1].remaining_s == 0
@@ -192,7 +204,7 @@ def test_progress_counts_to_where_the_run_ends_not_its_schedule(rooms, tiny_reci
         Pairs(rooms[:1], tiny_recipe.network),
         tmp_path,
         options=replace(CPU, max_steps=2),
-        progress=told.append,
+        watchers=Watchers(told.append),
     )
     assert [(p.step, p.steps) for p in told] == [(1, 2), (2, 2)]
     assert told[-1].remaining_s == 0

@@ -1,0 +1,93 @@
+"""Pairs varied for training: mirrored, run backwards, with perturbed starts, and with part of their points.
+
+Every draw depends on a seed and on the pair alone, so that it is the same in every process and after resuming. Not in
+the paper.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hybridlio.learned.data.pairs import PairBatch, Pairs
+from hybridlio.learned.losses.correspondences import Clouds
+from hybridlio.learned.networks import torch_se3 as se3
+from hybridlio.learned.settings import OptimiserSettings
+
+_VARYING, _DRAWING = 1, 2  # streams of random numbers beside that of perturbations
+
+
+def training_batch(pairs: Pairs, indices: Sequence[int], settings: OptimiserSettings, seed: int) -> PairBatch:
+    """Return these pairs together, varied as the settings say."""
+    draws = np.array([np.random.default_rng([seed, i, _VARYING]).random(2) for i in indices])
+    backwards = [i for i, draw in zip(indices, draws, strict=True) if draw[1] < settings.swapped and pairs.swappable(i)]
+    batch = mirrored(pairs.batch(indices, backwards), torch.from_numpy(draws[:, 0] < settings.mirrored))
+    return perturbed(with_points(batch, settings.points, seed), settings, seed)
+
+
+def perturbed(batch: PairBatch, settings: OptimiserSettings, seed: int) -> PairBatch:
+    """Return the batch with a perturbation of each initial pose, on the right, and with perturbed velocities."""
+    pose = np.r_[np.full(3, settings.initial_noise_rad), np.full(3, settings.initial_noise_m)]
+    sigmas = np.r_[pose, np.full(3, settings.velocity_noise_m_s)]
+    if not sigmas.any():
+        return batch
+    draws = np.array([np.random.default_rng([seed, int(index)]).normal(size=9) * sigmas for index in batch.index])
+    noise = torch.tensor(draws, dtype=torch.float32, device=batch.reference.device)
+    velocity = batch.network.velocity_m_s + noise[:, 6:]
+    return replace(batch, network=replace(batch.network, shake=se3.exp(noise[:, :6]), velocity_m_s=velocity))
+
+
+def mirrored(batch: PairBatch, rows: Tensor) -> PairBatch:
+    """Return the batch with the pairs of ``rows`` ``(B,)`` bool seen in a mirror that swaps left and right (y)."""
+    if not bool(rows.any()):
+        return batch
+    given = batch.network
+    sign = torch.where(rows, -1.0, 1.0)[:, None]
+    one = torch.ones_like(sign)
+    polar = torch.cat([one, sign, one], dim=1)  # of points and velocities
+    axial = torch.cat([sign, one, sign], dim=1)  # of angular velocities
+    flipped = rows[:, None, None, None]
+    maps = [
+        torch.where(flipped, vertices.flip(-1), vertices) * polar[..., None, None]
+        for vertices in (given.last, given.current)
+    ]
+    network = replace(
+        given,
+        last=maps[0],
+        current=maps[1],
+        imu=given.imu * torch.cat([axial, polar], dim=1)[:, None],
+        velocity_m_s=given.velocity_m_s * polar,
+        initial=None if given.initial is None else _mirrored_poses(given.initial, polar),
+    )
+    last, current = (
+        replace(cloud, points=cloud.points * polar[:, None], normals=cloud.normals * polar[:, None])
+        for cloud in (batch.last, batch.current)
+    )
+    return replace(
+        batch, network=network, last=last, current=current, reference=_mirrored_poses(batch.reference, polar)
+    )
+
+
+def _mirrored_poses(poses: Tensor, polar: Tensor) -> Tensor:
+    """``M T M`` for the mirror ``M`` with ``polar`` ``(B, 3)`` on its diagonal."""
+    mirror = torch.cat([polar, torch.ones_like(polar[:, :1])], dim=1)
+    return mirror[:, :, None] * poses * mirror[:, None, :]
+
+
+def with_points(batch: PairBatch, count: int, seed: int) -> PairBatch:
+    """Return the batch with ``count`` points of each current cloud, drawn anew for each pair and seed; 0 keeps all."""
+    cloud = batch.current
+    if not count or count >= cloud.points.shape[1]:
+        return batch
+    rows = [
+        torch.from_numpy(np.random.default_rng([seed, int(index), _DRAWING]).integers(0, max(int(size), 1), count))
+        for index, size in zip(batch.index, cloud.there.sum(1), strict=True)
+    ]
+    chosen = torch.stack(rows)
+    each = chosen[..., None].expand(-1, -1, 3)
+    thinned = Clouds(cloud.points.gather(1, each), cloud.normals.gather(1, each), cloud.there.gather(1, chosen))
+    return replace(batch, current=thinned)
