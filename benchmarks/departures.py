@@ -25,8 +25,8 @@ from hybridlio.learned.settings import Recipe
 from hybridlio.learned.training.driving import drive
 from hybridlio.learned.training.train import RunOptions, train
 from hybridlio.learned.training.validation import step_errors
-from hybridlio.runs.recipes import lasting
-from hybridlio.runs.training_data import DataOptions, shards_of
+from hybridlio.runs.recipes import for_steps
+from hybridlio.runs.training_data import DataOptions, prepare_shards
 
 
 def measured(name: str, network: OdometryNetwork, tests: list[Shard]) -> Iterator[Row]:
@@ -61,15 +61,15 @@ def main() -> None:
     prepared = DataOptions(options.cache)
 
     def tests(recipe: Recipe) -> list[Shard]:
-        return shards_of(options.test, recipe, prepared)
+        return prepare_shards(options.test, recipe, prepared)
 
     torch.manual_seed(0)
     lines = list(measured("default, untrained", OdometryNetwork(DEFAULT.network).eval(), tests(DEFAULT)))
     for recipe in DEPARTURES:
         if wanted and recipe.name not in wanted:
             continue
-        pairs = Pairs(shards_of(options.train, recipe, prepared), recipe.network)
-        recipe = lasting(recipe, options.steps, len(pairs))
+        pairs = Pairs(prepare_shards(options.train, recipe, prepared), recipe.network)
+        recipe = for_steps(recipe, options.steps, len(pairs))
         network = train(
             recipe, pairs, options.out / recipe.name, options=RunOptions(device="cpu", max_steps=options.steps)
         )

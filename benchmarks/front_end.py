@@ -37,8 +37,8 @@ from hybridlio.learned.networks.weights import Weights, load_weights, weights_pa
 from hybridlio.learned.training.driving import drive
 from hybridlio.learned.training.train import RunOptions, train
 from hybridlio.learned.training.validation import step_errors
-from hybridlio.runs.recipes import adaptation
-from hybridlio.runs.training_data import DataOptions, shards_of
+from hybridlio.runs.recipes import adaptation_recipe
+from hybridlio.runs.training_data import DataOptions, prepare_shards
 
 Row = dict[str, str]
 
@@ -95,7 +95,7 @@ def accuracy_rows(network: OdometryNetwork, name: str, shard: Shard, reference: 
 
 def adapted(weights: Weights, shard: Shard) -> OdometryNetwork:
     """The network after going on with its training on a recording, without labels."""
-    recipe = adaptation(weights.recipe)
+    recipe = adaptation_recipe(weights.recipe)
     with tempfile.TemporaryDirectory() as folder:
         start = weights.fitting(recipe.network)
         return train(recipe, Pairs([shard], recipe.network), folder, start=start, options=RunOptions("cpu")).eval()
@@ -191,7 +191,7 @@ def main() -> None:
     network, told = weights.network(), {}
 
     def shards(paths: list[Path]) -> list[Shard]:
-        return shards_of(paths, weights.recipe, DataOptions(options.cache)) if paths else []
+        return prepare_shards(paths, weights.recipe, DataOptions(options.cache)) if paths else []
 
     def show(title: str, rows: list[Row]) -> None:
         if rows:

@@ -18,6 +18,7 @@ from multiprocessing.connection import Connection
 import numpy as np
 from systems import Answer, Make
 
+from hybridlio.core.progress import Progress
 from hybridlio.datasets.sequence import Sequence
 
 Open = Callable[[], Sequence]  # given to processes, so picklable
@@ -50,7 +51,7 @@ class Pass:
 
 
 def run_in_lockstep(
-    systems: dict[str, Make], opened: Open, scans: int, threads: int, progress: Callable[[int, int], None] | None = None
+    systems: dict[str, Make], opened: Open, scans: int, threads: int, progress: Progress | None = None
 ) -> dict[str, Pass]:
     """One pass of every system over the recording that ``opened`` opens; whose turn is first changes scan by scan."""
     passes = {name: Pass() for name in systems}
@@ -61,7 +62,7 @@ def run_in_lockstep(
                 if passes[name].error is None:
                     _turn(talks[name], k, passes[name])
             if progress is not None:
-                progress(k + 1, scans)
+                progress("", k + 1, scans)
     return passes
 
 

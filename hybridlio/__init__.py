@@ -16,7 +16,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time each name l
     from hybridlio.graph.run.smooth import smooth
     from hybridlio.odometry.config import Config
     from hybridlio.odometry.odometry import Estimate, Odometry
-    from hybridlio.runs.batch import run_batch
+    from hybridlio.runs.batch import BatchOptions, run_batch
     from hybridlio.runs.batch_table import Batch
     from hybridlio.runs.recordings import Recording, find_recordings
     from hybridlio.simulation.config import SimulationConfig
@@ -24,6 +24,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time each name l
 
 __all__ = [
     "Batch",
+    "BatchOptions",
     "Calibration",
     "Config",
     "Estimate",
@@ -60,7 +61,7 @@ _HOMES = {
     "graph.run.smooth": ("smooth",),
     "odometry.config": ("Config",),
     "odometry.odometry": ("Estimate", "Odometry"),
-    "runs.batch": ("run_batch",),
+    "runs.batch": ("BatchOptions", "run_batch"),
     "runs.batch_table": ("Batch",),
     "runs.recordings": ("Recording", "find_recordings"),
     "simulation.config": ("SimulationConfig",),

@@ -1,4 +1,4 @@
-"""``python -m hybridlio``: the command line."""
+"""Run the command line by ``python -m hybridlio``."""
 
 from hybridlio.commands.app import app
 

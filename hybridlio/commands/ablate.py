@@ -12,8 +12,8 @@ import typer
 
 from hybridlio.commands import common
 from hybridlio.commands.common import INTERRUPTED, guarded
-from hybridlio.commands.terminal import complain, say, say_table
-from hybridlio.commands.train import Device, Recordings, leads, names, shown
+from hybridlio.commands.terminal import print_message, print_result, print_table
+from hybridlio.commands.train import Device, Recordings, first_process_progress, is_first_process
 from hybridlio.core.errors import ConfigError, HybridLioError
 
 if TYPE_CHECKING:
@@ -25,22 +25,28 @@ if TYPE_CHECKING:
     from hybridlio.learned.training.comparison import Line
     from hybridlio.runs.training_data import DataOptions
 
-Rows = Callable[["TableRow"], "RowResult"]
+RunRow = Callable[["TableRow"], "RowResult"]
 
-Number = Annotated[int, typer.Option("--table", metavar="N", help="Of the paper's tables, 1 to 5.", show_default=False)]
-Tests = Annotated[
-    list[Path] | None, typer.Option("--test", metavar="DATA", help="Recordings to test on; may be repeated.")
+Number = Annotated[
+    int, typer.Option("--table", metavar="N", help="The table of the paper to reproduce, 1 to 5.", show_default=False)
 ]
-Split = Annotated[str | None, typer.Option(metavar="NAME", help="Of KITTI odometry: easy or hard, in place of --test.")]
-Steps = Annotated[int, typer.Option(min=1, help="Of the optimiser, the same for every row.")]
-Out = Annotated[Path | None, typer.Option("-o", "--out", metavar="DIR", help="By default ablation/table-N.")]
+Tests = Annotated[
+    list[Path] | None, typer.Option("--test", metavar="DATA", help="A recording to test on; may be repeated.")
+]
+Split = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Split of KITTI odometry, easy or hard; replaces --test.")
+]
+Steps = Annotated[int, typer.Option(min=1, help="Optimiser steps per row.")]
+Out = Annotated[
+    Path | None, typer.Option("-o", "--out", metavar="DIR", help="The folder to write to; default ablation/table-N.")
+]
 Cache = Annotated[
-    Path | None, typer.Option(metavar="DIR", help="Where prepared recordings are kept; by default beside -o.")
+    Path | None, typer.Option(metavar="DIR", help="The folder for prepared recordings; default: beside -o.")
 ]
 Reduced = Annotated[
-    bool, typer.Option("--reduced", help="Coarser maps and smaller encoders, which a CPU trains in minutes.")
+    bool, typer.Option("--reduced", help="Use coarser maps and smaller encoders, which train on a CPU in minutes.")
 ]
-Only = Annotated[str | None, typer.Option("--rows", metavar="A,B,…", help="These presets' rows alone.")]
+Only = Annotated[str | None, typer.Option("--rows", metavar="A,B,…", help="Only the rows of these presets.")]
 
 
 @guarded
@@ -57,43 +63,43 @@ def ablate(
     out: Out = None,
     cache: Cache = None,
     device: Device = "auto",
-    _verbose: common.Verbose = 0,
+    _verbosity: common.Verbose = 0,
 ) -> None:
-    """Train and evaluate the rows of one of the paper's tables at one budget, and print it in the paper's form.
+    """Train and evaluate each row of one of the paper's tables with the same number of steps, and print the table.
 
-    Published figures stand beside, marked as such. Given again, the same command does not repeat finished rows. A row
-    that fails does not stop the others.
+    The published results are shown too, marked as such. The same command resumes where it stopped and keeps finished
+    rows. A row that fails does not stop the others.
     """
     from hybridlio.learned.networks.devices import pick_device
     from hybridlio.runs.training_data import DataOptions
 
     pick_device(device)
     if (test is None) == (split is None):
-        raise ConfigError("give --test DATA with recordings to test on, or --split easy or hard on KITTI odometry")
-    chosen = _chosen(table, names(rows), split)
+        raise ConfigError("give either --test DATA, recordings to test on, or --split easy or hard for KITTI odometry")
+    chosen = _choose_rows(table, None if rows is None else common.split_names(rows), split)
     folder = out or Path("ablation") / f"table-{table}"
     options = DataOptions(cache or folder.parent / "shards", None, None, reader, raw_root)
-    budget = f"{steps} steps a row{', at reduced size' if reduced else ''}"
-    lines = _measured(table, chosen, _trainer(data, test, options, folder, steps, reduced, device))
+    budget = f"{steps} steps per row{', reduced size' if reduced else ''}"
+    lines = _run_rows(table, chosen, _row_runner(data, test, options, folder, steps, reduced, device))
     _finish(folder, table, lines, budget)
 
 
-def _chosen(number: int, presets: tuple[str, ...] | None, split: str | None) -> list[TableRow]:
-    """The rows to train: those of other splits only where recordings are split, each preset once where they are not."""
+def _choose_rows(number: int, presets: tuple[str, ...] | None, split: str | None) -> list[TableRow]:
+    """Return the rows to train: with a split, all of them; without one, one row per preset, whatever its split."""
     from hybridlio.learned.presets import preset, table
     from hybridlio.learned.presets import split as sequences_of
 
     rows = [row for row in table(number) if presets is None or row.preset in presets]
     if not rows:
         known = ", ".join(dict.fromkeys(row.preset for row in table(number)))
-        raise ConfigError(f"--rows: none of table {number}'s; there are {known}")
+        raise ConfigError(f"--rows: table {number} has none of these presets; choose from {known}")
     if split is not None:
         sequences_of(split, preset(rows[0].preset).network)
         return [row if row.split else replace(row, split=split) for row in rows]
     return [replace(row, split=None) for k, row in enumerate(rows) if row.preset not in {r.preset for r in rows[:k]}]
 
 
-def _trainer(
+def _row_runner(
     data: list[Path],
     test: list[Path] | None,
     options: DataOptions,
@@ -101,44 +107,43 @@ def _trainer(
     steps: int,
     small: bool,
     device: str,
-) -> Rows:
-    """Trains and evaluates a row."""
+) -> RunRow:
+    """Return a function that trains and evaluates a row."""
     from hybridlio.learned.presets import preset
     from hybridlio.learned.training.ablation import RowData, run_rows
-    from hybridlio.learned.training.ablation import reduced as smaller
+    from hybridlio.learned.training.ablation import reduced as reduce_size
     from hybridlio.learned.training.train import RunOptions
-    from hybridlio.runs.training_data import shards_of, split_options
+    from hybridlio.runs.training_data import prepare_shards, split_options
 
     run_options = RunOptions(device=None if device == "auto" else device)
 
     def prepared(recipe: Recipe, split: str | None) -> RowData:
         train, tests = split_options(options, split, recipe)
-        with shown("preparing", "scans") as tick:
+        with first_process_progress("preparing", "scans") as report:
             parts = [
-                shards_of(paths, recipe, where, lambda name, done, total: tick(done, total, name))
-                for paths, where in ((data, train), (test or data, tests))
+                prepare_shards(paths, recipe, part, report) for paths, part in ((data, train), (test or data, tests))
             ]
         return RowData(*parts)
 
     def run(row: TableRow) -> RowResult:
         recipe = replace(preset(row.preset), name=row.name)
-        recipe = smaller(recipe) if small else recipe
-        with shown(row.name, "steps") as tick:
+        recipe = reduce_size(recipe) if small else recipe
+        with first_process_progress(row.name, "steps") as report:
             (result,) = run_rows(
                 [recipe],
                 lambda recipe: prepared(recipe, row.split),
                 folder,
                 steps,
                 run_options,
-                lambda _, p: tick(p.step, steps, f"loss {p.loss:.4g}, {p.pairs_per_s:.1f} pairs/s"),
+                lambda _, p: report(f"loss {p.loss:.4g}, {p.pairs_per_s:.1f} pairs/s", p.step, steps),
             )
         return result
 
     return run
 
 
-def _measured(number: int, chosen: list[TableRow], run: Rows) -> list[Line]:
-    """Every line of the table, those of chosen rows with what was measured."""
+def _run_rows(number: int, chosen: list[TableRow], run: RunRow) -> list[Line]:
+    """Return all lines of the table; those of chosen rows with their results."""
     from hybridlio.learned.training.comparison import Line
     from hybridlio.learned.training.published import published
 
@@ -151,10 +156,10 @@ def _measured(number: int, chosen: list[TableRow], run: Rows) -> list[Line]:
         try:
             lines.append(Line(figures.method, row.preset, run(row), figures))
         except KeyboardInterrupt:
-            complain("interrupted; the same command goes on where this one stopped")
+            print_message("interrupted; the same command resumes")
             raise typer.Exit(INTERRUPTED) from None
         except HybridLioError as error:
-            complain(f"error: {row.name}: {error}")
+            print_message(f"error: {row.name}: {error}")
             lines.append(Line(figures.method, row.preset, None, figures, str(error)))
     return lines
 
@@ -163,14 +168,14 @@ def _finish(folder: Path, number: int, lines: list[Line], budget: str) -> None:
     from hybridlio.core.files import write_whole
     from hybridlio.learned.training.comparison import LEGEND, tables, to_json_dict, to_markdown
 
-    if not leads():
+    if not is_first_process():
         return
     text = json.dumps(to_json_dict(number, lines, budget), indent=2, ensure_ascii=False)
     write_whole(folder / f"table-{number}.json", text + "\n")
     write_whole(folder / f"table-{number}.md", to_markdown(number, lines, budget))
     for title, rows in tables(lines).items():
-        say_table(_table(f"table {number}, {title}: {budget}", rows, LEGEND))
-    say(f"written to {folder / f'table-{number}.md'} and {folder / f'table-{number}.json'}")
+        print_table(_table(f"table {number}, {title}: {budget}", rows, LEGEND))
+    print_result(f"wrote {folder / f'table-{number}.md'} and {folder / f'table-{number}.json'}")
     if any(line.error for line in lines):
         raise typer.Exit(common.FAILED)
 

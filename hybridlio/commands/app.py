@@ -1,4 +1,4 @@
-"""The command line. What a command does is in ``hybridlio.commands``."""
+"""The command line; each command is a module of ``hybridlio.commands``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import typer
 
 from hybridlio.commands.ablate import ablate
 from hybridlio.commands.batch import batch
-from hybridlio.commands.common import start_quietly
+from hybridlio.commands.common import Verbose
 from hybridlio.commands.compare import compare
 from hybridlio.commands.config import config
 from hybridlio.commands.evaluate import evaluate
@@ -28,7 +28,7 @@ app = typer.Typer(
 )
 
 
-def _say_version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> None:
     if wanted:
         typer.echo(f"hybridlio {__version__}")
         raise typer.Exit
@@ -37,16 +37,11 @@ def _say_version(wanted: bool) -> None:
 @app.callback()
 def main(
     _version: Annotated[
-        bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Print the version.")
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
-    _verbose: Annotated[
-        int,
-        typer.Option(
-            "-v", "--verbose", count=True, metavar=" ", callback=start_quietly, show_default=False, help="Log more."
-        ),
-    ] = 0,
+    _verbosity: Verbose = 0,
 ) -> None:
-    """Lidar-inertial odometry: from a drive to a trajectory with covariances, a pose graph and a report."""
+    """Lidar-inertial odometry: estimates a trajectory with covariances, a pose graph and a report from a recording."""
 
 
 for _command in (simulate, odometry, smooth, georeference, batch, compare, evaluate, train, ablate, config, view):

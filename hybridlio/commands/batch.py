@@ -9,7 +9,7 @@ import typer
 
 from hybridlio.commands import common
 from hybridlio.commands.common import guarded
-from hybridlio.commands.terminal import complain, progress, say, say_table
+from hybridlio.commands.terminal import print_message, print_result, print_table, progress
 from hybridlio.runs.engines import LOCAL
 
 if TYPE_CHECKING:
@@ -22,16 +22,15 @@ def batch(
         list[str],
         typer.Argument(
             metavar="DATA…",
-            help="Recordings: paths, patterns in quotes, or .yaml or .txt files that list them.",
+            help="Recordings: paths, quoted patterns, or .yaml or .txt files that list them.",
             show_default=False,
         ),
     ],
     out: Annotated[
-        Path, typer.Option("-o", "--out", metavar="DIR", help="The folder of the run folders.", show_default=False)
+        Path,
+        typer.Option("-o", "--out", metavar="DIR", help="The folder to write the run folders to.", show_default=False),
     ],
-    sequence: Annotated[
-        str | None, typer.Option("--sequence", metavar="A,B,…", help="Which recordings, where DATA holds several.")
-    ] = None,
+    sequence: common.SequenceNames = None,
     reader: common.ReaderName = None,
     raw_root: common.RawRoot = None,
     initial_pose: common.InitialPoseName = None,
@@ -41,46 +40,49 @@ def batch(
     frames: common.Frames = None,
     vertical_angle: common.VerticalAngle = None,
     jobs: Annotated[
-        int | None, typer.Option("-j", "--jobs", min=1, help="Recordings at a time; by default one for each core.")
+        int | None, typer.Option("-j", "--jobs", min=1, help="Number of parallel runs; default: one per core.")
     ] = None,
     threads: Annotated[
-        int | None, typer.Option(min=1, help="Of each run; by default an equal share of the cores, on a cluster 1.")
+        int | None,
+        typer.Option(min=1, help="Threads per run; default: the cores divided by --jobs, or 1 on a cluster."),
     ] = None,
     engine: Annotated[
-        str, typer.Option(metavar="NAME", help="loky: processes on this machine; dask or ray: a cluster's.")
+        str, typer.Option(metavar="NAME", help="loky: processes on this machine; dask or ray: a cluster.")
     ] = LOCAL,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Of the cluster, such as tcp://head:8786.")
+        str | None, typer.Option(metavar="ADDRESS", help="Address of the cluster, such as tcp://head:8786.")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Run again what is there already.")] = False,
-    _verbose: common.Verbose = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Run recordings again that have a run in -o.")] = False,
+    _verbosity: common.Verbose = 0,
 ) -> None:
-    """Run the odometry over many recordings, several at a time, each into a run folder below -o.
+    """Run the odometry on many recordings in parallel, each into a run folder below -o.
 
-    One that fails stops no other. The same command again runs only what is missing. DIR/batch.md sums up.
+    A recording that fails does not stop the others. The same command runs only what is missing. DIR/batch.md has the
+    results.
     """
-    from hybridlio.runs.batch import run_batch
+    from hybridlio.runs.batch import BatchOptions, run_batch
     from hybridlio.runs.recordings import find_recordings
 
-    settings = common.settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
+    settings = common.load_settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
     found = find_recordings(data, sequence, reader, raw_root, frames, vertical_angle)
-    with progress("batch", "recordings") as tick:
-        done = run_batch(
-            found, out, settings, jobs=jobs, threads=threads, engine=engine, scheduler=scheduler, overwrite=overwrite,
-            without_imu=initial_pose is None and config is None, progress=tick,
-        )  # fmt: skip
+    options = BatchOptions(
+        jobs=jobs, threads=threads, engine=engine, scheduler=scheduler, overwrite=overwrite,
+        adapt_config=initial_pose is None and config is None,
+    )  # fmt: skip
+    with progress("batch", "recordings") as report:
+        done = run_batch(found, out, settings, options, report)
     _finish(done)
 
 
 def _finish(done: Batch) -> None:
-    """Say what came of it, and end with the exit code that belongs to it."""
+    """Print the results, and exit with an error code if any recording failed."""
     from hybridlio.runs.batch_table import table
 
-    say_table(table(done))
-    say(f"written to {done.out / 'batch.md'} and {done.out / 'batch.json'}")
+    print_table(table(done))
+    print_result(f"wrote {done.out / 'batch.md'} and {done.out / 'batch.json'}")
     if done.stopped is not None:
-        complain("interrupted; the same command goes on with what is missing")
+        print_message("interrupted; the same command runs what is missing")
         raise typer.Exit(common.INTERRUPTED)
     if done.failed:
-        complain(f"error: {len(done.failed)} of {len(done.rows)} recordings failed; the table says why")
+        print_message(f"error: {len(done.failed)} of {len(done.rows)} recordings failed; the table has the reasons")
         raise typer.Exit(common.FAILED)

@@ -1,4 +1,4 @@
-"""What the commands share: options, and how errors and interrupts end."""
+"""What the commands share: common options, and the exit codes of errors and interrupts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn, ParamSpec
 
 import typer
 
-from hybridlio.commands.terminal import complain, set_up_logging
+from hybridlio.commands.terminal import print_message, set_up_logging
 from hybridlio.core.errors import ConfigError, DataError, HybridLioError
 from hybridlio.odometry.registry import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
 
@@ -23,24 +23,20 @@ if TYPE_CHECKING:
 
 _P = ParamSpec("_P")
 
-BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
-
-_verbosity = 0
-
-
-def start_quietly(count: int) -> int:
-    """Take ``-v`` before the command's name; called at each start."""
-    global _verbosity
-    _verbosity = 0
-    return be_verbose(count)
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes; 130 is the shell's for SIGINT (128 + 2)
+_VERBOSITY = "_verbosity"  # the parameter that every command has
 
 
-def be_verbose(count: int) -> int:
-    """Take ``-v`` after the command's name."""
-    global _verbosity
-    _verbosity = max(_verbosity, count)
-    set_up_logging(_verbosity)
-    return count
+class PartialResultError(Exception):
+    """Ends a command that wrote part of its result. The cause is printed; the exit code is ``FAILED``."""
+
+
+def set_verbosity(context: typer.Context, count: int) -> int:
+    """Set up logging for ``-v``, which may stand before and after the command's name; the larger count applies."""
+    before = 0 if context.parent is None else context.parent.params[_VERBOSITY]
+    verbosity = max(before, count)
+    set_up_logging(verbosity)
+    return verbosity
 
 
 Verbose = Annotated[
@@ -51,47 +47,60 @@ Verbose = Annotated[
         count=True,
         metavar=" ",
         show_default=False,
-        callback=be_verbose,
-        help="Log more; twice: everything, and tracebacks.",
+        callback=set_verbosity,
+        help="Print more log messages; -vv: all of them, and tracebacks.",
     ),
 ]
 Data = Annotated[
-    Path, typer.Argument(metavar="DATA", help="A recording: its folder, or one above it.", show_default=False)
+    Path, typer.Argument(metavar="DATA", help="A recording, or a folder that contains one.", show_default=False)
 ]
 SequenceName = Annotated[
-    str | None, typer.Option("--sequence", metavar="NAME", help="Which recording, where DATA holds several.")
+    str | None, typer.Option("--sequence", metavar="NAME", help="The recording to use if DATA contains several.")
+]
+SequenceNames = Annotated[
+    str | None, typer.Option("--sequence", metavar="A,B,…", help="The recordings to use if DATA contains several.")
 ]
 ReaderName = Annotated[
-    str | None, typer.Option("--reader", metavar="NAME", help="kitti-raw, kitti-odometry or folder; else guessed.")
+    str | None,
+    typer.Option(
+        "--reader", metavar="NAME", help="kitti-raw, kitti-odometry or folder; by default detected from the files."
+    ),
 ]
 RawRoot = Annotated[
     Path | None,
-    typer.Option("--raw-root", metavar="DIR", help="For KITTI odometry: KITTI's raw data, to take the IMU from."),
+    typer.Option("--raw-root", metavar="DIR", help="KITTI raw data that provide the IMU of KITTI odometry sequences."),
 ]
 VerticalAngle = Annotated[
     float | None,
     typer.Option(
         "--vertical-angle",
         metavar="DEG",
-        help="Raise points by this angle; by default 0.205 for KITTI's own, else 0.",
+        help="Correct the elevation of all points by this angle; default: 0.205 for recordings by KITTI, else 0.",
     ),
 ]
-Frames = Annotated[str | None, typer.Option("--frames", metavar="A:B", help="Only scans A to B-1, counted from 0.")]
+Frames = Annotated[str | None, typer.Option("--frames", metavar="A:B", help="Use scans A to B-1 only, counted from 0.")]
 InitialPoseName = Annotated[
-    str | None, typer.Option("--initial-pose", metavar="NAME", help=", ".join(INITIAL_POSE_SOURCES))
+    str | None,
+    typer.Option("--initial-pose", metavar="NAME", help=f"Source of initial poses: {', '.join(INITIAL_POSE_SOURCES)}."),
 ]
-ResidualName = Annotated[str | None, typer.Option("--residual", metavar="NAME", help=", ".join(RESIDUAL_SOURCES))]
-BackendName = Annotated[str | None, typer.Option("--backend", metavar="NAME", help=", ".join(BACKENDS))]
+ResidualName = Annotated[
+    str | None,
+    typer.Option("--residual", metavar="NAME", help=f"Source of residuals: {', '.join(RESIDUAL_SOURCES)}."),
+]
+BackendName = Annotated[
+    str | None, typer.Option("--backend", metavar="NAME", help=f"Factor graph: {', '.join(BACKENDS)}.")
+]
 ConfigFile = Annotated[
-    Path | None, typer.Option("--config", metavar="FILE", help="Settings, as `hybridlio config` prints them.")
+    Path | None, typer.Option("--config", metavar="FILE", help="Settings file, as printed by `hybridlio config`.")
 ]
 
 
 def guarded(command: Callable[_P, None]) -> Callable[_P, None]:
-    """The command with one line for each error, and the exit code that belongs to it."""
+    """Wrap a command so that an error is printed as one line and sets the exit code."""
 
     @functools.wraps(command)
     def run(*args: _P.args, **kwargs: _P.kwargs) -> None:
+        verbosity = kwargs.get(_VERBOSITY)
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, _interrupt)
         try:
@@ -99,37 +108,36 @@ def guarded(command: Callable[_P, None]) -> Callable[_P, None]:
         except (typer.Exit, typer.BadParameter):
             raise
         except BaseException as error:
-            fail(error)
+            _fail(error, verbosity if isinstance(verbosity, int) else 0)
 
     return run
 
 
-def fail(error: BaseException, code: int | None = None) -> NoReturn:
-    """Say what went wrong and exit: 2 for input that cannot be used, 1 for other failures, 130 when interrupted.
-
-    Args:
-        error: what was raised.
-        code: the exit code in place of 1 or 2.
-    """
-    if _verbosity > 1:
-        complain("".join(traceback.format_exception(error)), "dim")
+def _fail(error: BaseException, verbosity: int) -> NoReturn:
+    """Print an error and exit: 2 for input that cannot be used, 1 for other failures, 130 for an interrupt."""
+    is_partial = isinstance(error, PartialResultError)
+    if is_partial and error.__cause__ is not None:
+        error = error.__cause__
+    if verbosity > 1:
+        print_message("".join(traceback.format_exception(error)), "dim")
     if isinstance(error, KeyboardInterrupt):
-        complain("interrupted")
+        print_message("interrupted")
         raise typer.Exit(INTERRUPTED) from None
-    if isinstance(error, HybridLioError):
-        complain(f"error: {error}")
-        bad_input = isinstance(error, ConfigError | DataError)
-        raise typer.Exit(code or (BAD_INPUT if bad_input else FAILED)) from None
     if isinstance(error, SystemExit | GeneratorExit):
         raise error
-    if isinstance(error, OSError) and error.strerror:  # a full disk, missing rights: the system's, and not a fault
-        complain(f"error: {error.filename}: {error.strerror}" if error.filename else f"error: {error.strerror}")
-        raise typer.Exit(code or FAILED) from None
+    print_message(f"error: {_describe(error)}")
+    is_bad_input = isinstance(error, ConfigError | DataError) and not is_partial
+    raise typer.Exit(BAD_INPUT if is_bad_input else FAILED) from None
+
+
+def _describe(error: BaseException) -> str:
+    if isinstance(error, HybridLioError):
+        return str(error)
+    if isinstance(error, OSError) and error.strerror:  # the system refused, such as a full disk: not a bug
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     if isinstance(error, MemoryError):
-        complain("error: out of memory; give less at once, such as a part of the recording by --frames")
-        raise typer.Exit(code or FAILED) from None
-    complain(f"error: {type(error).__name__}: {error} (a fault in hybridlio; -vv shows where)")
-    raise typer.Exit(FAILED) from None
+        return "out of memory; process part of the recording with --frames"
+    return f"{type(error).__name__}: {error} (a bug in hybridlio; run again with -vv for the traceback)"
 
 
 def open_data(
@@ -140,24 +148,29 @@ def open_data(
     frames: str | None,
     vertical_angle_deg: float | None,
 ) -> Sequence:
-    """The recording that the options mean, or the asked-for part of it."""
+    """Open the recording that the options name, or the part of it in ``frames``."""
     from hybridlio.datasets.registry import open_sequence
     from hybridlio.datasets.sequence import frame_range, part_of
 
     if frames is not None:
-        frame_range(frames)  # a misspelt range is said before a large recording is looked through
+        frame_range(frames)  # report a malformed range before opening a large recording
     whole = open_sequence(
         data, sequence=sequence, reader=reader, raw_root=raw_root, vertical_angle_deg=vertical_angle_deg
     )
     return part_of(whole, frames)
 
 
-def settings(config: Path | None, **names: str | None) -> Config:
-    """The configuration in a file, or the default one, with the names given on the command line."""
+def load_settings(config: Path | None, **names: str | None) -> Config:
+    """Return the configuration in a file, or the default one, with the names given on the command line."""
     from hybridlio.odometry.config import Config, load_config
 
     settings = load_config(config) if config is not None else Config()
     return settings.model_copy(update={name: value for name, value in names.items() if value is not None})
+
+
+def split_names(text: str) -> tuple[str, ...]:
+    """Return the names in comma-separated text, without empty ones."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 def _interrupt(_signal: int, _frame: FrameType | None) -> None:

@@ -9,16 +9,19 @@ import typer
 
 from hybridlio.commands import common
 from hybridlio.commands.common import guarded
-from hybridlio.commands.terminal import complain, progress, say, say_table
+from hybridlio.commands.terminal import print_message, print_result, print_table, progress
 from hybridlio.core.errors import ConfigError
+from hybridlio.core.tables import counted
 from hybridlio.odometry.registry import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
 
 if TYPE_CHECKING:
     from hybridlio.runs.compare import Comparison
 
+_INITIAL_POSES, _RESIDUALS, _BACKENDS = tuple(INITIAL_POSE_SOURCES), tuple(RESIDUAL_SOURCES), tuple(BACKENDS)
 
-def _several(names: tuple[str, ...]) -> str:
-    return f"Some of {', '.join(names)}, with commas between; `all` for each."
+
+def _choice_help(names: tuple[str, ...]) -> str:
+    return f"One or more of {', '.join(names)}, separated by commas; or `all`."
 
 
 @guarded
@@ -28,66 +31,68 @@ def compare(
     reader: common.ReaderName = None,
     raw_root: common.RawRoot = None,
     initial_pose: Annotated[
-        str, typer.Option("--initial-pose", metavar="A,B,…", help=_several(tuple(INITIAL_POSE_SOURCES)))
+        str, typer.Option("--initial-pose", metavar="A,B,…", help=_choice_help(_INITIAL_POSES))
     ] = "all",
     residual: Annotated[
-        str | None, typer.Option(metavar="A,B,…", help=_several(tuple(RESIDUAL_SOURCES)), show_default=False)
+        str | None, typer.Option(metavar="A,B,…", help=_choice_help(_RESIDUALS), show_default=False)
     ] = None,
     backend: Annotated[
-        str | None, typer.Option(metavar="A,B,…", help=_several(tuple(BACKENDS)), show_default=False)
+        str | None, typer.Option(metavar="A,B,…", help=_choice_help(_BACKENDS), show_default=False)
     ] = None,
     config: common.ConfigFile = None,
     frames: common.Frames = None,
     vertical_angle: common.VerticalAngle = None,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Write compare.json and compare.md there.")
+        Path | None,
+        typer.Option("-o", "--out", metavar="DIR", help="Write compare.json and compare.md to this folder."),
     ] = None,
-    _verbose: common.Verbose = 0,
+    _verbosity: common.Verbose = 0,
 ) -> None:
-    """Run every combination of sources over the same scans, and show them side by side."""
+    """Run the odometry on the same scans with every combination of sources, and print a table of the results."""
     from hybridlio.core.files import make_folder
-    from hybridlio.runs.compare import combinations, table, write_comparison
-    from hybridlio.runs.compare import compare as run_all
+    from hybridlio.runs.compare import combinations, compare_configs, table, write_comparison
 
-    settings = common.settings(config)
+    settings = common.load_settings(config)
     configs = combinations(
-        _names(initial_pose, tuple(INITIAL_POSE_SOURCES), "--initial-pose"),
-        _names(residual or settings.residual, tuple(RESIDUAL_SOURCES), "--residual"),
-        _names(backend or settings.backend, tuple(BACKENDS), "--backend"),
+        _choices(initial_pose, _INITIAL_POSES, "--initial-pose"),
+        _choices(residual or settings.residual, _RESIDUALS, "--residual"),
+        _choices(backend or settings.backend, _BACKENDS, "--backend"),
         settings,
     )
     recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle)
     if out is not None:
-        make_folder(out)  # before the work
-    with progress("comparing") as tick:
-        comparison = run_all(recording, configs, lambda name, done, total: tick(done, total, name))
-    say_table(table(comparison))
+        make_folder(out)  # fail before the runs, not after them
+    with progress("comparing") as report:
+        comparison = compare_configs(recording, configs, report)
+    print_table(table(comparison))
     if out is not None:
         write_comparison(out, comparison)
-        say(f"written to {out / 'compare.md'} and {out / 'compare.json'}")
+        print_result(f"wrote {out / 'compare.md'} and {out / 'compare.json'}")
     _finish(comparison)
 
 
 def _finish(comparison: Comparison) -> None:
-    """Say why runs ended early, a reason that they share once, and exit with the code that belongs to it."""
+    """Print why runs ended early, each shared reason once, and exit with an error code if any did."""
     if comparison.stopped is not None:
-        common.fail(comparison.stopped)
+        raise comparison.stopped
     failed: dict[tuple[str, int], list[str]] = {}
     for row in comparison.rows:
         if row.error:
             failed.setdefault((row.error, row.scans), []).append(f"{row.initial_pose} + {row.residual}")
     for (error, scans), names in failed.items():
-        complain(f"error: {', '.join(names)} ended after {scans} scans: {error}")
+        print_message(f"error: {', '.join(names)} ended after {counted(scans, 'scan')}: {error}")
     if failed:
         raise typer.Exit(common.FAILED)
 
 
-def _names(text: str, known: tuple[str, ...], option: str) -> tuple[str, ...]:
-    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+def _choices(text: str, known: tuple[str, ...], option: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(common.split_names(text)))
     if names == ("all",):
         return known
     unknown = [name for name in names if name not in known]
     if unknown or not names:
-        what = f"unknown {unknown[0]!r}" if unknown else "no name"
-        raise ConfigError(f"{option} {text!r}: {what}; give some of {', '.join(known)}, with commas between, or all")
+        problem = f"unknown name {unknown[0]!r}" if unknown else "no name given"
+        raise ConfigError(
+            f"{option} {text!r}: {problem}; choose from {', '.join(known)}, separated by commas, or give all"
+        )
     return names

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from hybridlio.commands.common import Verbose, guarded
-from hybridlio.commands.terminal import say
+from hybridlio.commands.terminal import print_result
 
 
 @guarded
-def config(_verbose: Verbose = 0) -> None:
-    """Print all settings with their defaults as YAML: ``hybridlio config > my.yaml``, change, ``--config my.yaml``."""
+def config(_verbosity: Verbose = 0) -> None:
+    """Print all settings with their defaults as YAML.
+
+    Save them by `hybridlio config > my.yaml`, edit the file, and use it with --config my.yaml.
+    """
     from hybridlio.odometry.config import Config, config_to_yaml
 
-    say(config_to_yaml(Config()).rstrip())
+    print_result(config_to_yaml(Config()).rstrip())

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hybridlio.commands.common import Verbose, guarded
-from hybridlio.commands.terminal import complain, say, say_table
+from hybridlio.commands.terminal import print_result, print_table, print_warning
 from hybridlio.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
@@ -20,38 +20,40 @@ if TYPE_CHECKING:
 @guarded
 def evaluate(
     estimate: Annotated[
-        Path, typer.Argument(metavar="EST", help="A run folder, or a TUM or KITTI file.", show_default=False)
+        Path,
+        typer.Argument(metavar="EST", help="The estimate: a run folder, or a TUM or KITTI file.", show_default=False),
     ],
     reference: Annotated[
         Path | None,
         typer.Option(
             metavar="GT",
-            help="A TUM or KITTI file, a run folder, or a recording that has a reference; "
-            "without it the one that came with the run's recording.",
+            help="The ground truth: a TUM or KITTI file, a run folder, or a recording with a reference. "
+            "Default: the reference stored in the run folder.",
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print every figure as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print all metrics as JSON.")] = False,
     lengths: Annotated[
-        str | None, typer.Option(metavar="10,20,…", help="Drift over segments of these lengths (metres) too.")
+        str | None,
+        typer.Option(metavar="10,20,…", help="Also compute the drift over segments of these lengths in metres."),
     ] = None,
-    _verbose: Verbose = 0,
+    _verbosity: Verbose = 0,
 ) -> None:
-    """Judge a trajectory: KITTI's drift, ATE, RPE and, for a run folder, whether its covariances are true."""
-    from hybridlio.evaluation.evaluate import evaluate as judge
-    from hybridlio.evaluation.figures import evaluation_table
+    """Compare a trajectory with ground truth: KITTI drift, ATE, RPE and, for a run folder, covariance consistency."""
+    from hybridlio.evaluation.evaluate import evaluate as evaluate_trajectory
+    from hybridlio.evaluation.metrics_table import metrics_table
 
     true, estimated, steps = _load(estimate, reference)
-    result = judge(true, estimated, lengths_m=_numbers(lengths), steps=steps)
+    result = evaluate_trajectory(true, estimated, lengths_m=_parse_lengths(lengths), steps=steps)
     if as_json:
-        say(json.dumps(result.to_json_dict(), indent=2, ensure_ascii=False))
+        print_result(json.dumps(result.to_json_dict(), indent=2, ensure_ascii=False))
     else:
-        say_table(evaluation_table({estimate.name or str(estimate): result}))
+        print_table(metrics_table({estimate.name or str(estimate): result}))
     for warning in result.warnings:
-        complain(f"warning: {warning}", "yellow")
+        print_warning(warning)
 
 
 def _load(estimate: Path, reference: Path | None) -> tuple[Trajectory, Trajectory, Steps | None]:
-    """Reference, estimate, and the steps behind the estimate where it is a run folder."""
+    """Return the reference, the estimate and, for a run folder, the estimate's steps."""
     import numpy as np
 
     from hybridlio.core.trajectory_files import read_pair, read_trajectory
@@ -59,24 +61,24 @@ def _load(estimate: Path, reference: Path | None) -> tuple[Trajectory, Trajector
 
     if not estimate.is_dir():
         if reference is None:
-            raise ConfigError(f"give --reference: {estimate} is a file and says nothing of the truth")
+            raise ConfigError(f"{estimate} is a trajectory file without ground truth; give --reference")
         if reference.is_file():
             return (*read_pair(reference, estimate), None)
-        true = _reference(reference)
+        true = _load_reference(reference)
         return true, read_trajectory(estimate, true.stamps_ns), None
     run = read_run(estimate)
     if reference is None and run.reference is None:
-        raise DataError(f"{estimate}: the run's recording had no reference; give one with --reference")
+        raise DataError(f"{estimate}: the recording of this run has no reference; give one with --reference")
     if reference is None:
         return run.reference, run.trajectory, run.steps  # type: ignore[return-value]
     if reference.is_dir():
-        return _reference(reference), run.trajectory, run.steps
+        return _load_reference(reference), run.trajectory, run.steps
     stamps = np.concatenate([run.stamps_before, run.trajectory.stamps_ns])
     return read_trajectory(reference, stamps, run.T_camera_lidar), run.trajectory, run.steps
 
 
-def _reference(folder: Path) -> Trajectory:
-    """The poses of a run, or the reference of a recording."""
+def _load_reference(folder: Path) -> Trajectory:
+    """Return the estimate of a run folder, or the reference of a recording."""
     from hybridlio.datasets.registry import open_sequence
     from hybridlio.runs.folder import is_run_folder, read_run
 
@@ -84,11 +86,11 @@ def _reference(folder: Path) -> Trajectory:
         return read_run(folder).trajectory
     reference = open_sequence(folder).reference
     if reference is None:
-        raise DataError(f"{folder}: this recording has no reference")
+        raise DataError(f"{folder}: this recording has no reference; give another one with --reference")
     return reference
 
 
-def _numbers(text: str | None) -> tuple[float, ...] | None:
+def _parse_lengths(text: str | None) -> tuple[float, ...] | None:
     if text is None:
         return None
     try:
@@ -96,5 +98,5 @@ def _numbers(text: str | None) -> tuple[float, ...] | None:
     except ValueError:
         lengths = ()
     if not lengths or min(lengths) <= 0:
-        raise ConfigError(f"--lengths {text!r}: give lengths in metres, such as 10,20,50")
+        raise ConfigError(f"--lengths {text!r}: give positive lengths in metres, such as 10,20,50")
     return lengths

@@ -9,7 +9,7 @@ import typer
 
 from hybridlio.commands.common import Verbose, guarded
 from hybridlio.commands.gps_options import Antenna, MaxShift, gps_options
-from hybridlio.commands.terminal import complain, say
+from hybridlio.commands.terminal import print_result, print_warning
 from hybridlio.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
@@ -21,24 +21,26 @@ def georeference(
     run: Annotated[
         Path,
         typer.Argument(
-            metavar="RUN", help="A run folder that `hybridlio odometry` or `hybridlio smooth` made.", show_default=False
+            metavar="RUN",
+            help="A run folder written by `hybridlio odometry` or `hybridlio smooth`.",
+            show_default=False,
         ),
     ],
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Where to write; by default into RUN.")
+        Path | None, typer.Option("-o", "--out", metavar="DIR", help="The folder to write to; default RUN.")
     ] = None,
     origin: Annotated[
         str | None,
         typer.Option(
             metavar="LAT,LON,HEIGHT",
-            help="Where on Earth the fixes' local frame has its origin (degrees, metres), if they do not say.",
+            help="Origin of the fixes' local frame (degrees, metres), if the recording does not have it.",
         ),
     ] = None,
     antenna: Antenna = None,
     max_shift: MaxShift = None,
-    _verbose: Verbose = 0,
+    _verbosity: Verbose = 0,
 ) -> None:
-    """Place a run on its GPS fixes as a whole, without bending it, and write it as CSV, GeoJSON and TUM."""
+    """Align a run with its GPS fixes by one rigid motion; write it as CSV, GeoJSON and TUM."""
     from hybridlio.record.record import Record
     from hybridlio.runs.folder import RECORD, read_run
     from hybridlio.smoothing.georeference import georeference as place
@@ -47,23 +49,27 @@ def georeference(
     stored = read_run(run)
     path = next((p for p in (run / RECORD, run.parent / RECORD) if p.is_file()), None)
     if path is None:
-        raise DataError(f"{run}: neither it nor the folder above has {RECORD}, which holds the fixes")
+        raise DataError(f"{run}: no {RECORD}, which holds the GPS fixes, in this folder or the one above")
     record, options = Record.load(path), gps_options(antenna, max_shift)
     placed = place(
-        record, stored.trajectory, antenna_m=options.antenna_m, max_shift_s=options.max_shift_s, origin=_origin(origin)
+        record,
+        stored.trajectory,
+        antenna_m=options.antenna_m,
+        max_shift_s=options.max_shift_s,
+        origin=_parse_origin(origin),
     )
     fit = placed.alignment
-    say(
-        f"{stored.metrics['sequence']}: {int(fit.inliers.sum())} of {len(fit.used)} fixes agree, {fit.rmse_m:.2f} m "
-        f"RMSE, clocks {1e3 * fit.shift_s:.0f} ± {1e3 * fit.shift_sigma_s:.0f} ms apart"
+    print_result(
+        f"{stored.metrics['sequence']}: {int(fit.inliers.sum())} of {len(fit.used)} fixes are inliers, "
+        f"{fit.rmse_m:.2f} m RMSE, clock offset {1e3 * fit.shift_s:.0f} ± {1e3 * fit.shift_sigma_s:.0f} ms"
     )
     for written in write_georeferenced(run if out is None else out, placed):
-        say(f"wrote   {written}")
+        print_result(f"wrote   {written}")
     if placed.origin is None:
-        complain("warning: the fixes do not say where on Earth they are; give --origin for latitudes", "yellow")
+        print_warning("the fixes have no geodetic origin; give --origin to get latitudes and longitudes")
 
 
-def _origin(text: str | None) -> GeodeticPoint | None:
+def _parse_origin(text: str | None) -> GeodeticPoint | None:
     from hybridlio.core.geodesy import check_geodetic
 
     if text is None:

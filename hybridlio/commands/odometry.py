@@ -8,14 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hybridlio.commands import common
-from hybridlio.commands.common import FAILED, guarded
-from hybridlio.commands.terminal import complain, progress, say, say_table
+from hybridlio.commands.common import PartialResultError, guarded
+from hybridlio.commands.terminal import print_message, print_result, print_table, print_warning, progress
 from hybridlio.core.tables import counted
 
 if TYPE_CHECKING:
     from hybridlio.evaluation.report_data import Findings
     from hybridlio.odometry.config import Config
     from hybridlio.runs.run import Run
+
+_SCANS_LISTED = 20  # fits on two lines of a terminal
 
 
 @guarded
@@ -32,75 +34,76 @@ def odometry(
     vertical_angle: common.VerticalAngle = None,
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--out", metavar="RUN", help="The run folder; by default runs/<sequence>-<date-time>."),
+        typer.Option("-o", "--out", metavar="RUN", help="The run folder; default runs/<sequence>-<date-time>."),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run that is in -o.")] = False,
-    _verbose: common.Verbose = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing run in -o.")] = False,
+    _verbosity: common.Verbose = 0,
 ) -> None:
-    """Estimate a recording's trajectory and leave it, with covariances, graph, metrics and report, in a run folder.
+    """Estimate the trajectory of a recording; write poses, covariances, graph, metrics and report to a run folder.
 
-    Without -o, runs/latest is a link to the newest. Ctrl-C keeps what was estimated so far.
+    Without -o, runs/latest links to the newest run. Ctrl-C stops the run and writes what is estimated by then.
     """
     from hybridlio.odometry.odometry import Odometry
     from hybridlio.runs.folder import new_run_folder
-    from hybridlio.runs.run import run_odometry, suited_to
+    from hybridlio.runs.run import adapt_config, run_odometry
 
-    chosen = common.settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
-    estimator = Odometry(config=chosen)  # wrong names fail before the recording is opened
+    chosen = common.load_settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
+    estimator = Odometry(config=chosen)  # report unknown names before the recording is opened
     recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle)
-    suited = suited_to(recording, chosen, as_asked=initial_pose is not None or config is not None)
-    if suited != chosen:
-        chosen, estimator = suited, Odometry(config=suited)
+    adapted = adapt_config(recording, chosen, is_explicit=initial_pose is not None or config is not None)
+    if adapted != chosen:
+        chosen, estimator = adapted, Odometry(config=adapted)
     folder = new_run_folder(recording.name, out, overwrite)
-    with progress("odometry") as tick:
-        run = run_odometry(recording, estimator, lambda done, total, metres: tick(done, total, f"{metres:.1f} m"))
+    with progress("odometry") as report:
+        run = run_odometry(recording, estimator, report)
     _finish(folder, run, chosen, is_latest=out is None)
 
 
 def _finish(folder: Path, run: Run, config: Config, is_latest: bool) -> None:
-    """Write the run and say what came of it; an interrupted or failed one ends with its exit code."""
-    from hybridlio.runs.folder import point_latest_at
+    """Write the run and print its result; exit with an error code where it was stopped."""
+    from hybridlio.runs.folder import link_latest
     from hybridlio.runs.write import write_run
 
-    if run.stopped is not None and len(run.estimates) < 2:  # the first pose is the origin: nothing is known yet
+    if run.stopped is not None and len(run.estimates) < 2:  # the first pose is the origin, so nothing is estimated
         _remove_if_empty(folder)
-        common.fail(run.stopped)
+        raise run.stopped
     if isinstance(run.stopped, KeyboardInterrupt):
-        complain("interrupted: writing what was estimated so far (again to give it up)", "yellow")
+        print_message("interrupted: writing the estimates so far; interrupt again to discard them", "yellow")
     findings = write_run(folder, run, config)
     if is_latest:
-        point_latest_at(folder)
-    _say_result(folder, run, findings)
+        link_latest(folder)
+    _print_result(folder, run, findings)
     if run.stopped is None:
         return
-    complain(f"kept {run.done} of {len(run.sequence)} scans in {folder}", "yellow")
+    print_message(f"wrote {run.done} of {len(run.sequence)} scans to {folder}", "yellow")
     if isinstance(run.stopped, KeyboardInterrupt):
         raise typer.Exit(common.INTERRUPTED)
-    common.fail(run.stopped, FAILED)
+    raise PartialResultError from run.stopped
 
 
-def _say_result(folder: Path, run: Run, findings: Findings) -> None:
-    from hybridlio.evaluation.figures import evaluation_table
+def _print_result(folder: Path, run: Run, findings: Findings) -> None:
+    from hybridlio.evaluation.metrics_table import metrics_table
     from hybridlio.runs.folder import POSES, REPORT
-    from hybridlio.runs.write import disagreements, forward_speed_length_m, imu_path_length_m, ms_per_scan
+    from hybridlio.runs.write import forward_speed_length_m, imu_conflicts, imu_path_length_m, ms_per_scan
 
-    metres, ms = run.trajectory.length_m, ms_per_scan(run).get("total")
-    speed = "" if ms is None else f", {ms:.0f} ms a scan without reading (median)"
-    say(f"{run.sequence.name}: {counted(run.done, 'scan')}, {metres:.2f} m in {run.seconds:.1f} s{speed}")
+    median_ms = ms_per_scan(run).get("total")
+    speed = "" if median_ms is None else f", {median_ms:.0f} ms per scan without reading (median)"
+    length = f"{run.trajectory.length_m:.2f} m"
+    print_result(f"{run.sequence.name}: {counted(run.done, 'scan')}, {length} in {run.seconds:.1f} s{speed}")
     if (driven := forward_speed_length_m(run)) is not None:
-        say(
-            f"by its own forward speed the vehicle drove {driven:.2f} m, by the estimate {imu_path_length_m(run):.2f} m"
-        )
+        print_result(f"path length of the IMU: estimate {imu_path_length_m(run):.2f} m, forward speed {driven:.2f} m")
     if run.bridged:
-        say(f"bridged scans: {', '.join(map(str, run.bridged[:20]))}{' …' if len(run.bridged) > 20 else ''}")
-    for line in disagreements(run):
-        say(line)
+        listed = ", ".join(map(str, run.bridged[:_SCANS_LISTED]))
+        more = ", …" if len(run.bridged) > _SCANS_LISTED else ""
+        print_result(f"{counted(len(run.bridged), 'scan')} bridged by the initial pose: {listed}{more}")
+    for line in imu_conflicts(run):
+        print_result(line)
     for warning in (warning for e in findings.evaluations.values() for warning in e.warnings):
-        complain(f"warning: {warning}", "yellow")
+        print_warning(warning)
     if findings.evaluations:
-        say_table(evaluation_table(findings.evaluations))
-    say(f"poses   {folder / POSES}")
-    say(f"report  {folder / REPORT}")
+        print_table(metrics_table(findings.evaluations))
+    print_result(f"poses   {folder / POSES}")
+    print_result(f"report  {folder / REPORT}")
 
 
 def _remove_if_empty(folder: Path) -> None:

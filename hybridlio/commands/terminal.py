@@ -1,4 +1,4 @@
-"""What the commands print: results on stdout; progress, warnings and errors on stderr."""
+"""Terminal output of the commands: results on stdout; progress, warnings and errors on stderr."""
 
 from __future__ import annotations
 
@@ -7,45 +7,42 @@ import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Protocol
 
 from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
+from hybridlio.core.progress import Progress
 
-class Tick(Protocol):
-    """Says how far a loop is."""
-
-    def __call__(self, done: int, total: int, detail: str = "") -> None:
-        """Say that ``done`` of ``total`` is done, and a word on it."""
-        ...
+_LINE_INTERVAL_S = 1.0  # keeps the log of a short run to a few lines
+_WIDEST_TABLE = 240  # columns; more than any table here needs
 
 
-_LINES_APART_S = 1.0
-_WIDE = 240
-
-
-def say(text: str) -> None:
-    """Print a line of results, as it is."""
+def print_result(text: str) -> None:
+    """Print a line to stdout without wrapping or markup."""
     Console().print(text, markup=False, highlight=False, soft_wrap=True)
 
 
-def say_table(table: Table) -> None:
-    """Print a table at the width that it needs, also where that is more than the terminal has."""
-    console, wide = Console(), Console(width=_WIDE)
+def print_table(table: Table) -> None:
+    """Print a table to stdout at its full width, even where the terminal is narrower."""
+    console, wide = Console(), Console(width=_WIDEST_TABLE)
     needed = Measurement.get(wide, wide.options, table).maximum
     (console if needed <= console.width else Console(width=needed)).print(table)
 
 
-def complain(text: str, style: str = "red") -> None:
-    """Print a line of trouble to stderr."""
+def print_message(text: str, style: str = "red") -> None:
+    """Print a line to stderr; red, as an error, unless ``style`` is given."""
     _stderr().print(Text(text, style=style), soft_wrap=True)
 
 
+def print_warning(text: str) -> None:
+    """Print ``warning: …`` to stderr."""
+    print_message(f"warning: {text}", "yellow")
+
+
 def set_up_logging(verbosity: int) -> None:
-    """Show the library's log: warnings, with 1 also what it does, with 2 everything and where it comes from."""
+    """Print the library's log to stderr: warnings; from 1 on also information; from 2 on also debugging output."""
     logger = logging.getLogger("hybridlio")
     for handler in [h for h in logger.handlers if isinstance(h, _Handler)]:
         logger.removeHandler(handler)
@@ -56,32 +53,37 @@ def set_up_logging(verbosity: int) -> None:
 
 
 class _Handler(logging.Handler):
-    """Lines such as ``warning: …``, above a progress bar where one runs."""
+    """Print records as ``warning: …``, above a progress bar if one is shown."""
 
     def __init__(self, verbosity: int) -> None:
         super().__init__()
         self._verbosity = verbosity
 
     def emit(self, record: logging.LogRecord) -> None:
-        where = f" ({record.name})" if self._verbosity > 1 else ""
+        logger_name = f" ({record.name})" if self._verbosity > 1 else ""
         style = {logging.WARNING: "yellow", logging.ERROR: "red"}.get(record.levelno, "dim")
-        complain(f"{record.levelname.lower()}: {record.getMessage()}{where}", style)
+        print_message(f"{record.levelname.lower()}: {record.getMessage()}{logger_name}", style)
 
 
 @contextmanager
-def progress(what: str, unit: str = "scans") -> Iterator[Tick]:
-    """Show how far a loop is: a bar on a terminal, else a line every tenth, a second apart at least.
+def progress(task: str, unit: str = "scans") -> Iterator[Progress]:
+    """Show the progress of a loop: a bar on a terminal, otherwise a line after every tenth of the work.
+
+    Args:
+        task: what the loop does.
+        unit: what it counts.
 
     Yields:
-        A function to call with what is done, what there is in all, and a word on it, such as the distance.
+        The callback to report progress to.
     """
-    with (_bar if _stderr().is_terminal else _lines)(what, unit) as tick:
-        yield tick
+    with (_bar if _stderr().is_terminal else _lines)(task, unit) as report:
+        yield report
 
 
 @contextmanager
-def _bar(what: str, unit: str) -> Iterator[Tick]:
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+def _bar(task: str, unit: str) -> Iterator[Progress]:
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as ProgressBar
 
     columns = (
         TextColumn("{task.description}"),
@@ -89,57 +91,63 @@ def _bar(what: str, unit: str) -> Iterator[Tick]:
         MofNCompleteColumn(),
         TextColumn("{task.fields[rate]}"),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[detail]}"),
+        TextColumn("{task.fields[stage]}"),
     )
-    pace = _Pace(unit)
-    with Progress(*columns, console=_stderr()) as bar:
-        task = bar.add_task(what, total=None, rate="", detail="")
+    rate = _Rate(unit)
+    with ProgressBar(*columns, console=_stderr()) as bar:
+        row = bar.add_task(task, total=None, rate="", stage="")
 
-        def tick(done: int, total: int, detail: str = "") -> None:
-            bar.update(task, completed=done, total=total, rate=pace.text(done), detail=detail)
+        def report(stage: str, done: int, total: int) -> None:
+            rate.update(done)
+            bar.update(row, completed=done, total=total, rate=str(rate), stage=stage)
 
-        yield tick
+        yield report
 
 
 @contextmanager
-def _lines(what: str, unit: str) -> Iterator[Tick]:
-    pace, shown, last_s = _Pace(unit), 0, 0.0
+def _lines(task: str, unit: str) -> Iterator[Progress]:
+    rate, printed_tenth, printed_s = _Rate(unit), 0, 0.0
 
-    def tick(done: int, total: int, detail: str = "") -> None:
-        nonlocal shown, last_s
-        rate, tenth, spent_s = pace.text(done), 10 * done // max(total, 1), pace.spent_s
-        if (tenth > shown and spent_s > last_s + _LINES_APART_S) or (done == total > 0 and shown < 10):
-            shown, last_s = tenth, spent_s
-            left = pace.seconds_for(total - done)
-            words = [f"{done}/{total} {unit} ({100 * done // total} %)", rate, f"{left:.0f} s left"]
-            complain(f"{what}: {', '.join([*words, *([detail] if detail else [])])}", "none")
+    def report(stage: str, done: int, total: int) -> None:
+        nonlocal printed_tenth, printed_s
+        rate.update(done)
+        tenth, elapsed_s = 10 * done // max(total, 1), rate.elapsed_s
+        is_due = tenth > printed_tenth and elapsed_s > printed_s + _LINE_INTERVAL_S
+        is_last = done == total > 0 and printed_tenth < 10
+        if is_due or is_last:
+            printed_tenth, printed_s = tenth, elapsed_s
+            words = [f"{done}/{total} {unit} ({100 * done // total} %)", str(rate)]
+            words += [f"{rate.seconds_for(total - done):.0f} s left", *([stage] if stage else [])]
+            print_message(f"{task}: {', '.join(words)}", "none")
 
-    yield tick
+    yield report
 
 
-class _Pace:
-    """How quickly a loop goes. One that goes on where an earlier one stopped is not credited with what that did."""
+class _Rate:
+    """Units of work per second, counted from the first report: work that was resumed does not count as fast."""
 
     def __init__(self, unit: str) -> None:
-        self._unit, self._start = unit, time.perf_counter()
-        self._before: int | None = None
+        self._unit, self._start_s = unit, time.perf_counter()
+        self._done_before: int | None = None
         self._per_s = 0.0
 
-    @property
-    def spent_s(self) -> float:
-        return max(time.perf_counter() - self._start, 1e-9)
-
-    def text(self, done: int) -> str:
-        if self._before is None:
-            self._before = max(done - 1, 0)
-        self._per_s = (done - self._before) / self.spent_s
+    def __str__(self) -> str:
         return f"{self._per_s:.1f} {self._unit}/s"
 
-    def seconds_for(self, more: int) -> float:
-        return more / max(self._per_s, 1e-9)
+    @property
+    def elapsed_s(self) -> float:
+        return max(time.perf_counter() - self._start_s, 1e-9)
+
+    def update(self, done: int) -> None:
+        if self._done_before is None:
+            self._done_before = max(done - 1, 0)
+        self._per_s = (done - self._done_before) / self.elapsed_s
+
+    def seconds_for(self, units: int) -> float:
+        return units / max(self._per_s, 1e-9)
 
 
 @functools.cache
 def _stderr() -> Console:
-    """One console for all, so that lines and bars do not write over each other; it finds stderr anew each time."""
+    """Return the one console for stderr, which keeps bars and lines apart; it looks stderr up at each print."""
     return Console(stderr=True)

@@ -13,8 +13,9 @@ import typer
 
 from hybridlio.commands import common
 from hybridlio.commands.common import INTERRUPTED, guarded
-from hybridlio.commands.terminal import Tick, complain, progress, say
+from hybridlio.commands.terminal import print_message, print_result, progress
 from hybridlio.core.errors import ConfigError
+from hybridlio.core.progress import Progress
 from hybridlio.odometry.registry import INITIAL_POSE_SOURCES
 
 if TYPE_CHECKING:
@@ -25,45 +26,48 @@ if TYPE_CHECKING:
     from hybridlio.learned.training.validation import Validation
 
 Recordings = Annotated[
-    list[Path], typer.Argument(metavar="DATA…", help="Recordings, folders of them, or shards.", show_default=False)
+    list[Path],
+    typer.Argument(metavar="DATA…", help="Recordings, folders of recordings, or shards.", show_default=False),
 ]
 Preset = Annotated[
     str | None,
     typer.Option(
-        metavar="NAME", help="default, paper, cho, nubert or another row of the paper's; default unless --init-from."
+        metavar="NAME",
+        help="default, paper, cho, nubert or another row of the paper's tables; default unless --init-from is given.",
     ),
 ]
 RecipeFile = Annotated[
-    Path | None, typer.Option("--config", metavar="FILE", help="Changes to it: network, loss, optimiser, as YAML.")
+    Path | None,
+    typer.Option("--config", metavar="FILE", help="YAML file that changes the preset's network, loss or optimiser."),
 ]
 InitFrom = Annotated[
-    str | None, typer.Option("--init-from", metavar="FILE", help="Weights to go on from, or `shipped`.")
+    str | None,
+    typer.Option("--init-from", metavar="FILE", help="Weights to start from, or `shipped` for those of hybridlio."),
 ]
 InitialPose = Annotated[
     str | None,
     typer.Option(
         "--initial-pose",
         metavar="NAME",
-        help=f"{', '.join(INITIAL_POSE_SOURCES)}: where the network's initial poses come from.",
+        help=f"Source of the network's initial poses: {', '.join(INITIAL_POSE_SOURCES)}.",
     ),
 ]
 Validate = Annotated[
-    list[Path] | None, typer.Option("--validate", metavar="DATA", help="Measure on this as it goes; may be repeated.")
+    list[Path] | None,
+    typer.Option("--validate", metavar="DATA", help="A recording to validate on during training; may be repeated."),
 ]
-Split = Annotated[str | None, typer.Option(metavar="NAME", help="Of KITTI odometry: easy or hard. Validates, too.")]
-Sequences = Annotated[
-    str | None, typer.Option("--sequence", metavar="A,B,…", help="Which recordings, where DATA holds several.")
+Split = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="Split of KITTI odometry, easy or hard; validates on its test sequences."),
 ]
 Out = Annotated[
-    Path | None, typer.Option("-o", "--out", metavar="DIR", help="The run's folder; by default training/<preset>.")
+    Path | None, typer.Option("-o", "--out", metavar="DIR", help="The run's folder; default training/<preset>.")
 ]
-Cache = Annotated[
-    Path | None, typer.Option(metavar="DIR", help="Where prepared recordings are kept; by default in -o.")
-]
+Cache = Annotated[Path | None, typer.Option(metavar="DIR", help="The folder for prepared recordings; default: in -o.")]
 Epochs = Annotated[int | None, typer.Option(min=1, help="Passes over the data.")]
-Steps = Annotated[int | None, typer.Option(min=1, help="Steps in all, in place of --epochs.")]
-Device = Annotated[str, typer.Option(metavar="NAME", help="cpu, cuda, …; auto is a GPU where there is one.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Start anew in a folder that holds a run.")]
+Steps = Annotated[int | None, typer.Option(min=1, help="Optimiser steps in all; replaces --epochs.")]
+Device = Annotated[str, typer.Option(metavar="NAME", help="cpu, cuda, …; auto uses a GPU if there is one.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Delete an existing run in -o and start again.")]
 
 
 @guarded
@@ -75,7 +79,7 @@ def train(
     initial_pose: InitialPose = None,
     validate: Validate = None,
     split: Split = None,
-    sequence: Sequences = None,
+    sequence: common.SequenceNames = None,
     reader: common.ReaderName = None,
     raw_root: common.RawRoot = None,
     out: Out = None,
@@ -84,32 +88,32 @@ def train(
     steps: Steps = None,
     device: Device = "auto",
     overwrite: Overwrite = False,
-    _verbose: common.Verbose = 0,
+    _verbosity: common.Verbose = 0,
 ) -> None:
-    """Train the network, or adapt trained weights, without labels; under torchrun in as many processes as it starts.
+    """Train the network, or adapt trained weights, without labels. Start it by torchrun to use several processes.
 
-    An interrupted run goes on where its last checkpoint was when the same command is given again.
+    The same command resumes an interrupted run from its last checkpoint.
     """
     from hybridlio.learned.networks.devices import pick_device
     from hybridlio.learned.networks.weights import load_weights, weights_path
-    from hybridlio.runs.recipes import origin, recipe_for
+    from hybridlio.runs.recipes import choose_recipe, for_steps
     from hybridlio.runs.training_data import DataOptions, training_pairs
 
     pick_device(device)
     if steps is not None and epochs is not None:
-        raise ConfigError("--steps and --epochs both say how long to train; give one")
+        raise ConfigError("--steps and --epochs both set the length of the training; give one of them")
     start = load_weights(weights_path(init_from)) if init_from is not None else None
-    recipe = recipe_for(preset, start.recipe if start else None, config, initial_pose, epochs)
+    recipe = choose_recipe(preset, start.recipe if start else None, config, initial_pose, epochs)
     folder = out or Path("training") / recipe.name
-    if overwrite and leads():
-        clear(folder)
-    options = DataOptions(cache or folder / "shards", initial_pose, names(sequence), reader, raw_root)
-    with shown("preparing", "scans") as tick:
-        pairs, tests = training_pairs(
-            data, validate, split, recipe, options, lambda name, done, total: tick(done, total, name)
-        )
-    about = {"init_from": origin(init_from or "", start)} if start is not None else {}
-    _run(recipe, pairs, tests, folder, start, about, device, steps)
+    if overwrite and is_first_process():
+        _clear(folder)
+    names = None if sequence is None else common.split_names(sequence)
+    options = DataOptions(cache or folder / "shards", initial_pose, names, reader, raw_root)
+    with first_process_progress("preparing", "scans") as report:
+        pairs, tests = training_pairs(data, validate, split, recipe, options, report)
+    if steps is not None:
+        recipe = for_steps(recipe, steps, len(pairs))
+    _run(recipe, pairs, tests, folder, (init_from, start), device, steps)
 
 
 def _run(
@@ -117,54 +121,48 @@ def _run(
     pairs: Pairs,
     tests: Pairs | None,
     folder: Path,
-    start: Weights | None,
-    about: dict[str, str],
+    init_from: tuple[str | None, Weights | None],
     device: str,
     steps: int | None,
 ) -> None:
     from hybridlio.learned.training.train import WEIGHTS, RunOptions, Watchers
     from hybridlio.learned.training.train import train as run
-    from hybridlio.runs.recipes import lasting
+    from hybridlio.runs.recipes import describe_origin
 
-    if steps is not None:
-        recipe = lasting(recipe, steps, len(pairs))
+    name, start = init_from
+    about = {} if start is None else {"init_from": describe_origin(name or "", start)}
     options = RunOptions(device=None if device == "auto" else device, max_steps=steps, about=about)
     tensors = None if start is None else start.fitting(recipe.network)
-    if leads():
-        say(f"{recipe.name}: {len(pairs)} pairs of {len(pairs.shards)} recordings, in {folder}")
+    if is_first_process():
+        print_result(f"{recipe.name}: {len(pairs)} pairs of {len(pairs.shards)} recordings, in {folder}")
     try:
-        with shown("training", "steps") as tick:
-            watchers = Watchers(lambda p: tick(p.step, p.steps, _where(p)), _say_validation)
+        with first_process_progress("training", "steps") as report:
+            watchers = Watchers(lambda p: report(_describe(p), p.step, p.steps), _print_validation)
             run(recipe, pairs, folder, tests, tensors, options, watchers)
     except KeyboardInterrupt:
-        complain("interrupted; the same command goes on where this one stopped")
+        print_message("interrupted; the same command resumes")
         raise typer.Exit(INTERRUPTED) from None
-    if leads():
-        say(f"weights  {folder / WEIGHTS}")
+    if is_first_process():
+        print_result(f"weights  {folder / WEIGHTS}")
 
 
-def names(text: str | None) -> tuple[str, ...] | None:
-    """Names with commas between, as a tuple."""
-    return tuple(name.strip() for name in text.split(",") if name.strip()) if text is not None else None
-
-
-def leads() -> bool:
-    """Whether this process, of those that torchrun may have started, is the one that prints."""
+def is_first_process() -> bool:
+    """Return whether this is the process that prints, of those that torchrun started."""
     return os.environ.get("RANK", "0") == "0"
 
 
 @contextmanager
-def shown(what: str, unit: str) -> Iterator[Tick]:
-    """Progress in the first process, none in others."""
-    if not leads():
-        yield lambda _done, _total, _detail="": None
+def first_process_progress(task: str, unit: str) -> Iterator[Progress]:
+    """Show progress in the first process, and nothing in the others."""
+    if not is_first_process():
+        yield lambda _stage, _done, _total: None
         return
-    with progress(what, unit) as tick:
-        yield tick
+    with progress(task, unit) as report:
+        yield report
 
 
-def clear(folder: Path) -> None:
-    """Delete what a training run leaves, and nothing else."""
+def _clear(folder: Path) -> None:
+    """Delete the files of a training run, and nothing else."""
     from hybridlio.learned.training.train import BEST, CHECKPOINT, WEIGHTS
 
     for name in (CHECKPOINT, WEIGHTS, BEST, "recipe.json", "log.jsonl"):
@@ -172,14 +170,14 @@ def clear(folder: Path) -> None:
     shutil.rmtree(folder / "tensorboard", ignore_errors=True)
 
 
-def _where(p: TrainingProgress) -> str:
+def _describe(p: TrainingProgress) -> str:
     return f"epoch {p.epoch + 1}, loss {p.loss:.4g}, {1e3 * p.po2pl_m:.1f} mm to planes, {p.pairs_per_s:.1f} pairs/s"
 
 
-def _say_validation(step: int, found: Validation) -> None:
+def _print_validation(step: int, found: Validation) -> None:
     words = [f"step {step}: validation loss {found.loss:.4g}"]
     if found.translation_rms_m is not None and found.rotation_rms_deg is not None:
-        words.append(f"left {1e3 * found.translation_rms_m:.1f} mm, {found.rotation_rms_deg:.3f}°")
+        words.append(f"RMS error {1e3 * found.translation_rms_m:.1f} mm, {found.rotation_rms_deg:.3f}°")
     if found.t_rel_percent is not None:
         words.append(f"t_rel {found.t_rel_percent:.3f} %, r_rel {found.r_rel_deg_per_100m:.3f} °/100 m")
-    complain(", ".join(words), "none")
+    print_message(", ".join(words), "none")

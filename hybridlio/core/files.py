@@ -33,19 +33,31 @@ def make_folder(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
-    """Keep other processes that ask the same from a folder, which is made; waits for one that is in it.
+def locked(lock_file: Path, wait: bool = True) -> Iterator[bool]:
+    """Hold an exclusive lock between processes for the length of the block.
+
+    Args:
+        lock_file: created with its folder where missing; it stays.
+        wait: wait for another process that holds the lock; otherwise return at once.
+
+    Yields:
+        Whether the lock is held; always True with ``wait``.
 
     Raises:
-        DataError: the folder cannot be made.
+        DataError: the file cannot be created.
     """
-    make_folder(folder)
-    handle = os.open(folder, os.O_RDONLY)
+    make_folder(lock_file.parent)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(handle)
+        file = lock_file.open("w")
+    except OSError as error:
+        raise DataError(f"cannot create the lock file {lock_file}: {error.strerror}; choose another folder") from None
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            yield False
+            return
+        yield True
 
 
 @contextlib.contextmanager

@@ -16,13 +16,13 @@ from hybridlio.core.version import __version__
 from hybridlio.evaluation.consistency import Anees
 from hybridlio.evaluation.drift import Drift
 from hybridlio.evaluation.evaluate import Evaluation
-from hybridlio.evaluation.figures import figures
-from hybridlio.evaluation.report_data import DrawnPath, Findings, ReportData, find
+from hybridlio.evaluation.metrics_table import format_metrics, metric_rows
+from hybridlio.evaluation.report_data import DrawnPath, Findings, ReportData, analyse
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Findings", "ReportData", "draw", "find", "pictures", "write_report"]
+__all__ = ["Findings", "ReportData", "analyse", "draw", "pictures", "write_report"]
 
 _PACKAGES = ("numpy", "scipy", "gtsam", "small_gicp", "open3d", "torch", "filterpy")
 _FRAMES_LISTED = 200
@@ -47,7 +47,7 @@ def write_report(
     """
     import jinja2
 
-    findings = find(data) if findings is None else findings
+    findings = analyse(data) if findings is None else findings
     drawn = draw(data, findings) if drawn is None else drawn
     text = resources.files("hybridlio.evaluation").joinpath("report.html.jinja").read_text(encoding="utf-8")
     environment = jinja2.Environment(
@@ -145,9 +145,7 @@ def _tiles(data: ReportData, findings: Findings) -> list[tuple[str, str, str]]:
 
 
 def _figure_rows(findings: Findings) -> list[tuple[str, list[str]]]:
-    columns = [figures(e) for e in findings.evaluations.values()]
-    headings = dict.fromkeys(heading for column in columns for heading in column)
-    return [(heading, [column.get(heading, "–") for column in columns]) for heading in headings]
+    return metric_rows(format_metrics(e) for e in findings.evaluations.values())
 
 
 def _drift(evaluation: Evaluation) -> Drift:

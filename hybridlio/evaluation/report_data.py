@@ -126,7 +126,7 @@ class Findings:
     notes: list[str]
 
 
-def find(data: ReportData) -> Findings:
+def analyse(data: ReportData) -> Findings:
     """Evaluate what can be evaluated; what cannot is noted, not raised."""
     notes: list[str] = []
     steps = None

@@ -1,1 +1,1 @@
-"""Whole recordings: run one, write its folder, compare, batch, prepare training data."""
+"""Runs over whole recordings: run one, write its folder, compare settings, run batches, prepare training data."""

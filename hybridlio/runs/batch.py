@@ -1,6 +1,6 @@
-"""Many recordings: each run in a process of its own, on one machine or a cluster, into a run folder of its own.
+"""Run many recordings, each in its own process on this machine or a cluster, and into its own run folder.
 
-A recording that fails leaves its reason and stops no other; what is complete is not done again.
+A recording that fails does not stop the others; complete runs are kept.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import logging
 import threading
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
 from collections.abc import Sequence as Items
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -17,40 +17,59 @@ from typing import Any
 
 from hybridlio.core.errors import ConfigError, DataError, HybridLioError
 from hybridlio.core.files import make_folder, write_whole
+from hybridlio.core.progress import Progress
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.registry import check_implementations, check_names
 from hybridlio.runs import engines
 from hybridlio.runs import folder as run_folder
-from hybridlio.runs.batch_table import DONE, DONE_BEFORE, FAILED, NOT_RUN, Batch, BatchRow, figures_of, write_batch
+from hybridlio.runs.batch_table import DONE, DONE_BEFORE, FAILED, NOT_RUN, Batch, BatchRow, summary_metrics, write_batch
 from hybridlio.runs.recordings import Recording
-
-Progress = Callable[[int, int, str], None]
 
 JOB, LOG = "batch_job.json", "run.log"
 _log = logging.getLogger("hybridlio")
 
 
 @dataclass(frozen=True)
-class Job:
-    """One recording's run, for a process that knows nothing else.
+class BatchOptions:
+    """How a batch runs.
 
     Attributes:
-        recording: what to run.
-        folder: the run folder.
+        jobs: number of parallel runs; None for one per core, or for all that the cluster has.
+        threads: threads of each run; None for the cores divided by ``jobs``, or for one on a cluster.
+        engine, scheduler: see :func:`hybridlio.runs.engines.engine`.
+        overwrite: run recordings again that have a run already.
+        adapt_config: run recordings without IMU data with initial poses by constant velocity.
+    """
+
+    jobs: int | None = None
+    threads: int | None = None
+    engine: str = engines.LOCAL
+    scheduler: str | None = None
+    overwrite: bool = False
+    adapt_config: bool = True
+
+
+@dataclass(frozen=True)
+class Job:
+    """All that a process needs to run one recording.
+
+    Attributes:
+        recording: the recording to run.
+        folder: its run folder.
         config: the settings.
-        threads: at most so many for the run.
-        without_imu: run a recording without inertial data from another initial pose.
+        threads: maximum number of threads of the run.
+        adapt_config: see :class:`BatchOptions`.
     """
 
     recording: Recording
     folder: Path
     config: Config
     threads: int
-    without_imu: bool
+    adapt_config: bool
 
     @property
     def description(self) -> dict[str, Any]:
-        """What makes two jobs the same: recording and settings."""
+        """Recording and settings as plain values; equal for jobs with equal results."""
         return {"recording": self.recording.to_json_dict(), "settings": self.config.model_dump(mode="json")}
 
 
@@ -58,90 +77,86 @@ def run_batch(
     recordings: Items[Recording],
     out: Path,
     config: Config | None = None,
-    *,
-    jobs: int | None = None,
-    threads: int | None = None,
-    engine: str = engines.LOCAL,
-    scheduler: str | None = None,
-    overwrite: bool = False,
-    without_imu: bool = True,
+    options: BatchOptions | None = None,
     progress: Progress | None = None,
 ) -> Batch:
-    """Run recordings, several at a time, and write each to ``out/<name>``, and ``batch.json`` and ``batch.md`` beside.
+    """Run recordings in parallel; write each to ``out/<name>``, and ``batch.json`` and ``batch.md`` to ``out``.
 
-    Runs that are complete are left as they are. What stops the batch, such as Ctrl-C, is kept in
-    :attr:`Batch.stopped`; the runs that were complete by then stay.
+    Complete runs are kept. An interrupt (Ctrl-C) ends the batch and is returned in :attr:`Batch.stopped`.
 
     Args:
-        recordings: as :func:`hybridlio.runs.recordings.find_recordings` finds them.
-        out: a folder, on a cluster one that all machines see under this path.
+        recordings: the recordings, from :func:`hybridlio.runs.recordings.find_recordings`.
+        out: the folder of the run folders; for a cluster, one that all machines see under this path.
         config: the settings of all runs.
-        jobs: how many at a time; None for one for each core.
-        threads: of each run; None for an equal share of the cores, or one on a cluster.
-        engine, scheduler: see :func:`hybridlio.runs.engines.engine`.
-        overwrite: run again what is there already.
-        without_imu: run recordings without inertial data from initial poses of constant velocity.
-        progress: called with recordings done, recordings in all, and the one that is done.
+        options: parallelism, engine and what to do with existing runs.
+        progress: called after each recording with its name, recordings done and recordings in all.
 
     Raises:
-        ConfigError: ``out`` holds runs of other recordings or with other settings, an unknown engine, or settings that
-            no recording can be run with. Nothing has been run or removed then.
-        DataError: the folder cannot be made.
+        ConfigError: ``out`` holds runs of other recordings or with other settings, the engine is unknown, or the
+            settings are invalid. Nothing is run or removed then.
+        DataError: the folder cannot be created.
         MissingDependencyError: the engine is not installed.
     """
-    config, out = config or Config(), Path(out).absolute()
-    if engines.is_remote(engine):
+    config, options, out = config or Config(), options or BatchOptions(), Path(out).absolute()
+    if engines.is_remote(options.engine):
         check_names(config.initial_pose, config.residual, config.backend)
     else:
         check_implementations(config)
-    local = engine == engines.LOCAL
-    jobs = max(1, min(jobs or engines.cores(), len(recordings))) if local else jobs
-    threads = threads or (max(1, engines.cores() // jobs) if local and jobs else 1)
-    todo = [Job(r, out / r.name, config, threads, without_imu) for r in recordings]
-    done = {job.recording for job in todo if _is_complete(job, overwrite)}
-    missing = [job for job in todo if job.recording not in done]
-    with engines.engine(engine, jobs, threads, scheduler):
+    parallel, threads = _workers(options, len(recordings))
+    jobs = [Job(r, out / r.name, config, threads, options.adapt_config) for r in recordings]
+    complete = {job.recording for job in jobs if _is_complete(job, options.overwrite)}
+    missing = [job for job in jobs if job.recording not in complete]
+    with engines.engine(options.engine, parallel, threads, options.scheduler):
         make_folder(out)
         for job in missing:
             _clear(job)
-        rows = {job.recording: _row(job, DONE_BEFORE if job.recording in done else NOT_RUN) for job in todo}
+        rows = {job.recording: _row(job, DONE_BEFORE if job.recording in complete else NOT_RUN) for job in jobs}
         stopped = _run_missing(missing, rows, out, progress)
     batch = Batch(out, tuple(rows.values()), stopped)
     write_batch(batch)
     return batch
 
 
+def _workers(options: BatchOptions, recordings: int) -> tuple[int | None, int]:
+    """Return the number of parallel runs, None for all that the engine has, and the threads of each."""
+    if options.engine != engines.LOCAL:
+        return options.jobs, options.threads or 1
+    cores = engines.cores()
+    jobs = max(1, min(options.jobs or cores, recordings))
+    return jobs, options.threads or max(1, cores // jobs)
+
+
 def _run_missing(
     missing: list[Job], rows: dict[Recording, BatchRow], out: Path, progress: Progress | None
 ) -> BaseException | None:
-    """Run jobs, and put in each one's row as it ends; what stopped them, if anything."""
+    """Run jobs and update the row of each as it ends; return the interrupt that stopped them, if any."""
     try:
         for job, reason in _run_all(missing):
             rows[job.recording] = _row(job, DONE if reason is None else FAILED, reason)
             write_batch(Batch(out, tuple(rows.values())))
             if progress is not None:
-                counted = sum(row.status != NOT_RUN for row in rows.values())
-                progress(counted, len(rows), job.recording.name)
+                ended = sum(row.status != NOT_RUN for row in rows.values())
+                progress(job.recording.name, ended, len(rows))
     except KeyboardInterrupt as error:
-        rows |= {job.recording: _row(job, DONE) for job in missing if _reached_its_end(_metrics(job.folder))}
+        rows |= {job.recording: _row(job, DONE) for job in missing if _is_whole(_metrics(job.folder))}
         return error
     return None
 
 
 def _is_complete(job: Job, overwrite: bool) -> bool:
-    """Whether the run is there.
+    """Return whether the run folder holds this job's run.
 
     Raises:
-        ConfigError: another run is there.
+        ConfigError: it holds another run.
     """
     metrics = _metrics(job.folder)
     if metrics and not overwrite:
         if _description(job.folder) != job.description:
             raise ConfigError(
-                f"{job.folder} holds a run of another recording or with other settings; choose another folder, or "
-                "--overwrite all that is there"
+                f"{job.folder} holds a run of another recording or with other settings; choose another folder with -o, "
+                "or give --overwrite to run all recordings again"
             )
-        return _reached_its_end(metrics)
+        return _is_whole(metrics)
     return False
 
 
@@ -150,7 +165,7 @@ def _clear(job: Job) -> None:
     (job.folder / JOB).unlink(missing_ok=True)
 
 
-def _reached_its_end(metrics: dict[str, Any]) -> bool:
+def _is_whole(metrics: dict[str, Any]) -> bool:
     return bool(metrics) and not metrics.get("interrupted")
 
 
@@ -170,14 +185,14 @@ def _metrics(folder: Path) -> dict[str, Any]:
 
 def _row(job: Job, status: str, reason: str | None = None) -> BatchRow:
     metrics = _metrics(job.folder)
-    return BatchRow(job.recording, job.folder, status, reason, figures_of(metrics) if metrics else {})
+    return BatchRow(job.recording, job.folder, status, reason, summary_metrics(metrics) if metrics else {})
 
 
 def _run_all(jobs: list[Job]) -> Iterator[tuple[Job, str | None]]:
-    """Every job as it ends, with the reason where it failed.
+    """Yield every job as it ends, with the reason if it failed.
 
-    Where a process ends by force (out of memory, a crash in a library), all that ran beside it are lost too. Those
-    that had been started are then run one by one, so that only the one whose fault it is fails; the rest goes on.
+    When a process dies (out of memory, a crash in a library), the engine loses all jobs that run beside it. The jobs
+    that had started are then run one by one, so that only the one that crashes fails; then the rest continues.
     """
     waiting = {job.recording: job for job in jobs}
     while waiting:
@@ -186,7 +201,7 @@ def _run_all(jobs: list[Job]) -> Iterator[tuple[Job, str | None]]:
             try:
                 for recording, reason in results:
                     yield waiting.pop(recording), reason
-            except Exception as error:  # of the engine: what a job raises comes back as its reason
+            except Exception as error:  # raised by the engine; errors of a job are returned as its reason
                 broken = error
         if broken is None:
             return
@@ -194,25 +209,26 @@ def _run_all(jobs: list[Job]) -> Iterator[tuple[Job, str | None]]:
         if not suspects:
             raise broken
         for job in suspects:
-            yield waiting.pop(job.recording), _reason_alone(job)
+            yield waiting.pop(job.recording), _run_alone(job)
 
 
 def _results(jobs: list[Job]) -> Generator[tuple[Recording, str | None]]:
     return engines.run_tasks((run_job, (job,)) for job in jobs)
 
 
-def _reason_alone(job: Job) -> str | None:
+def _run_alone(job: Job) -> str | None:
+    """Run one job and return the reason if it failed or its process died."""
     try:
         with closing(_results([job])) as results:
             return next(results)[1]
     except Exception as error:
-        return f"its process ended by force: {str(error).splitlines()[0]}"
+        return f"the process died: {str(error).splitlines()[0]}"
 
 
 def run_job(job: Job) -> tuple[Recording, str | None]:
-    """Run one recording and write its run folder; why that failed is returned, not raised.
+    """Run one recording and write its run folder; return the recording, and the reason if it failed.
 
-    The library's log of it is in the folder's ``run.log``, with the traceback of an error that is a fault.
+    The library's log of the run is written to the folder's ``run.log``, with the traceback of an unexpected error.
     """
     try:
         job.folder.mkdir(parents=True, exist_ok=True)
@@ -224,21 +240,21 @@ def run_job(job: Job) -> tuple[Recording, str | None]:
                 _log.error("%s", error)
                 return job.recording, str(error)
             except Exception as error:
-                _log.exception("a fault in hybridlio")
-                return job.recording, f"{type(error).__name__}: {error} (a fault in hybridlio; {LOG} shows where)"
+                _log.exception("a bug in hybridlio")
+                return job.recording, f"{type(error).__name__}: {error} (a bug in hybridlio; {LOG} has the traceback)"
     except (OSError, DataError) as error:
-        return job.recording, f"{job.folder}: cannot be written to: {error}"
+        return job.recording, f"{job.folder}: cannot be written: {error}"
     return job.recording, None
 
 
 def _run(job: Job) -> None:
     from hybridlio.odometry.odometry import Odometry
-    from hybridlio.runs.run import run_odometry, suited_to
+    from hybridlio.runs.run import adapt_config, run_odometry
     from hybridlio.runs.write import write_run
 
     sequence = job.recording.open()
-    config = suited_to(sequence, job.config, as_asked=not job.without_imu)
-    run = run_odometry(sequence, Odometry(config=_limited(config, job.threads)))
+    config = adapt_config(sequence, job.config, is_explicit=not job.adapt_config)
+    run = run_odometry(sequence, Odometry(config=_with_thread_limit(config, job.threads)))
     if isinstance(run.stopped, KeyboardInterrupt):
         raise run.stopped
     if run.stopped is not None and len(run.estimates) < 2:
@@ -248,12 +264,12 @@ def _run(job: Job) -> None:
         raise run.stopped
 
 
-def _limited(config: Config, threads: int) -> Config:
-    """The settings with no part of them using more threads."""
+def _with_thread_limit(config: Config, threads: int) -> Config:
+    """Return the settings with every ``threads`` reduced to the limit."""
 
-    def limited(tree: dict[str, Any]) -> dict[str, Any]:
+    def limit(tree: dict[str, Any]) -> dict[str, Any]:
         return {
-            key: limited(value)
+            key: limit(value)
             if isinstance(value, dict)
             else min(value, threads)
             if key == "threads" and value is not None
@@ -261,16 +277,16 @@ def _limited(config: Config, threads: int) -> Config:
             for key, value in tree.items()
         }
 
-    return Config.model_validate(limited(config.model_dump()))
+    return Config.model_validate(limit(config.model_dump()))
 
 
 @contextmanager
 def _logged_to(file: Path) -> Iterator[None]:
-    """Write what the library, and what draws its pictures, logs in this thread to a file."""
-    mine = threading.get_ident()
+    """Write what hybridlio and matplotlib log in this thread to a file."""
+    thread = threading.get_ident()
     handler = logging.FileHandler(file, mode="w", encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    handler.addFilter(lambda record: record.thread == mine)
+    handler.addFilter(lambda record: record.thread == thread)
     loggers, level = (_log, logging.getLogger("matplotlib")), _log.level
     for logger in loggers:
         logger.addHandler(handler)

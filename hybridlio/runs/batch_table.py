@@ -1,4 +1,4 @@
-"""A batch's outcome: one row a recording, as a table and as ``batch.json`` and ``batch.md``."""
+"""The result of a batch: one row per recording, as a table and as ``batch.json`` and ``batch.md``."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 DONE, DONE_BEFORE, FAILED, NOT_RUN = "done", "done before", "failed", "not run"
-_WORDS = ("recording", "status", "reason")
-_FIGURES = (
+_TEXT_COLUMNS = ("recording", "status", "reason")
+_METRICS = (
     "frames", "frames_done", "skipped", "bridged", "degenerate", "path_length_m", "length_m", "seconds",
     "t_rel_percent", "r_rel_deg_per_100m", "chosen_lengths_m", "chosen_t_rel_percent", "chosen_r_rel_deg_per_100m",
     "ate_m", "ate_deg", "end_error_m", "anees_rotation", "anees_position",
@@ -26,37 +26,36 @@ _FIGURES = (
 
 @dataclass(frozen=True, eq=False)
 class BatchRow:
-    """One recording's outcome.
+    """The result of one recording.
 
     Attributes:
-        recording: what was to be run.
+        recording: the recording.
         folder: its run folder.
         status: ``done``, ``done before``, ``failed`` or ``not run``.
         reason: why it failed, or None.
-        figures: the figures of ``metrics.json`` that a summary needs, as far as there are any; of a run that failed on
-            its way, up to there. Scans that were bridged or left a direction open are counted.
+        metrics: those of :func:`summary_metrics` that the run has; of a run that failed, up to where it stopped.
     """
 
     recording: Recording
     folder: Path
     status: str
     reason: str | None = None
-    figures: dict[str, Any] = field(default_factory=dict)
+    metrics: dict[str, Any] = field(default_factory=dict)
 
     def to_json_dict(self) -> dict[str, Any]:
-        """Everything as plain values."""
-        said = {"name": self.recording.name, **self.recording.to_json_dict(), "folder": self.folder.name}
-        return said | {"status": self.status, "reason": self.reason, **self.figures}
+        """Return all attributes as plain values."""
+        recording = {"name": self.recording.name, **self.recording.to_json_dict(), "folder": self.folder.name}
+        return recording | {"status": self.status, "reason": self.reason, **self.metrics}
 
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Many recordings' outcome.
+    """The result of many recordings.
 
     Attributes:
         out: the folder of the run folders.
-        rows: one a recording, in the order in which they were given.
-        stopped: what stopped the batch before its end, such as a KeyboardInterrupt; None for a whole one.
+        rows: one per recording, in the order given.
+        stopped: the interrupt that ended the batch early, or None.
     """
 
     out: Path
@@ -70,43 +69,43 @@ class Batch:
 
     @property
     def summary(self) -> str:
-        """How many there are of each status."""
+        """The number of recordings of each status, in one line."""
         count = Counter(row.status for row in self.rows)
-        told = [f"{count[status]} {status}" for status in (DONE, DONE_BEFORE, FAILED, NOT_RUN) if count[status]]
-        return f"{tables.counted(len(self.rows), 'recording')}: {', '.join(told)}"
+        parts = [f"{count[status]} {status}" for status in (DONE, DONE_BEFORE, FAILED, NOT_RUN) if count[status]]
+        return f"{tables.counted(len(self.rows), 'recording')}: {', '.join(parts)}"
 
 
-def figures_of(metrics: dict[str, Any]) -> dict[str, Any]:
-    """What a summary needs of a run's ``metrics.json``."""
-    out = {name: metrics[name] for name in _FIGURES if name in metrics}
-    counted = {name: len(out[name]) for name in ("bridged", "degenerate") if name in out}
-    return out | counted | {"ms_per_scan": metrics.get("ms_per_scan", {}).get("total")}
+def summary_metrics(metrics: dict[str, Any]) -> dict[str, Any]:
+    """Return the part of a run's ``metrics.json`` that a summary needs; lists of scans are replaced by their length."""
+    out = {name: metrics[name] for name in _METRICS if name in metrics}
+    counts = {name: len(out[name]) for name in ("bridged", "degenerate") if name in out}
+    return out | counts | {"ms_per_scan": metrics.get("ms_per_scan", {}).get("total")}
 
 
-def cells(row: BatchRow) -> dict[str, str]:
-    """A row in words. Drift is over KITTI's lengths, or over those that fit a shorter path; ``over`` says which."""
-    f, number = row.figures, tables.number
-    lengths, kitti = f.get("chosen_lengths_m"), f.get("t_rel_percent") is not None
-    prefix = "" if kitti else "chosen_"
-    over = "100–800 m" if kitti else tables.NOTHING if not lengths else f"{lengths[0]:g}–{lengths[-1]:g} m"
+def _cells(row: BatchRow) -> dict[str, str]:
+    """Return a row's cells by heading. The column ``over`` has the segment lengths of the drift."""
+    m, number = row.metrics, tables.number
+    lengths, is_kitti = m.get("chosen_lengths_m"), m.get("t_rel_percent") is not None
+    prefix = "" if is_kitti else "chosen_"
+    over = "100–800 m" if is_kitti else tables.NOTHING if not lengths else f"{lengths[0]:g}–{lengths[-1]:g} m"
     return {
         "recording": row.recording.name,
         "status": row.status,
-        "scans": str(f.get("frames_done", tables.NOTHING)),
-        "path [m]": number(f.get("path_length_m"), 1),
-        "t_rel [%]": number(f.get(f"{prefix}t_rel_percent"), 3),
-        "r_rel [°/100m]": number(f.get(f"{prefix}r_rel_deg_per_100m"), 3),
+        "scans": str(m.get("frames_done", tables.NOTHING)),
+        "path [m]": number(m.get("path_length_m"), 1),
+        "t_rel [%]": number(m.get(f"{prefix}t_rel_percent"), 3),
+        "r_rel [°/100m]": number(m.get(f"{prefix}r_rel_deg_per_100m"), 3),
         "over": over,
-        "ATE [m]": number(f.get("ate_m"), 3),
-        "bridged": str(f.get("bridged", tables.NOTHING)),
-        "ms a scan": number(f.get("ms_per_scan"), 0),
+        "ATE [m]": number(m.get("ate_m"), 3),
+        "bridged": str(m.get("bridged", tables.NOTHING)),
+        "ms per scan": number(m.get("ms_per_scan"), 0),
         "reason": row.reason or tables.NOTHING,
     }
 
 
 def table(batch: Batch) -> Table:
-    """The batch for the terminal."""
-    return tables.for_terminal([cells(row) for row in batch.rows], _WORDS, batch.summary)
+    """Return the batch as a table for the terminal."""
+    return tables.for_terminal([_cells(row) for row in batch.rows], _TEXT_COLUMNS, batch.summary)
 
 
 def write_batch(batch: Batch) -> None:
@@ -115,7 +114,7 @@ def write_batch(batch: Batch) -> None:
     Raises:
         DataError: they cannot be written.
     """
-    said = {"summary": batch.summary, "recordings": [row.to_json_dict() for row in batch.rows]}
-    write_whole(batch.out / "batch.json", json.dumps(said, indent=2, ensure_ascii=False) + "\n")
-    body = tables.to_markdown([cells(row) for row in batch.rows], _WORDS)
+    values = {"summary": batch.summary, "recordings": [row.to_json_dict() for row in batch.rows]}
+    write_whole(batch.out / "batch.json", json.dumps(values, indent=2, ensure_ascii=False) + "\n")
+    body = tables.to_markdown([_cells(row) for row in batch.rows], _TEXT_COLUMNS)
     write_whole(batch.out / "batch.md", f"{batch.summary}\n\n{body}\n")

@@ -1,9 +1,9 @@
-"""The same frames through several combinations of sources, side by side."""
+"""Run the odometry on the same frames with several combinations of sources, and tabulate the results."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from collections.abc import Sequence as Items
 from dataclasses import dataclass
 from itertools import product
@@ -16,6 +16,7 @@ from hybridlio.core import tables
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.files import write_whole
+from hybridlio.core.progress import Progress
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.evaluation.evaluate import Evaluation, associate, associated_step_errors, evaluate
 from hybridlio.odometry.config import Config
@@ -26,15 +27,16 @@ from hybridlio.runs.write import forward_speed_length_m
 if TYPE_CHECKING:
     from rich.table import Table
 
-Progress = Callable[[str, int, int], None]
-
 _NAMES = ("initial pose", "residual", "backend")
-_LEGEND = "initial, final: median error of a step before and after looking at the scans; time: median for a scan"
+_LEGEND = (
+    "initial, final: median error of a step before and after the residual; time, p90: median and 90th percentile per "
+    "scan, without reading"
+)
 
 
 @dataclass(frozen=True, eq=False)
 class StepErrors:
-    """Errors of relative poses against the reference's: of half of the steps they are below the median."""
+    """Errors of relative poses against the reference: median and root mean square, in metres and degrees."""
 
     median_m: float
     median_deg: float
@@ -43,17 +45,17 @@ class StepErrors:
 
 
 @dataclass(frozen=True, eq=False)
-class Compared:
-    """One combination's run.
+class ComparisonRow:
+    """The run of one combination.
 
     Attributes:
         initial_pose, residual, backend: the combination.
-        scans: how many were estimated.
-        bridged: of how many of them the residual source could make nothing.
+        scans: number of scans estimated.
+        bridged: number of these at which the residual source failed, so that the initial pose was used.
         path_length_m: of the estimate.
-        ms_median, ms_p90: milliseconds a scan, without reading it; None for fewer than two scans.
-        initial, final: errors of the steps before and after looking at the scans; None without reference.
-        evaluation: None without reference.
+        ms_median, ms_p90: milliseconds per scan, without reading it; None for fewer than two scans.
+        initial, final: errors of the steps before and after the residual; None without a reference.
+        evaluation: None without a reference.
         error: why the run ended early, or None.
     """
 
@@ -71,7 +73,7 @@ class Compared:
     error: str | None
 
     def to_json_dict(self) -> dict[str, Any]:
-        """Every attribute as plain values, the evaluation's under ``evaluation``."""
+        """Return all attributes as plain values."""
         out: dict[str, Any] = dict(vars(self))
         for name in ("initial", "final"):
             out[name] = None if out[name] is None else vars(out[name])
@@ -83,50 +85,50 @@ class Comparison:
     """Several runs over the same frames.
 
     Attributes:
-        sequence: its name.
-        scans: how many frames each run was given.
-        reference_length_m: the reference's path length, or None.
-        forward_speed_length_m: how far the vehicle went by its own forward speed, or None.
-        rows: one run each.
-        stopped: the interrupt that ended the comparison, or None.
+        sequence: the recording's name.
+        scans: number of frames given to each run.
+        reference_length_m: path length of the reference, or None.
+        forward_speed_length_m: path length by the vehicle's own forward speed, or None.
+        rows: one per run.
+        stopped: the interrupt that ended the comparison early, or None.
     """
 
     sequence: str
     scans: int
     reference_length_m: float | None
     forward_speed_length_m: float | None
-    rows: tuple[Compared, ...]
+    rows: tuple[ComparisonRow, ...]
     stopped: BaseException | None = None
 
 
 def combinations(
     initial_poses: Items[str], residuals: Items[str], backends: Items[str], config: Config
 ) -> list[Config]:
-    """The configuration with every combination of the names."""
+    """Return the configuration with every combination of the names."""
     names = ("initial_pose", "residual", "backend")
     combined = product(initial_poses, residuals, backends)
     return [config.model_copy(update=dict(zip(names, c, strict=True))) for c in combined]
 
 
-def compare(sequence: Sequence, configs: Iterable[Config], progress: Progress | None = None) -> Comparison:
+def compare_configs(sequence: Sequence, configs: Iterable[Config], progress: Progress | None = None) -> Comparison:
     """Run every configuration over the whole sequence, one after the other.
 
-    A run that fails has a row too, with what it had estimated until then. An interrupt ends the comparison; it is kept
-    in :attr:`Comparison.stopped`, and what was compared by then stays.
+    A run that fails has a row with what it estimated by then. An interrupt ends the comparison and is returned in
+    :attr:`Comparison.stopped`, with the rows so far.
 
     Args:
         sequence: the recording.
-        configs: see :func:`combinations`.
-        progress: called with the combination's name, scans done and scans in all, of all runs together.
+        configs: from :func:`combinations`.
+        progress: called after each scan with the combination, scans done and scans in all, summed over all runs.
 
     Raises:
         ConfigError: a source is unknown.
     """
-    odometries = [(config, Odometry(config=config)) for config in configs]  # wrong names fail before the work
+    odometries = [(config, Odometry(config=config)) for config in configs]  # unknown names fail before the first run
     runs: list[tuple[Config, Run]] = []
     for config, odometry in odometries:
-        show = None if progress is None else _shown(progress, config, len(runs), len(odometries))
-        run = run_odometry(sequence, odometry, show)
+        report = None if progress is None else _summed(progress, config, len(runs), len(odometries))
+        run = run_odometry(sequence, odometry, report)
         runs.append((config, run))
         if isinstance(run.stopped, KeyboardInterrupt):
             break
@@ -136,18 +138,19 @@ def compare(sequence: Sequence, configs: Iterable[Config], progress: Progress | 
         scans=len(sequence),
         reference_length_m=None if sequence.reference is None else sequence.reference.length_m,
         forward_speed_length_m=max(lengths, default=None),
-        rows=tuple(_compared(config, run) for config, run in runs),
+        rows=tuple(_row(config, run) for config, run in runs),
         stopped=next((run.stopped for _, run in runs if isinstance(run.stopped, KeyboardInterrupt)), None),
     )
 
 
-def _shown(progress: Progress, config: Config, number: int, runs: int) -> Callable[[int, int, float], None]:
+def _summed(progress: Progress, config: Config, run: int, runs: int) -> Progress:
+    """Return the callback of one run, which reports progress over all runs."""
     name = f"{config.initial_pose} + {config.residual}"
-    return lambda done, total, _metres: progress(name, number * total + done, runs * total)
+    return lambda _stage, done, total: progress(name, run * total + done, runs * total)
 
 
-def _compared(config: Config, run: Run) -> Compared:
-    spent = [sum(e.seconds.values()) * 1e3 for e in run.estimates[1:]]
+def _row(config: Config, run: Run) -> ComparisonRow:
+    spent_ms = [sum(e.seconds.values()) * 1e3 for e in run.estimates[1:]]
     reference, evaluation, initial, final = run.sequence.reference, None, None, None
     if reference is not None and len(run.estimates) > 1:
         try:
@@ -155,15 +158,15 @@ def _compared(config: Config, run: Run) -> Compared:
             initial, final = (_step_errors(run, poses) for poses in (run.initial_poses, run.steps.poses))
         except DataError as error:
             run.stopped = run.stopped or error
-    return Compared(
+    return ComparisonRow(
         initial_pose=config.initial_pose,
         residual=config.residual,
         backend=config.backend,
         scans=len(run.estimates),
         bridged=len(run.bridged),
         path_length_m=run.trajectory.length_m if run.estimates else 0.0,
-        ms_median=float(np.median(spent)) if spent else None,
-        ms_p90=float(np.percentile(spent, 90)) if spent else None,
+        ms_median=float(np.median(spent_ms)) if spent_ms else None,
+        ms_p90=float(np.percentile(spent_ms, 90)) if spent_ms else None,
         initial=initial,
         final=final,
         evaluation=evaluation,
@@ -184,40 +187,40 @@ def _step_errors(run: Run, poses: Array) -> StepErrors | None:
 
 
 def table(comparison: Comparison) -> Table:
-    """The comparison for the terminal."""
-    return tables.for_terminal(columns(comparison), _NAMES, heading(comparison), _LEGEND)
+    """Return the comparison as a table for the terminal."""
+    return tables.for_terminal(cells(comparison), _NAMES, heading(comparison), _LEGEND)
 
 
 def heading(comparison: Comparison) -> str:
-    """What was compared on."""
+    """Return one line with the recording and the settings that all rows share."""
     words = [f"{comparison.sequence}: {comparison.scans} scans"]
     if comparison.reference_length_m is not None:
-        words.append(f"{comparison.reference_length_m:.1f} m by the reference")
+        words.append(f"reference {comparison.reference_length_m:.1f} m")
     if comparison.forward_speed_length_m is not None:
-        words.append(f"{comparison.forward_speed_length_m:.1f} m by forward speed")
-    judged = [row.evaluation for row in comparison.rows if row.evaluation is not None]
-    short = [e.chosen_lengths_m for e in judged if e.t_rel_percent is None and e.chosen_lengths_m is not None]
+        words.append(f"forward speed {comparison.forward_speed_length_m:.1f} m")
+    evaluations = [row.evaluation for row in comparison.rows if row.evaluation is not None]
+    short = [e.chosen_lengths_m for e in evaluations if e.t_rel_percent is None and e.chosen_lengths_m is not None]
     words += [f"drift over {short[0][0]:g}–{short[0][-1]:g} m"] if short else []
     used = {name: {getattr(row, name.replace(" ", "_")) for row in comparison.rows} for name in _NAMES}
     words += [f"{name} {values.pop()}" for name, values in used.items() if len(values) == 1]
     return ", ".join(words)
 
 
-def columns(comparison: Comparison) -> list[dict[str, str]]:
-    """The rows under their headings, all under the same; columns that say nothing are left out."""
+def cells(comparison: Comparison) -> list[dict[str, str]]:
+    """Return each row's cells by heading, without columns that are empty or that the title has already."""
     rows = [_cells(row) for row in comparison.rows]
-    same = [name for name in _NAMES[1:] if len({row[name] for row in rows}) == 1]
-    told = [name for name in tables.headings(rows) if name not in same]
-    return [{name: row.get(name, tables.NOTHING) for name in told} for row in rows]
+    shared = [name for name in _NAMES[1:] if len({row[name] for row in rows}) == 1]
+    shown = [name for name in tables.headings(rows) if name not in shared]
+    return [{name: row.get(name, tables.NOTHING) for name in shown} for row in rows]
 
 
-def _cells(row: Compared) -> dict[str, str]:
+def _cells(row: ComparisonRow) -> dict[str, str]:
     e = row.evaluation
     out = {"initial pose": row.initial_pose, "residual": row.residual, "backend": row.backend}
     if e is not None:
-        short = e.t_rel_percent is None
-        out["t_rel [%]"] = tables.number(e.chosen_t_rel_percent if short else e.t_rel_percent, 3)
-        out["r_rel [°/100m]"] = tables.number(e.chosen_r_rel_deg_per_100m if short else e.r_rel_deg_per_100m, 3)
+        is_short = e.t_rel_percent is None
+        out["t_rel [%]"] = tables.number(e.chosen_t_rel_percent if is_short else e.t_rel_percent, 3)
+        out["r_rel [°/100m]"] = tables.number(e.chosen_r_rel_deg_per_100m if is_short else e.r_rel_deg_per_100m, 3)
         out["ATE [m]"] = tables.number(e.ate_m, 3)
     for name, errors in (("initial", row.initial), ("final", row.final)):
         if errors is not None:
@@ -229,17 +232,22 @@ def _cells(row: Compared) -> dict[str, str]:
         "p90 [ms]": tables.number(row.ms_p90, 1),
     }
     out["bridged"] = str(row.bridged)
-    return out | {"ended early": f"after {row.scans} scans: {row.error}" if row.error else tables.NOTHING}
+    end = f"after {tables.counted(row.scans, 'scan')}: {row.error}" if row.error else tables.NOTHING
+    return out | {"ended early": end}
 
 
 def to_markdown(comparison: Comparison) -> str:
-    """The comparison as a Markdown table."""
-    body = tables.to_markdown(columns(comparison), _NAMES)
+    """Return the comparison as a Markdown table."""
+    body = tables.to_markdown(cells(comparison), _NAMES)
     return f"{heading(comparison)}\n\n{body}\n\n{_LEGEND}\n"
 
 
 def write_comparison(folder: Path, comparison: Comparison) -> None:
-    """Write ``compare.json`` and ``compare.md``."""
+    """Write ``compare.json`` and ``compare.md``.
+
+    Raises:
+        DataError: they cannot be written.
+    """
     values = vars(comparison) | {"rows": [row.to_json_dict() for row in comparison.rows]}
     values["stopped"] = comparison.stopped is not None
     write_whole(folder / "compare.json", json.dumps(values, indent=2, ensure_ascii=False) + "\n")

@@ -1,4 +1,4 @@
-"""Who runs the recordings of a batch: joblib's backends, from processes on one machine to a cluster's scheduler."""
+"""Engines that run the jobs of a batch: joblib's backends, from processes on this machine to a cluster."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ LOCAL = "loky"
 
 
 def is_remote(name: str) -> bool:
-    """Whether an engine's workers may be on other machines, with other devices and files than this one."""
+    """Return whether an engine may run jobs on other machines, which have other devices and files."""
     return name in _CONNECT
 
 
 def cores() -> int:
-    """Cores that this process may use, by affinity and by a container's quota."""
+    """Return the number of cores that this process may use, by its affinity and its container's quota."""
     import joblib
 
     return int(joblib.cpu_count())
@@ -27,25 +27,25 @@ def cores() -> int:
 
 @contextmanager
 def engine(name: str, jobs: int | None, threads: int, scheduler: str | None = None) -> Iterator[None]:
-    """Have :func:`run_tasks` within the block run by an engine.
+    """Make :func:`run_tasks` use an engine within the block.
 
     Args:
-        name: ``loky`` (processes on this machine), ``dask``, ``ray``, or another backend that joblib knows.
-        jobs: at most so many at a time; None for all that the engine has.
-        threads: of numerical libraries in each of ``loky``'s processes; other engines set it for their workers.
-        scheduler: a cluster's address. Without one, Dask and Ray use the cluster that the process is connected to
-            already or that their own settings name, and otherwise make one of this machine.
+        name: ``loky`` (processes on this machine), ``dask``, ``ray``, or another backend known to joblib.
+        jobs: maximum number of parallel jobs; None for all that the engine has.
+        threads: threads of numerical libraries per process of ``loky``; other engines have their own setting.
+        scheduler: a cluster's address. Without one, Dask and Ray use the cluster that this process is connected to or
+            that their own settings name; otherwise they start one on this machine.
 
     Raises:
         MissingDependencyError: the engine is not installed.
-        ConfigError: there is no such engine, or no scheduler at that address.
+        ConfigError: the engine is unknown, or there is no scheduler at the address.
     """
     import joblib
 
     if scheduler is not None and name not in _CONNECT:
-        raise ConfigError(f"the engine {name} has no scheduler to connect to; choose {' or '.join(_CONNECT)}")
+        raise ConfigError(f"the engine {name} has no scheduler; use {' or '.join(_CONNECT)}, or omit --scheduler")
     options: dict[str, Any] = {"inner_max_num_threads": threads} if name == LOCAL else {}
-    with _CONNECT.get(name, _alone)(scheduler, jobs):
+    with _CONNECT.get(name, _without_cluster)(scheduler, jobs):
         try:
             config = joblib.parallel_config(backend=name, n_jobs=jobs or -1, **options)
         except (ValueError, KeyError) as error:
@@ -56,27 +56,27 @@ def engine(name: str, jobs: int | None, threads: int, scheduler: str | None = No
 
 
 def run_tasks(tasks: Iterable[Task]) -> Generator[Any]:
-    """What the tasks return, each as soon as it is known where the engine can tell, else all at the end.
+    """Yield the result of each task: as it ends where the engine supports that, otherwise all together at the end.
 
-    A process of its own runs each, also where there is a single one, so that one that ends by force does not take this
-    process with it. Closing the generator gives up what is still running.
+    Every task runs in another process than this one, even a single task, so that a crash does not end this process.
+    Closing the generator cancels tasks that are still running.
     """
     import joblib
     from joblib.parallel import get_active_backend
 
     backend, jobs = get_active_backend()
-    as_known = getattr(backend, "supports_return_generator", False)
+    has_generator = getattr(backend, "supports_return_generator", False)
     parallel = joblib.Parallel(
-        n_jobs=max(jobs, 2) if jobs > 0 else jobs,  # of one job joblib makes none of its own
+        n_jobs=max(jobs, 2) if jobs > 0 else jobs,  # with one job, joblib would run the task in this process
         batch_size=1,
         pre_dispatch=jobs if jobs > 0 else "all",
-        return_as="generator_unordered" if as_known else "list",
+        return_as="generator_unordered" if has_generator else "list",
     )
     yield from parallel(joblib.delayed(call)(*arguments) for call, arguments in tasks)
 
 
 @contextmanager
-def _alone(_scheduler: str | None, _jobs: int | None) -> Iterator[None]:
+def _without_cluster(_scheduler: str | None, _jobs: int | None) -> Iterator[None]:
     yield
 
 
@@ -116,9 +116,10 @@ def _ray(scheduler: str | None, _jobs: int | None) -> Iterator[None]:
     yield
 
 
-def _or_none(connected: Callable[[], Any]) -> Any:
+def _or_none(get_client: Callable[[], Any]) -> Any:
+    """Return the client that this process is connected by, or None."""
     try:
-        return connected()
+        return get_client()
     except ValueError:
         return None
 

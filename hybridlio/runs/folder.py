@@ -1,4 +1,4 @@
-"""A run folder: what a run leaves, and how it is found and read again.
+"""Run folders: the files of a run, and how to create, write and read them.
 
 ``metrics.json`` is written last: a folder that has it is complete.
 """
@@ -43,11 +43,11 @@ class StoredRun:
 
     Attributes:
         path: the folder.
-        trajectory: what was estimated, with covariances; without the rows filled in before the first usable scan.
-        stamps_before: ``(K,)`` stamps of those rows, often none.
-        steps: the motions between, where the folder has their covariances.
-        reference: the truth that came with the recording, at the same rows, or None.
-        metrics: what ``metrics.json`` says.
+        trajectory: the estimate with covariances, from the first usable scan on.
+        stamps_before: ``(K,)`` stamps of the scans before that, which have filled-in rows; often none.
+        steps: the relative poses between estimates, or None if the folder has no covariances of them.
+        reference: the ground truth that came with the recording, or None.
+        metrics: the content of ``metrics.json``.
     """
 
     path: Path
@@ -59,65 +59,68 @@ class StoredRun:
 
     @property
     def T_camera_lidar(self) -> NDArray[np.float64] | None:
-        """``(4, 4)`` where KITTI pose files of this recording are in a camera's frame, else None."""
+        """``(4, 4)`` if this recording's KITTI pose files are in the camera frame, else None."""
         T = self.metrics.get("T_camera_lidar")
         return None if T is None else np.array(T, dtype=np.float64)
 
 
 def new_run_folder(sequence: str, out: Path | None, overwrite: bool) -> Path:
-    """The folder to write a run to, made now, so that a place without rights is noticed before the work.
+    """Create and return the folder to write a run to. Called before the run, so that missing rights show early.
 
-    Without ``out`` it is ``runs/<sequence>-<date-time>``, with a number behind where another run has that already.
+    Without ``out`` it is ``runs/<sequence>-<date-time>``, with a number appended if that folder exists.
 
     Raises:
-        ConfigError: ``out`` holds a run already, or files by the names of a run's, and ``overwrite`` is not set.
-        DataError: the folder cannot be made.
+        ConfigError: ``out`` holds a run, or other files with the names of a run's files, and ``overwrite`` is not set.
+        DataError: the folder cannot be created.
     """
     if out is not None and not overwrite:
         _check_free(out)
     wanted = out or Path("runs") / f"{sequence}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
     try:
         if out is None:
-            return _made_anew(wanted)
+            return _create_unique(wanted)
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise DataError(f"cannot make the run folder {wanted}: {error.strerror}; choose another with -o") from None
+        raise DataError(f"cannot create the run folder {wanted}: {error.strerror}; choose another with -o") from None
     return out
 
 
 def _check_free(out: Path) -> None:
     if (out / METRICS).exists():
-        raise ConfigError(f"{out} holds a run already; choose another folder, or --overwrite it")
-    there = [name for name in (*FILES, SMOOTHED) if (out / name).exists()]
-    if there:
+        raise ConfigError(f"{out} already holds a run; choose another folder, or give --overwrite to replace it")
+    existing = [name for name in (*FILES, SMOOTHED) if (out / name).exists()]
+    if existing:
         raise ConfigError(
-            f"{out} holds {there[0]} and is no finished run; choose another folder, or --overwrite such files"
+            f"{out} holds {existing[0]} but no finished run; choose another folder, or give --overwrite to replace it"
         )
 
 
-def _made_anew(wanted: Path) -> Path:
-    """The folder, or one with a number behind its name, that was not there and that no other process makes."""
+def _create_unique(wanted: Path) -> Path:
+    """Create the folder, or one with a number appended, such that no other process has or gets the same."""
     for number in count(1):
         folder = wanted if number == 1 else wanted.with_name(f"{wanted.name}-{number}")
         with suppress(FileExistsError):
             folder.mkdir(parents=True)
             return folder
-    raise AssertionError("numbers do not end")
+    raise AssertionError("unreachable")
 
 
 def clear(folder: Path) -> None:
-    """Remove a run's files and those of its smoothing, what says that it is complete first; leave anything else."""
+    """Remove the files of a run and of its smoothing, and nothing else.
+
+    ``metrics.json`` goes first, so that a folder that is left half-way does not count as complete.
+    """
     for one in (folder, folder / SMOOTHED):
         for name in (METRICS, *FILES):
             (one / name).unlink(missing_ok=True)
-    with suppress(OSError):  # not there, or something of somebody else's is in it
+    with suppress(OSError):  # it does not exist, or it holds other files
         (folder / SMOOTHED).rmdir()
 
 
-def point_latest_at(folder: Path) -> None:
-    """Make ``latest`` beside the folder a link to it, replacing an older one in one move.
+def link_latest(folder: Path) -> None:
+    """Make ``latest`` beside the folder a link to it; an older link is replaced in one step.
 
-    Where that cannot be, as on a disk without links, the log says so: it must not take a finished run's place.
+    Failure, as on a file system without links, is only logged: it must not lose a finished run.
     """
     link = folder.parent / "latest"
     if link.exists() and not link.is_symlink():
@@ -128,7 +131,7 @@ def point_latest_at(folder: Path) -> None:
         temporary.symlink_to(folder.name)
         temporary.replace(link)
     except OSError as error:
-        _log.warning("%s cannot be made a link to %s: %s", link, folder.name, error.strerror or error)
+        _log.warning("cannot link %s to %s: %s", link, folder.name, error.strerror or error)
 
 
 def write_trajectory(
@@ -138,12 +141,22 @@ def write_trajectory(
     steps: Steps | None = None,
     stamps_before: NDArray[np.int64] | None = None,
 ) -> None:
-    """Write the poses in both text formats, and ``covariances.npz``.
+    """Write the poses in the TUM and KITTI formats, and ``covariances.npz``.
 
     The latter holds ``stamps_ns`` ``(N,)``, ``absolute`` ``(N, 6, 6)``, ``estimated`` ``(N,)`` and, with ``steps``,
-    ``relative_poses`` ``(M-1, 4, 4)`` and ``relative`` ``(M-1, 6, 6)`` of the ``M`` poses that are estimated; rad² and
-    m², rotation first. Scans before the first usable one have a row too: the first pose, with the covariance of a
-    motion of which nothing is known, and ``estimated`` False.
+    ``relative_poses`` ``(M-1, 4, 4)`` and ``relative`` ``(M-1, 6, 6)`` of the ``M`` estimated poses; rad² and m²,
+    rotation first. Scans before the first usable one have a row too, with ``estimated`` False: the first pose, with
+    the covariance of an unknown motion.
+
+    Args:
+        folder: the run folder.
+        trajectory: the estimated poses.
+        T_camera_lidar: write the KITTI file in this camera's frame; None writes it in the lidar's.
+        steps: relative poses between estimates.
+        stamps_before: stamps of the scans before the first usable one.
+
+    Raises:
+        DataError: a file cannot be written.
     """
     whole = trajectory if stamps_before is None else _filled_before(trajectory, stamps_before)
     write_tum(folder / POSES, whole)
@@ -169,19 +182,19 @@ def _filled_before(trajectory: Trajectory, stamps_ns: NDArray[np.int64]) -> Traj
 def write_graph(
     folder: Path, poses: NDArray[np.float64], edges: Items[tuple[int, int, RelativePose]], first: int = 0
 ) -> None:
-    """Write poses, numbered from ``first``, and the relative poses between them (by row) as ``graph.g2o``."""
+    """Write ``graph.g2o``: poses ``(N, 4, 4)``, numbered from ``first``, and edges by the poses' rows."""
     from hybridlio.graph.formats.g2o import write_g2o
 
     write_g2o(folder / GRAPH, poses, [(i + first, j + first, edge) for i, j, edge in edges], first)
 
 
 def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
-    """Write ``metrics.json``, by which the folder counts as complete."""
+    """Write ``metrics.json``, which marks the folder as complete."""
     write_whole(folder / METRICS, json.dumps(metrics, indent=2, ensure_ascii=False) + "\n")
 
 
 def is_run_folder(path: Path) -> bool:
-    """Whether there is a run at ``path``."""
+    """Return whether ``path`` is a folder with a complete run."""
     return (path / METRICS).is_file() and (path / POSES).is_file()
 
 
@@ -189,11 +202,11 @@ def read_run(path: Path) -> StoredRun:
     """Read a run folder.
 
     Raises:
-        DataError: there is no complete run, or one of its files is malformed.
+        DataError: there is no complete run, or one of its files is malformed; names the folder.
     """
     if not is_run_folder(path):
-        what = "no such folder" if not path.exists() else f"no run in it (it has no {METRICS})"
-        raise DataError(f"{path}: {what}; `hybridlio odometry` makes run folders")
+        problem = "no such folder" if not path.exists() else f"not a run folder: it has no {METRICS} and {POSES}"
+        raise DataError(f"{path}: {problem}; give a folder written by `hybridlio odometry`")
     whole = read_tum(path / POSES)
     reference = read_tum(path / REFERENCE) if (path / REFERENCE).is_file() else None
     try:
@@ -204,8 +217,8 @@ def read_run(path: Path) -> StoredRun:
         covered = Trajectory(whole.stamps_ns, whole.poses, arrays["absolute"])
         trajectory = select(covered, np.flatnonzero(estimated))
     except UNREADABLE_NPZ as error:
-        what = f"its {METRICS}, {POSES} or {COVARIANCES} cannot be read"
-        raise DataError(f"{path}: {what} ({error}); run again") from error
+        files = f"{METRICS}, {POSES} or {COVARIANCES}"
+        raise DataError(f"{path}: {files} cannot be read ({error}); run the odometry again") from error
     steps = Steps(arrays["relative_poses"], arrays["relative"]) if "relative" in arrays else None
     return StoredRun(path, trajectory, whole.stamps_ns[~estimated], steps, reference, metrics)
 
@@ -214,5 +227,5 @@ def _metrics(path: Path) -> dict[str, Any]:
     metrics = json.loads(path.read_text(encoding="utf-8"))
     missing = {"sequence", "notes"} - set(metrics)
     if not isinstance(metrics, dict) or missing:
-        raise ValueError(f"no {' and '.join(sorted(missing)) or 'object'} in {path.name}")
+        raise ValueError(f"{path.name} lacks {' and '.join(sorted(missing)) or 'an object'}")
     return metrics

@@ -1,4 +1,4 @@
-"""Which recipe a training run follows: a preset or the one behind given weights, with what a file changes."""
+"""The recipe of a training run: a preset, or that of given weights, with changes from a file."""
 
 from __future__ import annotations
 
@@ -18,26 +18,32 @@ if TYPE_CHECKING:
     from hybridlio.learned.networks.weights import Weights
 
 LSTM = "lstm"
-_ADAPTING = {"epochs": 10, "schedule": "cosine"}
-_GENTLER = 0.1  # adaptation starts with this share of the learning rate that found the weights
+ADAPTED_SUFFIX = "-adapted"
+# Adaptation of trained weights; measured with these values in docs/training.md (benchmarks/front_end.py --adapt).
+_ADAPTATION_EPOCHS = 10
+_ADAPTATION_RATE = 0.1  # share of the recipe's learning rate: small steps, which keep what the weights have learned
 
 
-def adaptation(recipe: Recipe) -> Recipe:
-    """The recipe to go on with weights on another's recordings: the same network and loss, gentle steps, few epochs."""
-    if recipe.name.endswith("-adapted"):
+def adaptation_recipe(recipe: Recipe) -> Recipe:
+    """Return the recipe to adapt weights to other recordings: same network and loss, few epochs with small steps."""
+    if recipe.name.endswith(ADAPTED_SUFFIX):
         return recipe
-    rate = recipe.optimiser.learning_rate * _GENTLER
-    optimiser = replace(recipe.optimiser, learning_rate=rate, **_ADAPTING)  # type: ignore[arg-type]
-    return replace(recipe, name=f"{recipe.name}-adapted", optimiser=optimiser)
+    optimiser = replace(
+        recipe.optimiser,
+        learning_rate=recipe.optimiser.learning_rate * _ADAPTATION_RATE,
+        epochs=_ADAPTATION_EPOCHS,
+        schedule="cosine",
+    )
+    return replace(recipe, name=f"{recipe.name}{ADAPTED_SUFFIX}", optimiser=optimiser)
 
 
-def changed_by_file(recipe: Recipe, path: Path) -> Recipe:
-    """The recipe with what a YAML or JSON file says; what it leaves out stays.
+def with_file(recipe: Recipe, path: Path) -> Recipe:
+    """Return the recipe with the values of a YAML or JSON file; values that the file omits stay.
 
     The file has the sections of a run's ``recipe.json``; ``network.geometry`` may also be the name of a lidar.
 
     Raises:
-        ConfigError: no such file, not YAML, an unknown key or a value out of range; names each.
+        ConfigError: the file is missing or not YAML, has an unknown key or a value out of range; names each.
     """
     tree = read_yaml(path, ConfigError) or {}
     if not isinstance(tree, dict):
@@ -45,62 +51,65 @@ def changed_by_file(recipe: Recipe, path: Path) -> Recipe:
     network = tree.get("network")
     if isinstance(network, dict) and isinstance(network.get("geometry"), str):
         tree = {**tree, "network": {**network, "geometry": asdict(map_geometry(network["geometry"]))}}
-    return from_dict(Recipe, _merged(to_dict(recipe), tree), str(path))
+    return from_dict(Recipe, _merge(to_dict(recipe), tree), str(path))
 
 
 def with_initial_pose(recipe: Recipe, name: str | None) -> Recipe:
-    """The recipe with initial poses by the network's own LSTMs (``lstm``), or given by a source of another name."""
+    """Return the recipe with initial poses from the network's own LSTMs (``lstm``), or given by another source."""
     if name is None:
         return recipe
     network = replace(recipe.network, imu="initial-pose" if name == LSTM else "given")
     return replace(recipe, network=network)
 
 
-def recipe_for(
+def choose_recipe(
     preset_name: str | None = None,
-    behind: Recipe | None = None,
+    weights_recipe: Recipe | None = None,
     file: Path | None = None,
     initial_pose: str | None = None,
     epochs: int | None = None,
 ) -> Recipe:
-    """The recipe of a run.
+    """Return the recipe of a training run.
 
     Args:
-        preset_name: a preset; without it that of the given weights, gentler, or else ``default``.
-        behind: the recipe of weights to start from.
-        file: see :func:`changed_by_file`.
+        preset_name: a preset; None for that of the given weights, adapted, or without weights for ``default``.
+        weights_recipe: the recipe of the weights to start from.
+        file: see :func:`with_file`.
         initial_pose: see :func:`with_initial_pose`.
-        epochs: in place of the recipe's.
+        epochs: replaces the recipe's number of epochs.
 
     Raises:
-        ConfigError: an unknown preset, or the file is no good.
+        ConfigError: the preset is unknown, or the file is invalid.
     """
-    recipe = adaptation(behind) if behind is not None and preset_name is None else preset(preset_name or "default")
+    if weights_recipe is not None and preset_name is None:
+        recipe = adaptation_recipe(weights_recipe)
+    else:
+        recipe = preset(preset_name or "default")
     if file is not None:
-        recipe = changed_by_file(recipe, file)
+        recipe = with_file(recipe, file)
     recipe = with_initial_pose(recipe, initial_pose)
     if epochs is not None:
         recipe = replace(recipe, optimiser=replace(recipe.optimiser, epochs=epochs))
     return recipe
 
 
-def lasting(recipe: Recipe, steps: int, pairs: int) -> Recipe:
-    """The recipe with as many epochs as so many steps over so many pairs begin."""
+def for_steps(recipe: Recipe, steps: int, pairs: int) -> Recipe:
+    """Return the recipe with the number of epochs that this number of steps begins, given the number of pairs."""
     epochs = math.ceil(steps / math.ceil(pairs / recipe.optimiser.batch))
     return replace(recipe, optimiser=replace(recipe.optimiser, epochs=epochs))
 
 
-def origin(name: str, weights: Weights) -> str:
-    """Where a run started, for its weights' metadata: the file, and what that says of itself."""
-    told = [f"{key} {weights.about[key]}" for key in ("data", "commit") if weights.about.get(key)]
-    return f"{name} ({'; '.join([weights.recipe.name, *told])})"
+def describe_origin(name: str, weights: Weights) -> str:
+    """Return the origin of a run for its weights' metadata: the initial weights' file, recipe, data and commit."""
+    details = [f"{key} {weights.about[key]}" for key in ("data", "commit") if weights.about.get(key)]
+    return f"{name} ({'; '.join([weights.recipe.name, *details])})"
 
 
-def _merged(base: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+def _merge(base: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     out = dict(base)
     for key, value in changes.items():
         inner = out.get(key)
-        whole = key == "geometry"  # its four numbers go together
-        both = isinstance(inner, dict) and isinstance(value, Mapping) and not whole
-        out[key] = _merged(inner, value) if both else value  # type: ignore[arg-type]
+        is_nested = isinstance(inner, dict) and isinstance(value, Mapping)
+        replaces_whole = key == "geometry"  # its four numbers belong together
+        out[key] = _merge(inner, value) if is_nested and not replaces_whole else value  # type: ignore[arg-type]
     return out

@@ -1,4 +1,4 @@
-"""Which recordings a batch runs: from paths, patterns and list files to one entry a recording, each with a name."""
+"""The recordings of a batch: expand paths, patterns and list files to one named entry per recording."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ _ANGLE = "vertical_angle_deg"
 
 @dataclass(frozen=True)
 class Recording:
-    """One recording to run, in words that mean the same in another process and on another machine.
+    """One recording to run, described so that another process or machine can open it.
 
     Attributes:
         path: its folder, or one above it.
-        sequence: which one, where there are several.
-        reader: a name of :data:`hybridlio.datasets.registry.READERS`; guessed without it.
-        raw_root: for KITTI odometry, where inertial data are.
-        frames: the part ``A:B`` of it.
-        vertical_angle_deg: raise its points by this angle; None for what the recording needs.
-        name: what its run folder is called.
+        sequence: its name, if the path contains several recordings.
+        reader: a name of :data:`hybridlio.datasets.registry.READERS`; None to detect it.
+        raw_root: KITTI raw data that provide the IMU of KITTI odometry sequences.
+        frames: the range ``A:B`` to use; None for all.
+        vertical_angle_deg: correction of the points' elevation; None for the recording's default.
+        name: the name of its run folder.
 
     Raises:
-        ConfigError: no such reader, ``frames`` is no range, or the angle is over 5°.
+        ConfigError: the reader is unknown, ``frames`` is not a range, or the angle exceeds 5°.
     """
 
     path: str
@@ -52,10 +52,10 @@ class Recording:
             frame_range(self.frames)
 
     def open(self) -> Sequence:
-        """Open it, or the part of it that is wanted.
+        """Open the recording, or the part of it in ``frames``.
 
         Raises:
-            DataError: there is no such recording, or it is malformed, or none of its scans is wanted.
+            DataError: the recording is missing or malformed, or the range contains no scan.
         """
         found = open_sequence(
             self.path,
@@ -67,7 +67,7 @@ class Recording:
         return part_of(found, self.frames)
 
     def to_json_dict(self) -> dict[str, str | float | None]:
-        """What tells it from others, as plain values."""
+        """Return all attributes except the name as plain values."""
         return {key: value for key, value in asdict(self).items() if key != "name"}
 
 
@@ -79,65 +79,66 @@ def find_recordings(
     frames: str | None = None,
     vertical_angle_deg: float | None = None,
 ) -> tuple[Recording, ...]:
-    """Every recording that is meant, once, under names of their own.
+    """Return every recording in ``data`` once, with unique names.
 
-    A path that holds several recordings stands for all of them. One that holds none is kept: it fails when it is
-    opened, and the others do not have to wait for that.
+    A path that contains several recordings stands for all of them. A path that contains none is kept: it fails when
+    it is opened, and does not stop the others.
 
     Args:
-        data: one or more of: paths, patterns (``drives/*``), or files that list them: ``.yaml`` with paths, or with
-            mappings of :class:`Recording`'s attributes but ``name``; or text with a path, and perhaps a sequence, a
-            line. Paths in a file start from its folder.
-        sequence: which recordings, with commas between, where a path holds several.
-        reader, raw_root, frames, vertical_angle_deg: for all that do not say their own.
+        data: one or more of: paths; patterns (``drives/*``); files that list recordings. A ``.yaml`` file lists paths
+            or mappings with :class:`Recording`'s attributes except ``name``; a text file has a path, optionally
+            followed by a sequence, per line. Paths in a file are relative to its folder.
+        sequence: comma-separated names of the recordings to use from a path that contains several.
+        reader, raw_root, frames, vertical_angle_deg: defaults for entries that do not set their own.
 
     Raises:
-        ConfigError: there is not a single one, a pattern matches nothing, there is no such list file, ``reader`` or
-            ``raw_root``, ``frames`` is no range, or the angle is over 5°.
+        ConfigError: there is no recording, a pattern matches nothing, a list file, ``reader`` or ``raw_root`` does
+            not exist, ``frames`` is not a range, or the angle exceeds 5°.
         DataError: a list file cannot be read, or is malformed.
     """
     check_options(raw_root=raw_root)
     data = [data] if isinstance(data, str | Path | Recording) else data
     root = None if raw_root is None else str(raw_root)
-    given = Recording("", sequence, reader, root, frames, vertical_angle_deg)
-    wanted = [_with_defaults(item, given) for entry in data for item in _listed(entry)]
-    found = list(dict.fromkeys(one for item in wanted for one in _each(item)))
+    defaults = Recording("", sequence, reader, root, frames, vertical_angle_deg)
+    entries = [_with_defaults(entry, defaults) for argument in data for entry in _expand(argument)]
+    found = list(dict.fromkeys(one for entry in entries for one in _split(entry)))
     if not found:
         raise ConfigError("no recording to run; give paths, patterns or a list file")
-    return tuple(_named(found))
+    return tuple(_with_unique_names(found))
 
 
-def _listed(entry: str | Path | Recording) -> Iterator[Recording]:
-    """What an argument stands for: itself, or what its pattern matches or its file lists."""
-    if isinstance(entry, Recording):
-        yield entry
+def _expand(argument: str | Path | Recording) -> Iterator[Recording]:
+    """Yield the entries of a list file, the matches of a pattern, or the argument itself."""
+    if isinstance(argument, Recording):
+        yield argument
         return
-    path = Path(entry).expanduser()
+    path = Path(argument).expanduser()
     if path.is_file() and path.suffix in _YAML + _TEXT:
         yield from _read_list(path)
     elif not path.exists() and path.suffix in _YAML + _TEXT:
         raise ConfigError(f"{path}: no such list file")
     elif not path.exists() and glob.has_magic(str(path)):
-        matched = sorted(glob.glob(str(path)))
-        if not matched:
-            raise ConfigError(f"{path}: nothing matches this pattern")
-        yield from map(Recording, matched)
+        matches = sorted(glob.glob(str(path)))
+        if not matches:
+            raise ConfigError(f"{path}: no path matches this pattern")
+        yield from map(Recording, matches)
     else:
         yield Recording(str(path))
 
 
 def _read_list(file: Path) -> Iterator[Recording]:
-    entries = read_yaml(file) if file.suffix in _YAML else _lines(file)
+    entries = read_yaml(file) if file.suffix in _YAML else _read_lines(file)
     if not isinstance(entries, list):
-        raise DataError(f"{file}: expected a list of recordings, one an entry")
+        raise DataError(f"{file}: expected a list of recordings, got {type(entries).__name__}")
     for number, entry in enumerate(entries, 1):
-        item = _entry(entry, f"{file}, entry {number}")
-        below = _from(file.parent, item)
-        found = list(_listed(below.path)) if Path(below.path).suffix not in _YAML + _TEXT else [below]
-        yield from (replace(below, path=one.path) for one in found)
+        parsed = _parse_entry(entry, f"{file}, entry {number}")
+        absolute = _relative_to(file.parent, parsed)
+        is_list = Path(absolute.path).suffix in _YAML + _TEXT
+        found = [absolute] if is_list else list(_expand(absolute.path))  # list files are not nested
+        yield from (replace(absolute, path=one.path) for one in found)
 
 
-def _lines(file: Path) -> list[dict[str, str]]:
+def _read_lines(file: Path) -> list[dict[str, str]]:
     try:
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -150,66 +151,66 @@ def _lines(file: Path) -> list[dict[str, str]]:
             raise DataError(f"{file}, line {number}: {error}") from None
         if len(words) > 2:
             raise DataError(
-                f"{file}, line {number}: expected a path and perhaps a sequence, found {len(words)} words; "
-                "put a path with spaces in quotes"
+                f"{file}, line {number}: expected a path and an optional sequence, found {len(words)} words; "
+                "quote paths that contain spaces"
             )
         entries += [dict(zip(("path", "sequence"), words, strict=False))] if words else []
     return entries
 
 
-def _entry(entry: Any, where: str) -> Recording:
+def _parse_entry(entry: Any, place: str) -> Recording:
     known = [f.name for f in fields(Recording) if f.name != "name"]
     values = {"path": entry} if isinstance(entry, str) else entry
     if not isinstance(values, dict) or not values.get("path"):
-        raise DataError(f"{where}: expected a path, or a mapping with one")
+        raise DataError(f"{place}: expected a path, or a mapping with the key path")
     unknown = [key for key in values if key not in known]
     if unknown:
-        raise DataError(f"{where}: unknown key {unknown[0]!r}; the keys are {', '.join(known)}")
+        raise DataError(f"{place}: unknown key {unknown[0]!r}; choose from {', '.join(known)}")
     angle = values.get(_ANGLE)
     if angle is not None and (isinstance(angle, bool) or not isinstance(angle, int | float)):
-        raise DataError(f"{where}: {_ANGLE} {angle!r}: give a number of degrees")
-    said = {key: str(value) for key, value in values.items() if value is not None and key != _ANGLE}
+        raise DataError(f"{place}: {_ANGLE} {angle!r}: give a number of degrees")
+    texts = {key: str(value) for key, value in values.items() if value is not None and key != _ANGLE}
     try:
-        return Recording(**said, vertical_angle_deg=angle)
+        return Recording(**texts, vertical_angle_deg=angle)
     except ConfigError as error:
-        raise DataError(f"{where}: {error}") from None
+        raise DataError(f"{place}: {error}") from None
 
 
-def _from(folder: Path, item: Recording) -> Recording:
-    """The item with its paths started from a folder."""
-    root = item.raw_root and str(folder / Path(item.raw_root).expanduser())
-    return replace(item, path=str(folder / Path(item.path).expanduser()), raw_root=root)
+def _relative_to(folder: Path, entry: Recording) -> Recording:
+    """Return the entry with its relative paths resolved from a folder."""
+    root = entry.raw_root and str(folder / Path(entry.raw_root).expanduser())
+    return replace(entry, path=str(folder / Path(entry.path).expanduser()), raw_root=root)
 
 
-def _with_defaults(item: Recording, given: Recording) -> Recording:
-    own = {key: value for key, value in asdict(item).items() if value not in (None, "")}
-    return Recording(**(asdict(given) | own))
+def _with_defaults(entry: Recording, defaults: Recording) -> Recording:
+    own = {key: value for key, value in asdict(entry).items() if value not in (None, "")}
+    return Recording(**(asdict(defaults) | own))
 
 
-def _each(item: Recording) -> Iterator[Recording]:
-    """The item once for every recording that it stands for, its path absolute."""
-    item = _from(Path.cwd(), item)
+def _split(entry: Recording) -> Iterator[Recording]:
+    """Yield the entry once per recording that its path and sequence names stand for, with an absolute path."""
+    entry = _relative_to(Path.cwd(), entry)
     try:
-        names = sequence_names(item.path, reader=item.reader)
+        names = sequence_names(entry.path, reader=entry.reader)
     except HybridLioError:
-        yield replace(item, name=Path(item.path).name)
+        yield replace(entry, name=Path(entry.path).name)
         return
-    for wanted in (word.strip() for word in item.sequence.split(",")) if item.sequence else names:
-        yield replace(item, sequence=wanted, name=_full_name(wanted, names))
+    for chosen in (word.strip() for word in entry.sequence.split(",")) if entry.sequence else names:
+        yield replace(entry, sequence=chosen, name=_full_name(chosen, names))
 
 
-def _full_name(wanted: str, names: tuple[str, ...]) -> str:
-    """The recording's whole name where it was picked by its number."""
-    if wanted.isdigit() and wanted not in names:
-        ends = [name for name in names if (tail := re.search(r"\d+$", name)) and int(tail[0]) == int(wanted)]
-        return ends[0] if len(ends) == 1 else wanted
-    return wanted
+def _full_name(chosen: str, names: tuple[str, ...]) -> str:
+    """Return the recording's full name if it was chosen by its number."""
+    if chosen.isdigit() and chosen not in names:
+        matches = [name for name in names if (tail := re.search(r"\d+$", name)) and int(tail[0]) == int(chosen)]
+        return matches[0] if len(matches) == 1 else chosen
+    return chosen
 
 
-def _named(found: list[Recording]) -> Iterator[Recording]:
-    """Names that can be folders, none given twice: where several recordings share one, each gets a mark of its own."""
-    safe = [re.sub(r"[^\w.-]+", "_", item.name).lstrip(".") or "recording" for item in found]
+def _with_unique_names(found: list[Recording]) -> Iterator[Recording]:
+    """Yield the recordings with names fit for folders; recordings with equal names get a hash appended."""
+    safe = [re.sub(r"[^\w.-]+", "_", entry.name).lstrip(".") or "recording" for entry in found]
     count = Counter(safe)
-    for item, name in zip(found, safe, strict=True):
-        mark = hashlib.sha256(repr(item.to_json_dict()).encode()).hexdigest()[:6]
-        yield replace(item, name=name if count[name] == 1 else f"{name}-{mark}")
+    for entry, name in zip(found, safe, strict=True):
+        digest = hashlib.sha256(repr(entry.to_json_dict()).encode()).hexdigest()[:6]
+        yield replace(entry, name=name if count[name] == 1 else f"{name}-{digest}")

@@ -1,10 +1,10 @@
-"""The loop: a sequence through an odometry, from the first scan to the last or to where it is stopped."""
+"""The main loop: run an odometry over a sequence, from the first usable scan until the end or an interrupt."""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import islice
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.packed_arrays import PackedList
+from hybridlio.core.progress import Progress
 from hybridlio.core.sensors import NS_PER_S, Frame
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.sequence import Sequence
@@ -25,28 +26,26 @@ from hybridlio.sources.innovation_gate import GATE_NIS, Verdict
 
 _log = logging.getLogger(__name__)
 
-Progress = Callable[[int, int, float], None]
-
-_CLOCKS_APART_NS = 30 * NS_PER_S  # GPS time and UTC are 18 s apart
-_TOLD = 3  # scans that a run cannot start at, by warnings
+_MAX_CLOCK_OFFSET_NS = 30 * NS_PER_S  # more than the 18 s between GPS time and UTC
+_MAX_START_WARNINGS = 3  # enough to see why; later unusable scans are logged as information
 _FROM_IMU, _WITHOUT_IMU = "preintegration", "constant-velocity"
 
 
 @dataclass(eq=False)
 class Run:
-    """What a run came to, whole or up to where it stopped.
+    """A run over a sequence, complete or up to where it stopped.
 
     Attributes:
         sequence: the recording.
-        odometry: in the state it was left in.
-        estimates: one for each scan from the first usable one on.
-        skipped: scans before that one.
-        unreadable: why, by frame, where a scan could not be read or not be started at; bridged where there is an
-            estimate before.
-        reading_s: seconds spent reading, one for each estimate.
-        seconds: wall time of the whole loop.
-        stopped: what stopped the run before its end, such as a KeyboardInterrupt; None for a whole one.
-        points_before: of the last scan that was read.
+        odometry: the odometry, in its last state.
+        estimates: one per scan, from the first usable scan on.
+        skipped: number of scans before the first usable one.
+        unreadable: by frame, why a scan could not be read or the run could not start at it. Such a scan is bridged
+            by the initial pose, or skipped before the first estimate.
+        reading_s: seconds spent reading, one per estimate.
+        seconds: wall time of the loop.
+        stopped: the error or KeyboardInterrupt that stopped the run early, or None.
+        last_points: ``(N, 3)`` points of the last scan read, to detect a scan that is delivered twice.
     """
 
     sequence: Sequence
@@ -57,16 +56,16 @@ class Run:
     reading_s: list[float] = field(default_factory=list)
     seconds: float = 0.0
     stopped: BaseException | None = None
-    points_before: NDArray[np.float32] | None = field(default=None, repr=False)
+    last_points: NDArray[np.float32] | None = field(default=None, repr=False)
 
     @property
     def done(self) -> int:
-        """Scans dealt with, those before the first usable one too."""
+        """Number of scans processed, including those before the first usable one."""
         return self.skipped + len(self.estimates) if self.estimates else 0
 
     @property
     def trajectory(self) -> Trajectory:
-        """The estimates, in the first usable scan's frame, with covariances."""
+        """The estimated poses, in the frame of the first usable scan, with covariances."""
         estimates = list(self.estimates)
         return Trajectory(
             np.array([e.stamp_ns for e in estimates]),
@@ -81,7 +80,7 @@ class Run:
 
     @property
     def steps(self) -> Steps:
-        """The backend's motions from estimate to estimate."""
+        """The relative poses between estimates, as the backend has them."""
         steps = [e.step for e in self.estimates if e.step is not None]
         return Steps(
             np.array([s.pose for s in steps]).reshape(-1, 4, 4),
@@ -95,26 +94,26 @@ class Run:
 
     @property
     def ok(self) -> NDArray[np.bool_]:
-        """``(N-1,)``; False where the residual source failed and the initial pose bridges."""
+        """``(N-1,)``; False where the residual source failed and the initial pose is used instead."""
         return np.array([e.relative.ok for e in self.estimates if e.relative is not None], dtype=bool)
 
     @property
     def degenerate(self) -> NDArray[np.bool_]:
-        """``(N-1,)``; True where the scan left a direction unconstrained."""
+        """``(N-1,)``; True where the scan does not constrain every direction."""
         return np.array([len(e.relative.degenerate) > 0 for e in self.estimates if e.relative is not None], dtype=bool)
 
     @property
     def bridged(self) -> list[int]:
-        """The frames of which :attr:`ok` is False."""
+        """The frames where :attr:`ok` is False: bridged by the initial pose."""
         return (np.flatnonzero(~self.ok) + self.skipped + 1).tolist()
 
-    def judged(self, verdict: Verdict) -> list[int]:
-        """The frames whose relative pose came off so in the comparison with the IMU."""
+    def frames_with(self, verdict: Verdict) -> list[int]:
+        """Return the frames with this verdict of the innovation gate, which compares scan and IMU."""
         return [self.skipped + k for k, e in enumerate(self.estimates) if e.gate.verdict == verdict]
 
     @property
     def timings_s(self) -> dict[str, Array]:
-        """Seconds by stage, one for each estimate after the first; reading the scan is a stage."""
+        """Seconds by stage, including reading; one per estimate after the first."""
         seconds = [e.seconds for e in islice(self.estimates, 1, None)]
         stages = dict.fromkeys(stage for spent in seconds for stage in spent)
         spent = {stage: np.array([one.get(stage, 0.0) for one in seconds]) for stage in stages}
@@ -122,25 +121,34 @@ class Run:
 
     @property
     def record(self) -> Record | None:
-        """What smoothing needs, with fixes that another clock may have stamped; None for less than two estimates."""
+        """The input of smoothing; None for fewer than two estimates.
+
+        GPS fixes shortly before and after the run are included, as their clock may be offset.
+        """
         if len(self.estimates) < 2:
             return None
-        record = self.odometry.record(len(self.estimates))  # an interrupt may have left it one scan ahead
+        record = self.odometry.record(
+            len(self.estimates)
+        )  # an interrupt can leave the odometry one scan ahead of the list
         begin, end = (int(stamp) for stamp in record.online.stamps_ns[[0, -1]])
-        near = (fix for fix in self.sequence.gps if begin - _CLOCKS_APART_NS <= fix.stamp_ns <= end + _CLOCKS_APART_NS)
+        near = (
+            fix
+            for fix in self.sequence.gps
+            if begin - _MAX_CLOCK_OFFSET_NS <= fix.stamp_ns <= end + _MAX_CLOCK_OFFSET_NS
+        )
         return replace(record, gps=tuple(near))
 
 
 def run_odometry(sequence: Sequence, odometry: Odometry, progress: Progress | None = None) -> Run:
-    """Give every frame of a sequence to an odometry.
+    """Run an odometry over all frames of a sequence.
 
-    A scan that cannot be read is bridged as one of no points is, with a warning. What stops the run is kept in
-    :attr:`Run.stopped` rather than raised, so that what was estimated before is not lost.
+    A scan that cannot be read is bridged by the initial pose, with a warning. An error or interrupt that stops the
+    run is returned in :attr:`Run.stopped`, not raised, so that the estimates before it are kept.
 
     Args:
         sequence: the recording.
-        odometry: a fresh one.
-        progress: called after each scan with scans done, scans in all and metres travelled.
+        odometry: a new odometry.
+        progress: called after each scan with the distance travelled (``12.3 m``), scans done and scans in all.
     """
     run = Run(sequence, odometry)
     _log.info(
@@ -155,9 +163,9 @@ def run_odometry(sequence: Sequence, odometry: Odometry, progress: Progress | No
                 last = run.estimates[-2].pose[:3, 3], run.estimates[-1].pose[:3, 3]
                 distance_m += float(np.linalg.norm(last[1] - last[0]))
             if progress is not None:
-                progress(k + 1, len(sequence), distance_m)
+                progress(f"{distance_m:.1f} m", k + 1, len(sequence))
         if not run.estimates:
-            raise DataError(f"{sequence.name}: no scan to start at; the first: {next(iter(run.unreadable.values()))}")
+            raise DataError(f"{sequence.name}: no usable scan; the first: {next(iter(run.unreadable.values()))}")
     except (KeyboardInterrupt, Exception) as error:
         run.stopped = error
     run.seconds = time.perf_counter() - start
@@ -165,10 +173,10 @@ def run_odometry(sequence: Sequence, odometry: Odometry, progress: Progress | No
 
 
 def _advance(run: Run, k: int) -> None:
-    """Read frame ``k`` and estimate it; before the first estimate a frame that cannot be started at is skipped."""
+    """Read frame ``k`` and estimate its pose. Before the first estimate, an unusable frame is skipped."""
     start = time.perf_counter()
-    frame = _frame(run, k)
-    read = time.perf_counter() - start
+    frame = _read_frame(run, k)
+    read_s = time.perf_counter() - start
     try:
         if not run.estimates and k in run.unreadable:
             raise DataError(run.unreadable[k])
@@ -178,41 +186,42 @@ def _advance(run: Run, k: int) -> None:
             raise
         run.unreadable[k] = str(error)
         run.skipped += 1
-        level = logging.WARNING if run.skipped <= _TOLD else logging.INFO
-        more = "; -v tells of more scans like this" if run.skipped == _TOLD else ""
-        _log.log(level, "cannot start here, trying the next: %s%s", error, more)
+        level = logging.WARNING if run.skipped <= _MAX_START_WARNINGS else logging.INFO
+        more = "; further scans like this are logged with -v" if run.skipped == _MAX_START_WARNINGS else ""
+        _log.log(level, "cannot start at this scan, trying the next: %s%s", error, more)
         return
-    run.reading_s.append(read)
+    run.reading_s.append(read_s)
     run.estimates.append(estimate)
     if estimate.gate.verdict in ("down-weighted", "rejected", "relocated"):
         nis, verdict = estimate.gate.nis, estimate.gate.verdict
         _log.info("frame %d: %s: innovation against the IMU has χ² = %.0f (gate %.0f)", k, verdict, nis, GATE_NIS)
     elif estimate.relative is not None and not estimate.relative.ok and k not in run.unreadable:
-        _log.info("frame %d: bridged by the initial pose: %s", k, _why(estimate.relative.details))
-    _log.debug("frame %d: %s", k, _described(estimate))
+        _log.info("frame %d: bridged by the initial pose: %s", k, _bridging_reason(estimate.relative.details))
+    _log.debug("frame %d: %s", k, _describe(estimate))
 
 
-def _why(details: Mapping[str, float]) -> str:
+def _bridging_reason(details: Mapping[str, float]) -> str:
     points = f"{details.get('points', 0.0):.0f} points"
     return f"{details['matched']:.0%} of {points} match" if "matched" in details else f"{points} to match"
 
 
-def _described(estimate: Estimate) -> str:
+def _describe(estimate: Estimate) -> str:
     relative = estimate.relative
     if relative is None:
-        return "the first"
+        return "first estimate"
     words = [f"{relative.source}{'' if relative.ok else ' (bridged)'}"]
     words += [f"{len(relative.degenerate)} directions unconstrained"] if len(relative.degenerate) else []
     words += [f"{name} {value:.4g}" for name, value in relative.details.items()]
     return ", ".join(words + [f"{stage} {1e3 * spent:.0f} ms" for stage, spent in estimate.seconds.items()])
 
 
-def _frame(run: Run, k: int) -> Frame:
+def _read_frame(run: Run, k: int) -> Frame:
+    """Return frame ``k``, without points if its scan cannot be read or repeats the one before."""
     try:
         frame = run.sequence[k]
-        before, run.points_before = run.points_before, frame.scan.points
+        before, run.last_points = run.last_points, frame.scan.points
         if len(frame.scan) and before is not None and np.array_equal(frame.scan.points, before):
-            raise DataError("its points are those of the scan before, to the last bit")  # delivered twice
+            raise DataError("its points are identical to those of the scan before; it was delivered twice")
         return frame
     except DataError as error:
         run.unreadable[k] = str(error)
@@ -221,22 +230,22 @@ def _frame(run: Run, k: int) -> Frame:
         return run.sequence.without_scan(k)
 
 
-def suited_to(sequence: Sequence, config: Config, as_asked: bool = False) -> Config:
-    """The configuration, with an initial pose that needs no inertial data where the recording has none.
+def adapt_config(sequence: Sequence, config: Config, is_explicit: bool = False) -> Config:
+    """Return the configuration, with initial poses by constant velocity if the recording has no IMU data.
 
     Args:
         sequence: the recording.
         config: the settings.
-        as_asked: they are somebody's choice, and stay.
+        is_explicit: the user chose the initial pose; do not change it.
 
     Raises:
-        DataError: preintegration was chosen, and there is nothing to integrate.
+        DataError: the user chose preintegration, and there are no IMU data.
     """
-    if len(sequence.imu) or (as_asked and config.initial_pose != _FROM_IMU):
+    if len(sequence.imu) or (is_explicit and config.initial_pose != _FROM_IMU):
         return config
-    if as_asked:
+    if is_explicit:
         raise DataError(
-            f"{sequence.name}: no IMU samples for initial poses by {_FROM_IMU}; choose another, such as {_WITHOUT_IMU}"
+            f"{sequence.name}: no IMU data for {_FROM_IMU}; choose another initial pose, such as {_WITHOUT_IMU}"
         )
-    _log.warning("%s: no inertial data, so initial poses by %s", sequence.name, _WITHOUT_IMU)
+    _log.warning("%s: no IMU data; the initial poses are by %s", sequence.name, _WITHOUT_IMU)
     return config.model_copy(update={"initial_pose": _WITHOUT_IMU})

@@ -1,4 +1,4 @@
-"""What is written of a run: its files, its metrics, its report."""
+"""Write a run folder: poses, covariances, graph, record, metrics and report."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ import numpy as np
 from hybridlio.core import se3
 from hybridlio.core.errors import EstimationError
 from hybridlio.core.files import write_whole
+from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.tables import counted
 from hybridlio.core.trajectory_files import write_tum
 from hybridlio.core.version import __version__
 from hybridlio.evaluation.evaluate import Evaluation, Steps
 from hybridlio.evaluation.report import draw, write_report
-from hybridlio.evaluation.report_data import Findings, ReportData, find
+from hybridlio.evaluation.report_data import Findings, ReportData, analyse
 from hybridlio.odometry.config import Config, config_to_yaml
 from hybridlio.record.record import Record
 from hybridlio.runs import folder as run_folder
@@ -28,22 +29,22 @@ if TYPE_CHECKING:
     from hybridlio.sources.innovation_gate import Verdict
 
 _ONLINE, _SMOOTHED = "odometry", "smoothed"
-_TOLD = 20
-_MANY = 0.1  # of all scans
+_MAX_SCANS_NOTED = 20  # unreadable scans listed in the report; metrics.json has them all
+_LARGE_SHARE = 0.1  # of all scans; more conflicts with the IMU than single bad scans explain
 
 
 def write_run(folder: Path, run: Run, config: Config) -> Findings:
-    """Write everything of a run, whole or interrupted, in place of what an earlier run left in the folder.
+    """Write all files of a run, complete or interrupted, and remove those of an earlier run in the folder.
 
     Returns:
-        What the evaluation found.
+        The evaluation of the run.
 
     Raises:
-        EstimationError: there is not a single estimate.
+        EstimationError: the run has no estimate.
         DataError: a file cannot be written.
     """
     if not run.estimates:
-        raise EstimationError(f"{run.sequence.name}: nothing was estimated")
+        raise EstimationError(f"{run.sequence.name}: the run has no estimate to write")
     run_folder.clear(folder)
     sequence, trajectory, record = run.sequence, run.trajectory, run.record
     if record is not None:
@@ -57,60 +58,59 @@ def write_run(folder: Path, run: Run, config: Config) -> Findings:
     text = config_to_yaml(config)
     write_whole(folder / run_folder.CONFIG, text)
     data = report_data(run, config, text)
-    findings = find(data)
+    findings = analyse(data)
     write_pages(folder, data, findings)
     run_folder.write_metrics(folder, metrics(run, config, findings.evaluations.get(_ONLINE)))
     return findings
 
 
 def write_pages(folder: Path, data: ReportData, findings: Findings) -> None:
-    """Write ``report.html``, and the picture of the path alone."""
+    """Write ``report.html``, and the plot of the trajectory as ``trajectory.png``."""
     drawn = draw(data, findings)
     write_report(folder / run_folder.REPORT, data, findings, drawn)
     write_whole(folder / run_folder.PICTURE, drawn["trajectory"])
 
 
 def T_pose_files(run: Run) -> Any:
-    """``T_camera_lidar`` where KITTI pose files of the recording are in the camera's frame, else None."""
+    """Return ``T_camera_lidar`` if the recording's KITTI pose files are in the camera frame, else None."""
     sequence = run.sequence
     return sequence.calibration.T_camera_lidar if sequence.pose_file_frame == "camera" else None
 
 
 def notes(run: Run) -> list[str]:
-    """What a reader should know before trusting the figures."""
+    """Return what a reader of the results should know first, such as scans that could not be used."""
     out = list(run.sequence.notes)
     if run.stopped is not None:
-        why = "interrupted" if isinstance(run.stopped, KeyboardInterrupt) else f"stopped by an error ({run.stopped})"
-        out.append(f"{why} after {run.done} of {len(run.sequence)} scans")
+        cause = "interrupted" if isinstance(run.stopped, KeyboardInterrupt) else f"stopped by an error ({run.stopped})"
+        out.append(f"{cause} after {run.done} of {len(run.sequence)} scans")
     if run.skipped:
-        out.append(f"the run starts at scan {run.skipped}; {counted(run.skipped, 'scan')} before could not be used")
+        out.append(f"the run starts at scan {run.skipped}; no earlier scan is usable")
     if run.bridged:
-        out.append(f"bridged by the initial pose, as they could not be used: {counted(len(run.bridged), 'scan')}")
-    out += disagreements(run)
-    told = [f"frame {k}: {why}" for k, why in run.unreadable.items()]
-    return out + told[:_TOLD] + ([f"and {len(told) - _TOLD} more"] if len(told) > _TOLD else [])
+        out.append(f"{counted(len(run.bridged), 'unusable scan')} bridged by the initial pose")
+    out += imu_conflicts(run)
+    listed = [f"frame {k}: {reason}" for k, reason in run.unreadable.items()]
+    more = len(listed) - _MAX_SCANS_NOTED
+    return out + listed[:_MAX_SCANS_NOTED] + ([f"and {more} more"] if more > 0 else [])
 
 
-def disagreements(run: Run) -> list[str]:
-    """What was done with scans that contradict the IMU, in a line each, and what to check then; often none."""
-    said = {
-        "rejected": "left out, as they contradict the IMU",
-        "relocated": "the map is followed from there, the jump left out, after contradicting the IMU once too often",
-        "down-weighted": "counted for less, as they disagree with the IMU beyond their covariances",
-        "trusted again": "taken as they are, as they contradict the IMU for longer than it is to be believed",
+def imu_conflicts(run: Run) -> list[str]:
+    """Return one line per verdict of the innovation gate: how many scans conflict with the IMU and what was done."""
+    actions = {
+        "rejected": "rejected: they conflict with the IMU, which bridges them",
+        "relocated": "used to relocate in the map after repeated rejections; the jump is not in the trajectory",
+        "down-weighted": "down-weighted: they differ from the IMU by more than their covariances",
+        "trusted again": "accepted although they conflict with the IMU, after too many rejections in a row",
     }
-    counts = {what: len(run.judged(cast("Verdict", verdict))) for verdict, what in said.items()}
-    out = [f"{what}: {counted(count, 'scan')}" for what, count in counts.items() if count]
-    gross = len(run.judged("rejected")) + len(run.judged("trusted again"))
-    if gross > _MANY * len(run.estimates):
-        out.append(
-            "so many scans contradict the IMU that it may be its data that are wrong: check T_imu_lidar, units, clock"
-        )
+    counts = {action: len(run.frames_with(cast("Verdict", verdict))) for verdict, action in actions.items()}
+    out = [f"{counted(count, 'scan')} {action}" for action, count in counts.items() if count]
+    conflicts = len(run.frames_with("rejected")) + len(run.frames_with("trusted again"))
+    if conflicts > _LARGE_SHARE * len(run.estimates):
+        out.append("many scans conflict with the IMU; its data may be wrong: check T_imu_lidar, units and clock")
     return out
 
 
 def report_data(run: Run, config: Config, config_text: str) -> ReportData:
-    """The run for its report."""
+    """Return the input of the run's report."""
     return ReportData(
         name=run.sequence.name,
         estimate=run.trajectory,
@@ -130,7 +130,7 @@ def report_data(run: Run, config: Config, config_text: str) -> ReportData:
 
 
 def metrics(run: Run, config: Config, evaluation: Evaluation | None) -> dict[str, Any]:
-    """The figures of a run as plain values: what was done, how quickly and, with a reference, how well."""
+    """Return the content of ``metrics.json``: settings, counts, times and, with a reference, errors."""
     T = T_pose_files(run)
     out: dict[str, Any] = {
         "hybridlio": __version__,
@@ -143,10 +143,10 @@ def metrics(run: Run, config: Config, evaluation: Evaluation | None) -> dict[str
         "interrupted": run.stopped is not None,
         "skipped": run.skipped,
         "bridged": run.bridged,
-        "rejected": run.judged("rejected"),
-        "down_weighted": run.judged("down-weighted"),
-        "relocated": run.judged("relocated"),
-        "trusted_again": run.judged("trusted again"),
+        "rejected": run.frames_with("rejected"),
+        "down_weighted": run.frames_with("down-weighted"),
+        "relocated": run.frames_with("relocated"),
+        "trusted_again": run.frames_with("trusted again"),
         "degenerate": (np.flatnonzero(run.degenerate) + run.skipped + 1).tolist(),
         "unreadable": {str(k): why for k, why in run.unreadable.items()},
         "notes": notes(run),
@@ -163,7 +163,7 @@ def metrics(run: Run, config: Config, evaluation: Evaluation | None) -> dict[str
 
 
 def ms_per_scan(run: Run) -> dict[str, float]:
-    """Median milliseconds a scan by stage, and ``total`` without reading; empty for a single estimate."""
+    """Return the median milliseconds per scan by stage, and ``total`` without reading; empty for a single estimate."""
     stages = run.timings_s
     if not stages:
         return {}
@@ -172,25 +172,28 @@ def ms_per_scan(run: Run) -> dict[str, float]:
 
 
 def forward_speed_length_m(run: Run) -> float | None:
-    """How far the vehicle went over the estimated scans by its own forward speed (trapezoidal rule), if known."""
+    """Return the path length by the vehicle's own forward speed (trapezoidal rule), or None if it is unknown."""
     speed = run.sequence.forward_speed_m_s
     if speed is None or len(run.estimates) < 2:
         return None
     rows = slice(run.skipped, run.done)
-    return float(np.trapezoid(speed[rows], run.sequence.stamps_ns[rows] / 1e9))
+    return float(np.trapezoid(speed[rows], run.sequence.stamps_ns[rows] / NS_PER_S))
 
 
 def imu_path_length_m(run: Run) -> float:
-    """How far the IMU went; in bends that is another way than the lidar's, and the forward speed is of this one."""
+    """Return the estimated path length of the IMU, to compare with the forward speed, which is that of the IMU.
+
+    In bends it differs from the path length of the lidar.
+    """
     poses = run.trajectory.poses @ se3.inverse(run.sequence.calibration.T_imu_lidar)
     return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
 
 
 def write_smoothed(folder: Path, stored: run_folder.StoredRun, record: Record, smoothed: Smoothed) -> Findings:
-    """Write a smoothed run as a run folder of its own, its report showing the trajectory before and after.
+    """Write a smoothed run as a run folder, with a report that shows the trajectory before and after smoothing.
 
     Returns:
-        What the evaluation of both found.
+        The evaluation of both trajectories.
 
     Raises:
         DataError: a file cannot be written.
@@ -204,7 +207,7 @@ def write_smoothed(folder: Path, stored: run_folder.StoredRun, record: Record, s
     run_folder.write_graph(folder, trajectory.poses, edges, len(stored.stamps_before))
     if stored.reference is not None:
         write_tum(folder / run_folder.REFERENCE, stored.reference)
-    findings = find(data := _smoothed_report_data(stored, record, smoothed, steps))
+    findings = analyse(data := _smoothed_report_data(stored, record, smoothed, steps))
     write_pages(folder, data, findings)
     run_folder.write_metrics(folder, _smoothed_metrics(stored, smoothed, findings.evaluations.get(_SMOOTHED)))
     return findings

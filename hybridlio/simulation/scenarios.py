@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from hybridlio.core.errors import ConfigError
+from hybridlio.core.progress import Progress
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.faults import block_sector, drop_scans, imu_bias, imu_gap
-from hybridlio.simulation.simulate import Progress, simulate
+from hybridlio.simulation.simulate import simulate
 
 _SPEED_M_S, _HARD_SPEED_M_S = 10.0, 16.0
 
@@ -83,7 +84,7 @@ def open_scenario(
         name: one of :data:`SCENARIOS`.
         out: a folder for the drives of all scenarios, one below it for each.
         seed, length_m: of the drive.
-        progress: called with scans done and scans in all.
+        progress: as of :func:`hybridlio.simulation.simulate.simulate`.
 
     Raises:
         ConfigError: there is no such scenario.

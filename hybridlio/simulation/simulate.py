@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.core.errors import DataError
-from hybridlio.core.files import alone_in, write_whole
+from hybridlio.core.files import locked, write_whole
 from hybridlio.core.geodesy import origin_of
+from hybridlio.core.progress import Progress
 from hybridlio.core.sensors import NS_PER_S, LidarModel, Scan
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.kitti_writer import (
@@ -34,8 +34,6 @@ from hybridlio.simulation.sensors.gps import gps_csv, gps_fixes
 from hybridlio.simulation.sensors.imu import add_noise, ideal_imu
 from hybridlio.simulation.sensors.lidar import RayPattern, first_hits, measure, ray_pattern
 
-Progress = Callable[[int, int], None]
-
 FORMAT_VERSION = 1
 _LEAD_S = 0.2  # the IMU runs so long before the first scan's stamp and after the last one's
 
@@ -49,7 +47,7 @@ def simulate(out: Path, config: SimulationConfig, progress: Progress | None = No
     Args:
         out: the folder to write to, made where it is missing.
         config: the settings.
-        progress: called with scans done and scans in all, after each scan.
+        progress: called after each scan with an empty stage, scans done and scans in all.
 
     Returns:
         The drive, ``OUT/<date>/<date>_drive_NNNN_sync``. In it also lie ``poses.txt`` (exact lidar poses in the first
@@ -68,7 +66,7 @@ def simulate(out: Path, config: SimulationConfig, progress: Progress | None = No
         return done.sync
     partial = DriveFolders(Path(out) / f".partial-{_fingerprint(description)}", done.number)
     drive = plan(config)
-    with alone_in(partial.root):
+    with locked(partial.root / ".lock"):
         if not done.sync.exists():  # another process may have made it meanwhile
             _write_measurements(partial, drive, config)
             _write_scans(partial, drive, config, progress)
@@ -152,7 +150,7 @@ def _write_scans(folders: DriveFolders, drive: Drive, config: SimulationConfig, 
         if not (folders.velodyne / "data" / f"{k:010d}.bin").exists():
             write_scan(folders.velodyne, k, scan_at(drive, k, pattern, config))
         if progress is not None:
-            progress(k + 1, total)
+            progress("", k + 1, total)
 
 
 def scan_at(

@@ -50,7 +50,7 @@ def test_rows_are_trained_shown_beside_the_published_and_not_trained_again(tiny_
     assert "2.03 / 1.14" in done.output
     said = json.loads((tmp_path / "table-2.json").read_text())
     assert [line["result"]["steps"] for line in said["lines"]] == [2, 2, 2]
-    assert "2 steps a row, at reduced size" in (tmp_path / "table-2.md").read_text()
+    assert "2 steps per row, reduced size" in (tmp_path / "table-2.md").read_text()
     stamps = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/result.json")}
     assert len(stamps) == 3
     again = run(tiny_drive, *words)

@@ -94,8 +94,8 @@ def test_a_configuration_is_printed_changed_and_used(tiny_drive, tmp_path, witho
         (("odometry", "nowhere", "--frames", "x"), "'x'"),  # which is known before the recording is looked for
         (("odometry", "DRIVE", "--config", "none.yaml"), "none.yaml"),
         (("compare", "DRIVE", "--initial-pose", "kalman,guess"), "'guess'"),
-        (("compare", "DRIVE", "--residual", ","), "no name"),
-        (("smooth", "DRIVE"), "no run in it"),
+        (("compare", "DRIVE", "--residual", ","), "no name given"),
+        (("smooth", "DRIVE"), "not a run folder"),
         (("evaluate", "nowhere", "--reference", "DRIVE"), "nowhere"),
         (("view", "DRIVE"), "report.html"),
     ],
@@ -141,7 +141,7 @@ def test_what_the_system_refuses_is_no_fault_of_the_librarys(error, said, monkey
 
     monkeypatch.setattr("hybridlio.odometry.config.config_to_yaml", fail)
     assert said in (words := refused(1, "config"))
-    assert "fault" not in words
+    assert "bug" not in words
 
 
 def test_progress_goes_to_stderr_so_that_results_can_be_piped(tiny_drive, tmp_path, without_pages):

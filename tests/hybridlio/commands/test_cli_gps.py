@@ -56,7 +56,7 @@ def test_smoothing_is_told_of_antenna_clock_and_outages(with_fixes: Path, monkey
 def test_georeferencing_is_told_of_the_antenna(with_fixes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given, place = [], georeference.georeference
     monkeypatch.setattr(georeference, "georeference", lambda *a, **k: (given.append(k), place(*a, **k))[1])
-    assert "13 of 13 fixes agree" in ok("georeference", with_fixes, *OPTIONS)
+    assert "13 of 13 fixes are inliers" in ok("georeference", with_fixes, *OPTIONS)
     assert given[0]["antenna_m"].tolist() == LEVER_M.tolist()
     assert given[0]["max_shift_s"] == 0
 
@@ -67,7 +67,7 @@ def test_georeferencing_is_told_of_the_antenna(with_fixes: Path, monkeypatch: py
         (("--gps", "--antenna", "1,2"), "--antenna '1,2': give X,Y,Z"),
         (("--gps", "--antenna", "1,2,nan"), "antenna_m: must be three finite numbers"),
         (("--gps", "--outage", "30"), "--outage '30': give seconds"),
-        (("--gps", "--outage", "9:8"), "--outage '9:8': its end is not after its start"),
+        (("--gps", "--outage", "9:8"), "--outage '9:8': the end must be after the start"),
         (("--antenna", "1,2,3"), "give --gps too"),
         (("--outage", "1:2"), "give --gps too"),
     ],

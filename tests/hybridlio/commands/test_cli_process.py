@@ -41,7 +41,7 @@ def test_an_interrupted_run_keeps_what_was_estimated(name, tiny_drive, project_r
     done = subprocess.run(command, env=env, capture_output=True, text=True, check=False, restore_signals=True)
     assert done.returncode == 130, done.stderr
     assert "Traceback" not in done.stderr
-    assert "kept 8 of 25 scans" in done.stderr
+    assert "wrote 8 of 25 scans" in done.stderr
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())
     assert (metrics["frames_done"], metrics["frames"], metrics["interrupted"]) == (8, 25, True)
     with np.load(tmp_path / "run/odometry.npz") as record:

@@ -100,7 +100,7 @@ def test_scans_that_cannot_be_read_are_bridged_told_and_have_rows(damaged, tmp_p
     assert result.exit_code == 0, result.output
     for name in ("0000000007.bin", "0000000012.bin"):
         assert name in result.stderr
-    assert "bridged scans: 7, 12" in result.stdout
+    assert "2 scans bridged by the initial pose: 7, 12" in result.stdout
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())
     assert metrics["bridged"] == [7, 12]
     assert set(metrics["unreadable"]) == {"7", "12"}
@@ -146,7 +146,7 @@ def test_a_disk_without_links_keeps_the_run_and_says_so(tiny_drive, tmp_path, mo
     monkeypatch.setattr(Path, "symlink_to", fail)
     result = run("odometry", tiny_drive, "--residual", "none", "--frames", ":3")
     assert result.exit_code == 0, result.output
-    assert "latest cannot be made a link" in result.stderr
+    assert "cannot link runs/latest" in result.stderr
     assert len(list((tmp_path / "runs").glob("*/metrics.json"))) == 1
 
 
@@ -185,8 +185,8 @@ def test_a_recording_that_cannot_be_started_at_is_told_of_a_few_times(tiny_drive
     many = tmp_path / "many.yaml"
     many.write_text("scan_matching: {min_points: 10000000}")
     said = run("odometry", tiny_drive, "--config", many, "-o", tmp_path / "run").stderr
-    assert said.count("cannot start here") == 3
-    assert "no scan to start at" in said
+    assert said.count("cannot start at this scan") == 3
+    assert "no usable scan" in said
 
 
 def test_the_way_is_that_of_the_unit_that_the_forward_speed_is_of(finished_run):

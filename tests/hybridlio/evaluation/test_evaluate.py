@@ -9,7 +9,7 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.evaluation import evaluate as metrics
 from hybridlio.evaluation.evaluate import Evaluation, Steps, evaluate
-from hybridlio.evaluation.figures import evaluation_table, figures
+from hybridlio.evaluation.metrics_table import format_metrics, metrics_table
 
 STEP_COVARIANCE = np.diag([1e-4, 1e-4, 4e-4, 1e-4, 1e-4, 4e-4])
 
@@ -33,7 +33,7 @@ def drive(rng: np.random.Generator, n: int, speed_m: float = 1.0) -> tuple[Traje
 def rendered(evaluations: dict[str, Evaluation]) -> str:
     console = Console(width=400)
     with console.capture() as text:
-        console.print(evaluation_table(evaluations))
+        console.print(metrics_table(evaluations))
     return text.get()
 
 
@@ -67,7 +67,7 @@ def test_a_short_run_has_no_kitti_drift_but_one_over_lengths_that_fit_and_say_so
     assert result.chosen_t_rel_percent is not None
     assert [s.at for s in result.segments] == list(result.chosen_lengths_m)
     text = rendered({"short": result})
-    assert "drift over 5–40 m [%]" in text
+    assert "t_rel over 5–40 m [%]" in text
     assert "t_rel [%]" not in text
 
 
@@ -153,11 +153,11 @@ def test_the_table_has_a_line_for_each_figure_and_a_column_for_each_run(rng: np.
     reference, estimate, steps = drive(rng, 300)
     full, bare = evaluate(reference, estimate, steps=steps), evaluate(reference, reference)
     lines = rendered({"with": full, "without": bare}).splitlines()
-    for heading, value in figures(full).items():
+    for heading, value in format_metrics(full).items():
         line = next(line for line in lines if heading in line)
         assert value in line
         # the reference has no covariances to judge
-        assert figures(bare).get(heading, "–") in line
+        assert format_metrics(bare).get(heading, "–") in line
 
 
 def test_without_a_reference_there_is_one_clear_error():

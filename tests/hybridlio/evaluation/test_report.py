@@ -10,8 +10,8 @@ from hybridlio.core import se3
 from hybridlio.core.errors import DataError
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.evaluation.evaluate import Steps, evaluate
-from hybridlio.evaluation.figures import figures
-from hybridlio.evaluation.report import ReportData, find, pictures, write_report
+from hybridlio.evaluation.metrics_table import format_metrics
+from hybridlio.evaluation.report import ReportData, analyse, pictures, write_report
 
 SIGMAS = [*np.radians([0.03, 0.03, 0.05]).tolist(), 0.02, 0.01, 0.02]
 
@@ -100,7 +100,7 @@ def test_the_page_holds_the_figures_that_the_evaluation_gives(data: ReportData, 
     assert data.final_poses is not None
     assert data.step_covariances is not None
     steps = Steps(data.final_poses, data.step_covariances)
-    for heading, value in figures(evaluate(data.reference, data.estimate, steps=steps)).items():
+    for heading, value in format_metrics(evaluate(data.reference, data.estimate, steps=steps)).items():
         assert heading in html
         assert f"<td>{value}</td>" in html
     for average in evaluate(data.reference, data.estimate).segments:
@@ -127,7 +127,7 @@ def test_names_are_text_and_never_markup(html: str) -> None:
 
 
 def test_wrong_covariances_are_called_so(data: ReportData, tmp_path: Path) -> None:
-    assert find(data).steps.consistency.rotation.consistent  # type: ignore[union-attr]
+    assert analyse(data).steps.consistency.rotation.consistent  # type: ignore[union-attr]
     write_report(tmp_path / "r.html", dataclasses.replace(run(claim=9.0), others={}, timings_s={}, initial_poses=None))
     assert re.search(r"<td>σ (2\.9\d?|3|3\.\d+) times too small</td>", (tmp_path / "r.html").read_text())
 
@@ -145,9 +145,9 @@ GONE_WITH = {
 
 @pytest.mark.parametrize("absent", GONE_WITH)
 def test_whatever_is_absent_only_takes_its_own_pictures_away(data: ReportData, absent: str) -> None:
-    assert set(pictures(data, find(data))) == EVERY_PICTURE
+    assert set(pictures(data, analyse(data))) == EVERY_PICTURE
     less = dataclasses.replace(data, **{absent: None})
-    assert set(pictures(less, find(less))) == EVERY_PICTURE - GONE_WITH[absent]
+    assert set(pictures(less, analyse(less))) == EVERY_PICTURE - GONE_WITH[absent]
 
 
 def test_an_estimate_alone_has_a_report(data: ReportData, tmp_path: Path) -> None:
@@ -178,7 +178,7 @@ def test_a_reference_of_another_time_is_a_warning_and_not_the_end(data: ReportDa
 
 
 def test_the_drawn_lines_are_the_data(data: ReportData) -> None:
-    figure = pictures(data, find(data))["trajectory"]
+    figure = pictures(data, analyse(data))["trajectory"]
     lines = {line.get_label(): line.get_xydata() for line in figure.axes[0].lines}
     assert data.reference is not None
     np.testing.assert_allclose(lines["reference"], data.reference.poses[:, :2, 3])

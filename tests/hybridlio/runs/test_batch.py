@@ -12,7 +12,7 @@ from hybridlio.commands.app import app
 from hybridlio.core.errors import ConfigError, DataError, MissingDependencyError
 from hybridlio.odometry.config import Config
 from hybridlio.runs import batch, engines
-from hybridlio.runs.batch import Job, run_batch, run_job
+from hybridlio.runs.batch import BatchOptions, Job, run_batch, run_job
 from hybridlio.runs.batch_table import DONE, DONE_BEFORE, FAILED, NOT_RUN
 from hybridlio.runs.recordings import Recording, find_recordings
 
@@ -38,18 +38,18 @@ def statuses(done) -> list[str]:
 
 def test_one_that_fails_stops_no_other_and_a_second_batch_does_only_what_is_missing(two, tmp_path):
     recordings = (two[0], Recording(str(tmp_path / "gone"), name="gone"), two[1])
-    first = run_batch(recordings, tmp_path / "out", QUICK, jobs=2)
+    first = run_batch(recordings, tmp_path / "out", QUICK, BatchOptions(jobs=2))
     assert statuses(first) == [DONE, FAILED, DONE]
     assert "no such folder" in first.rows[1].reason
-    assert [row.figures["frames_done"] for row in (first.rows[0], first.rows[2])] == [4, 5]
+    assert [row.metrics["frames_done"] for row in (first.rows[0], first.rows[2])] == [4, 5]
     written = {row.folder: (row.folder / "metrics.json").stat().st_mtime_ns for row in (first.rows[0], first.rows[2])}
-    again = run_batch(recordings, tmp_path / "out", QUICK, jobs=2)
+    again = run_batch(recordings, tmp_path / "out", QUICK, BatchOptions(jobs=2))
     assert statuses(again) == [DONE_BEFORE, FAILED, DONE_BEFORE]
     assert {folder: (folder / "metrics.json").stat().st_mtime_ns for folder in written} == written
 
 
 def test_batch_json_and_batch_md_hold_every_recording_with_its_figures_and_reasons(two, tmp_path):
-    run_batch((two[0], Recording("/gone", name="gone")), tmp_path, QUICK, engine="threading")
+    run_batch((two[0], Recording("/gone", name="gone")), tmp_path, QUICK, BatchOptions(engine="threading"))
     first, gone = json.loads((tmp_path / "batch.json").read_text())["recordings"]
     assert first["frames"] == 4
     assert first["ate_m"] > 0
@@ -61,18 +61,18 @@ def test_batch_json_and_batch_md_hold_every_recording_with_its_figures_and_reaso
 
 
 def test_runs_with_other_settings_are_not_taken_for_the_same_nor_overwritten_unasked(two, tmp_path):
-    run_batch(two[:1], tmp_path, QUICK, engine="threading")
+    run_batch(two[:1], tmp_path, QUICK, BatchOptions(engine="threading"))
     other = QUICK.model_copy(update={"initial_pose": "identity"})
     with pytest.raises(ConfigError, match="other settings"):
-        run_batch(two[:1], tmp_path, other, engine="threading")
-    assert statuses(run_batch(two[:1], tmp_path, other, engine="threading", overwrite=True)) == [DONE]
+        run_batch(two[:1], tmp_path, other, BatchOptions(engine="threading"))
+    assert statuses(run_batch(two[:1], tmp_path, other, BatchOptions(engine="threading", overwrite=True))) == [DONE]
 
 
 def test_a_run_that_did_not_reach_its_end_is_done_again(two, tmp_path):
-    (row,) = run_batch(two[:1], tmp_path, QUICK, engine="threading").rows
+    (row,) = run_batch(two[:1], tmp_path, QUICK, BatchOptions(engine="threading")).rows
     metrics = row.folder / "metrics.json"
     metrics.write_text(json.dumps({**json.loads(metrics.read_text()), "interrupted": True}))
-    assert statuses(run_batch(two[:1], tmp_path, QUICK, engine="threading")) == [DONE]
+    assert statuses(run_batch(two[:1], tmp_path, QUICK, BatchOptions(engine="threading"))) == [DONE]
 
 
 def run_or_die(job: Job) -> tuple[Recording, str | None]:
@@ -85,9 +85,9 @@ def run_or_die(job: Job) -> tuple[Recording, str | None]:
 
 def test_a_process_that_ends_by_force_takes_no_other_recording_with_it(two, tmp_path, monkeypatch):
     monkeypatch.setattr(batch, "run_job", run_or_die)
-    done = run_batch((Recording("/gone", name="deadly"), two[0]), tmp_path, QUICK, jobs=2)
+    done = run_batch((Recording("/gone", name="deadly"), two[0]), tmp_path, QUICK, BatchOptions(jobs=2))
     assert statuses(done) == [FAILED, DONE]
-    assert "ended by force" in done.rows[0].reason
+    assert "the process died" in done.rows[0].reason
 
 
 def interrupt_the_second(job: Job) -> tuple[Recording, str | None]:
@@ -99,11 +99,11 @@ def interrupt_the_second(job: Job) -> tuple[Recording, str | None]:
 
 def test_an_interrupt_keeps_what_is_done(two, tmp_path, monkeypatch):
     monkeypatch.setattr(batch, "run_job", interrupt_the_second)
-    stopped = run_batch(two, tmp_path, QUICK, jobs=1, engine="sequential")
+    stopped = run_batch(two, tmp_path, QUICK, BatchOptions(jobs=1, engine="sequential"))
     assert isinstance(stopped.stopped, KeyboardInterrupt)
     assert statuses(stopped) == [DONE, NOT_RUN]
     monkeypatch.undo()
-    assert statuses(run_batch(two, tmp_path, QUICK, engine="threading")) == [DONE_BEFORE, DONE]
+    assert statuses(run_batch(two, tmp_path, QUICK, BatchOptions(engine="threading"))) == [DONE_BEFORE, DONE]
 
 
 def threads_of(_: int) -> tuple[int, str | None]:
@@ -118,15 +118,15 @@ def test_a_process_of_its_own_runs_each_job_with_as_many_threads_as_it_was_given
 
 
 def test_no_part_of_a_run_uses_more_threads_than_it_was_given():
-    matching = batch._limited(Config(), 1).scan_matching
+    matching = batch._with_thread_limit(Config(), 1).scan_matching
     assert (matching.registration.threads, matching.local_map.threads) == (1, 1)
-    assert batch._limited(Config(), 99) == Config()
+    assert batch._with_thread_limit(Config(), 99) == Config()
 
 
 def test_the_same_batch_runs_on_a_dask_cluster(two, tmp_path):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
-        done = run_batch(two[:1], tmp_path, QUICK, engine="dask", scheduler=cluster.scheduler_address)
+        done = run_batch(two[:1], tmp_path, QUICK, BatchOptions(engine="dask", scheduler=cluster.scheduler_address))
     assert statuses(done) == [DONE]
 
 
@@ -140,21 +140,21 @@ def test_a_folder_that_cannot_be_made_is_named_whoever_runs_the_batch(two, tmp_p
         distributed.Client(cluster),
         pytest.raises(DataError, match=r"cannot make the folder .*file/runs"),
     ):
-        run_batch(two, tmp_path / "file/runs", QUICK, engine="dask")
+        run_batch(two, tmp_path / "file/runs", QUICK, BatchOptions(engine="dask"))
 
 
 @pytest.mark.parametrize(("engine", "module"), [("dask", "distributed"), ("ray", "ray")])
 def test_an_engine_that_is_not_installed_says_what_to_install(two, tmp_path, monkeypatch, engine, module):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(MissingDependencyError, match="pip install"):
-        run_batch(two, tmp_path, QUICK, engine=engine)
+        run_batch(two, tmp_path, QUICK, BatchOptions(engine=engine))
 
 
 def test_an_unknown_engine_and_a_scheduler_for_none_are_refused(two, tmp_path):
     with pytest.raises(ConfigError, match="unknown engine 'steam'"):
-        run_batch(two, tmp_path, QUICK, engine="steam")
+        run_batch(two, tmp_path, QUICK, BatchOptions(engine="steam"))
     with pytest.raises(ConfigError, match="no scheduler"):
-        run_batch(two, tmp_path, QUICK, scheduler="tcp://head:8786")
+        run_batch(two, tmp_path, QUICK, BatchOptions(scheduler="tcp://head:8786"))
 
 
 def command(*words: object) -> tuple[int, str]:
@@ -193,23 +193,23 @@ def test_an_option_that_no_recording_can_be_run_with_fails_once_before_anything(
 
 
 def test_settings_that_no_recording_can_be_run_with_remove_no_run(two, tmp_path):
-    run_batch(two[:1], tmp_path, QUICK, engine="threading")
+    run_batch(two[:1], tmp_path, QUICK, BatchOptions(engine="threading"))
     without_weights = Config.model_validate({"residual": "network", "network": {"weights": "/gone.safetensors"}})
     for settings, engine in ((without_weights, "threading"), (QUICK, "steam")):
         with pytest.raises(ConfigError, match=r"gone\.safetensors|steam"):
-            run_batch(two[:1], tmp_path, settings, engine=engine, overwrite=True)
-    assert statuses(run_batch(two[:1], tmp_path, QUICK, engine="threading")) == [DONE_BEFORE]
+            run_batch(two[:1], tmp_path, settings, BatchOptions(engine=engine, overwrite=True))
+    assert statuses(run_batch(two[:1], tmp_path, QUICK, BatchOptions(engine="threading"))) == [DONE_BEFORE]
 
 
 def test_what_one_recording_lacks_fails_for_it_alone(two, tmp_path):
     beyond = Recording(two[0].path, frames="900:", name="beyond")
-    done = run_batch((beyond, two[0]), tmp_path, QUICK, engine="threading")
+    done = run_batch((beyond, two[0]), tmp_path, QUICK, BatchOptions(engine="threading"))
     assert statuses(done) == [FAILED, DONE]
     assert "no scans in 900:" in done.rows[0].reason
 
 
 def test_a_fault_is_one_recordings_reason_and_its_log_shows_where(two, tmp_path, monkeypatch):
     monkeypatch.setattr("hybridlio.runs.write.write_run", lambda *_: 1 // 0)
-    done = run_batch(two[:1], tmp_path, QUICK, engine="sequential")
+    done = run_batch(two[:1], tmp_path, QUICK, BatchOptions(engine="sequential"))
     assert "ZeroDivisionError" in done.rows[0].reason
     assert "Traceback" in (done.rows[0].folder / "run.log").read_text()

@@ -11,7 +11,15 @@ from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.odometry import Odometry
-from hybridlio.runs.compare import Comparison, columns, combinations, compare, table, to_markdown, write_comparison
+from hybridlio.runs.compare import (
+    Comparison,
+    cells,
+    combinations,
+    compare_configs,
+    table,
+    to_markdown,
+    write_comparison,
+)
 from hybridlio.runs.run import run_odometry
 
 SOURCES = ("kalman", "constant-velocity")
@@ -25,7 +33,7 @@ def sequence(tiny_drive) -> Sequence:
 @pytest.fixture(scope="module")
 def compared(sequence) -> Comparison:
     configs = combinations(SOURCES, ["scan-matching", "none"], ["incremental"], Config())
-    return compare(sequence, configs)
+    return compare_configs(sequence, configs)
 
 
 def test_every_combination_has_a_row_in_order(compared):
@@ -58,17 +66,17 @@ def test_table_and_markdown_show_every_row_without_columns_that_say_nothing(comp
     with console.capture() as text:
         console.print(table(compared))
     markdown = to_markdown(compared).splitlines()
-    for row in columns(compared):
+    for row in cells(compared):
         assert any(all(cell in line for cell in row.values()) for line in text.get().splitlines())
         assert f"| {' | '.join(row.values())} |" in markdown
-    assert "backend" not in columns(compared)[0]
-    assert "ended early" not in columns(compared)[0]
+    assert "backend" not in cells(compared)[0]
+    assert "ended early" not in cells(compared)[0]
 
 
 def test_without_reference_paths_and_times_are_still_compared(sequence):
     bare = replace(sequence, reference=None)
-    result = compare(bare, combinations(["identity"], ["none"], ["incremental"], Config()))
-    (row,) = columns(result)
+    result = compare_configs(bare, combinations(["identity"], ["none"], ["incremental"], Config()))
+    (row,) = cells(result)
     assert {"path [m]", "time [ms]", "bridged"} <= set(row)
     assert "ATE [m]" not in row
 
@@ -80,10 +88,10 @@ def test_a_run_that_fails_has_a_row_with_the_reason_and_the_others_go_on(sequenc
         raise GraphError(f"frame {frame.index}: no")
 
     monkeypatch.setattr(Kalman, "predict", fail)
-    result = compare(sequence, combinations(SOURCES, ["none"], ["incremental"], Config()))
+    result = compare_configs(sequence, combinations(SOURCES, ["none"], ["incremental"], Config()))
     assert [row.error for row in result.rows] == ["frame 1: no", None]
-    assert columns(result)[0]["ended early"] == "after 1 scans: frame 1: no"
-    assert columns(result)[1]["ended early"] == "–"
+    assert cells(result)[0]["ended early"] == "after 1 scan: frame 1: no"
+    assert cells(result)[1]["ended early"] == "–"
 
 
 def test_a_recording_that_cannot_be_started_at_has_rows_too(sequence):
@@ -91,7 +99,7 @@ def test_a_recording_that_cannot_be_started_at_has_rows_too(sequence):
         raise DataError(f"{k}.bin: truncated")
 
     broken = replace(sequence, load_scan=load)
-    (row,) = compare(broken, combinations(["identity"], ["none"], ["incremental"], Config())).rows
+    (row,) = compare_configs(broken, combinations(["identity"], ["none"], ["incremental"], Config())).rows
     assert row.scans == 0
     assert "0.bin: truncated" in row.error
 
@@ -99,7 +107,7 @@ def test_a_recording_that_cannot_be_started_at_has_rows_too(sequence):
 def test_a_wrong_name_is_refused_before_any_run(sequence):
     told = []
     with pytest.raises(ConfigError, match="guess"):
-        compare(sequence, combinations(["identity", "guess"], ["none"], ["incremental"], Config()), told.append)
+        compare_configs(sequence, combinations(["identity", "guess"], ["none"], ["incremental"], Config()), told.append)
     assert told == []
 
 
@@ -111,7 +119,7 @@ def test_progress_counts_over_all_runs_and_an_interrupt_ends_the_comparison(sequ
         if done == 15:
             raise KeyboardInterrupt
 
-    found = compare(sequence, combinations([*SOURCES, "kalman"], ["none"], ["incremental"], Config()), show)
+    found = compare_configs(sequence, combinations([*SOURCES, "kalman"], ["none"], ["incremental"], Config()), show)
     assert isinstance(found.stopped, KeyboardInterrupt)
     assert [(row.initial_pose, row.scans, row.error) for row in found.rows] == [
         (SOURCES[0], 12, None), (SOURCES[1], 3, "interrupted"),

@@ -161,7 +161,7 @@ def test_a_single_estimate_is_written_without_record_and_graph(tiny_drive, tmp_p
 
 def test_a_run_without_estimates_is_refused_and_leaves_an_older_one_alone(folder, tiny_drive):
     run = Run(open_sequence(tiny_drive), Odometry())
-    with pytest.raises(EstimationError, match="nothing was estimated"):
+    with pytest.raises(EstimationError, match="no estimate to write"):
         write_run(folder, run, CONFIG)
     assert run_folder.is_run_folder(folder)
 
@@ -189,7 +189,7 @@ def test_a_folder_with_files_of_a_runs_names_that_is_no_run_is_refused_unasked(t
     mine = tmp_path / name
     mine.parent.mkdir(exist_ok=True)
     mine.write_text("mine")
-    with pytest.raises(ConfigError, match=f"holds {name.split('/')[0]} and is no finished run"):
+    with pytest.raises(ConfigError, match=f"holds {name.split('/')[0]} but no finished run"):
         run_folder.new_run_folder("town", tmp_path, overwrite=False)
     assert run_folder.new_run_folder("town", tmp_path, overwrite=True) == tmp_path
     assert mine.read_text() == "mine"
@@ -228,14 +228,14 @@ def test_a_place_where_no_folder_can_be_made_is_named(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("runs").write_text("a file")
     for out in (None, Path("runs/mine")):
-        with pytest.raises(DataError, match="cannot make the run folder runs/"):
+        with pytest.raises(DataError, match="cannot create the run folder runs/"):
             run_folder.new_run_folder("town", out, overwrite=False)
 
 
 def test_latest_points_at_the_newest_and_works_after_the_folder_above_moved(tmp_path):
     for name in ("a", "b"):
         (tmp_path / "runs" / name).mkdir(parents=True)
-        run_folder.point_latest_at(tmp_path / "runs" / name)
+        run_folder.link_latest(tmp_path / "runs" / name)
     (tmp_path / "runs").rename(tmp_path / "moved")
     assert (tmp_path / "moved/latest").resolve() == tmp_path / "moved/b"
     assert sorted(path.name for path in (tmp_path / "moved").iterdir()) == ["a", "b", "latest"]
@@ -244,7 +244,7 @@ def test_latest_points_at_the_newest_and_works_after_the_folder_above_moved(tmp_
 def test_a_folder_that_is_called_latest_is_left_alone(tmp_path):
     (tmp_path / "latest").mkdir()
     (tmp_path / "a").mkdir()
-    run_folder.point_latest_at(tmp_path / "a")
+    run_folder.link_latest(tmp_path / "a")
     assert not (tmp_path / "latest").is_symlink()
 
 
@@ -259,7 +259,7 @@ def test_a_damaged_run_is_refused_by_name(name, text, folder, tmp_path):
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path):
-    with pytest.raises(DataError, match="no run in it"):
+    with pytest.raises(DataError, match="not a run folder"):
         run_folder.read_run(tmp_path)
     with pytest.raises(DataError, match="no such folder"):
         run_folder.read_run(tmp_path / "none")
@@ -290,5 +290,5 @@ def _flipped(path: Path) -> None:
 def test_a_damaged_run_is_refused_with_its_folder(folder, tmp_path, name, damage):
     damaged = shutil.copytree(folder, tmp_path / "run")
     damage(damaged / name)
-    with pytest.raises(DataError, match=rf"{damaged}: its metrics.json, poses_tum.txt or covariances.npz cannot"):
+    with pytest.raises(DataError, match=rf"{damaged}: metrics.json, poses_tum.txt or covariances.npz cannot"):
         run_folder.read_run(damaged)

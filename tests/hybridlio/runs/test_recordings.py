@@ -135,7 +135,7 @@ def test_a_single_path_as_text_is_one_recording_and_not_its_letters(drives):
     assert names(find_recordings(str(drives / "north"))) == ["north"]
 
 
-@pytest.mark.parametrize(("given", "words"), [("none.yaml", "no such list file"), ("nope/*", "nothing matches")])
+@pytest.mark.parametrize(("given", "words"), [("none.yaml", "no such list file"), ("nope/*", "no path matches")])
 def test_a_list_or_pattern_that_stands_for_nothing_is_refused(tmp_path, given, words):
     with pytest.raises(ConfigError, match=words):
         find_recordings([tmp_path / given])

@@ -16,7 +16,7 @@ from hybridlio.datasets.registry import open_sequence
 from hybridlio.learned.settings import NetworkSettings, Recipe
 from hybridlio.runs import training_data
 from hybridlio.runs.run import run_odometry
-from hybridlio.runs.training_data import DataOptions, shard_name, shards_of, training_pairs
+from hybridlio.runs.training_data import DataOptions, prepare_shards, shard_name, training_pairs
 
 NETWORK = NetworkSettings(geometry=MAP_GEOMETRIES["16-beam"])
 RECIPE = Recipe(network=NETWORK)
@@ -32,13 +32,13 @@ def options(tmp_path_factory) -> DataOptions:
 @pytest.fixture(scope="module")
 def given(tiny_drive, options):
     """The drive's shard with initial poses and velocities."""
-    return shards_of([tiny_drive], GIVEN, options)[0]
+    return prepare_shards([tiny_drive], GIVEN, options)[0]
 
 
 def test_a_recording_is_prepared_once_and_found_again(tiny_drive, options, given):
     stamp = (given.folder / "shard.json").stat().st_mtime_ns
     told = []
-    again = shards_of([tiny_drive], GIVEN, options, lambda *where: told.append(where))
+    again = prepare_shards([tiny_drive], GIVEN, options, lambda *where: told.append(where))
     assert [shard.folder for shard in again] == [given.folder]
     assert (given.folder / "shard.json").stat().st_mtime_ns == stamp
     assert told == []
@@ -46,8 +46,8 @@ def test_a_recording_is_prepared_once_and_found_again(tiny_drive, options, given
 
 
 def test_the_folder_of_shards_and_a_shard_itself_are_data_too(options, given):
-    assert given.folder in [shard.folder for shard in shards_of([options.cache], GIVEN, options)]
-    assert [shard.folder for shard in shards_of([given.folder], GIVEN, options)] == [given.folder]
+    assert given.folder in [shard.folder for shard in prepare_shards([options.cache], GIVEN, options)]
+    assert [shard.folder for shard in prepare_shards([given.folder], GIVEN, options)] == [given.folder]
 
 
 def test_given_initial_poses_are_those_of_an_odometry_run_and_not_the_truth(tiny_drive, given):
@@ -75,7 +75,7 @@ def test_a_step_that_scans_do_not_tell_gives_no_velocity(tiny_drive, tmp_path, m
         return replace(run, estimates=lost)
 
     monkeypatch.setattr(training_data, "run_odometry", half_blind)
-    shard = shards_of([tiny_drive], MOVING, DataOptions(tmp_path))[0]
+    shard = prepare_shards([tiny_drive], MOVING, DataOptions(tmp_path))[0]
     known = np.isfinite(shard.velocity_m_s).all(axis=1)
     assert not known[5]  # at the scan that the fourth step leads to
     assert known[2:5].all()
@@ -119,10 +119,10 @@ def test_processes_that_ask_at_once_get_one_shard(tiny_drive, tmp_path, project_
         "import sys; from pathlib import Path\n"
         "from hybridlio.learned.settings import NetworkSettings, Recipe\n"
         "from hybridlio.cloud.projection import MAP_GEOMETRIES\n"
-        "from hybridlio.runs.training_data import DataOptions, shards_of\n"
+        "from hybridlio.runs.training_data import DataOptions, prepare_shards\n"
         "told = []\n"
         "recipe = Recipe(network=NetworkSettings(geometry=MAP_GEOMETRIES['16-beam']))\n"
-        "shards = shards_of([Path(sys.argv[1])], recipe,\n"
+        "shards = prepare_shards([Path(sys.argv[1])], recipe,\n"
         "                   DataOptions(Path(sys.argv[2])), lambda *where: told.append(where))\n"
         "print(len(shards[0]), bool(told))\n"
     )
@@ -135,7 +135,7 @@ def test_processes_that_ask_at_once_get_one_shard(tiny_drive, tmp_path, project_
 
 def test_a_place_without_recordings_is_named(tmp_path, options):
     with pytest.raises(DataError, match="nowhere"):
-        shards_of([tmp_path / "nowhere"], RECIPE, options)
+        prepare_shards([tmp_path / "nowhere"], RECIPE, options)
 
 
 def test_an_unknown_split_is_refused(tiny_drive, options):

@@ -65,7 +65,7 @@ class InterruptError(Exception):
 
 
 def test_an_interrupted_drive_shows_nothing_and_goes_on_to_the_same_bytes(tmp_path: Path):
-    def interrupt(done: int, total: int) -> None:
+    def interrupt(stage: str, done: int, total: int) -> None:
         if done == 3:
             raise InterruptError
 
@@ -75,10 +75,10 @@ def test_an_interrupted_drive_shows_nothing_and_goes_on_to_the_same_bytes(tmp_pa
     partial = next((tmp_path / "a").glob(".partial-*"))
     scan = next(partial.rglob("0000000001.bin"))
     written = scan.stat().st_mtime_ns
-    calls: list[tuple[int, int]] = []
+    calls: list[tuple[str, int, int]] = []
     drive = simulate(tmp_path / "a", SMALL, lambda *a: calls.append(a))
     assert (drive / "velodyne_points/data" / scan.name).stat().st_mtime_ns == written
-    assert calls == [(k, 6) for k in range(1, 7)]
+    assert calls == [("", k, 6) for k in range(1, 7)]
     assert contents(drive.parent) == contents(simulate(tmp_path / "b", SMALL).parent)
     assert [p.name for p in (tmp_path / "a").iterdir()] == [DATE]
 
