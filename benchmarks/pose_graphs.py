@@ -21,7 +21,6 @@ from scipy.spatial.transform import Rotation
 from hybridlio.core import se3
 from hybridlio.graph import PoseGraph
 from hybridlio.graph.model.coordinates import to_matrices
-from hybridlio.graph.model.edge_arrays import loops_of
 
 _EQUAL = 1e-5  # relative; errors closer than this are the same answer
 
@@ -96,7 +95,8 @@ def compare(path: Path, runs: int) -> None:
 
 def with_wrong_loops(path: Path, seed: int) -> tuple[PoseGraph, set[int]]:
     graph, rng = PoseGraph.load(path), np.random.default_rng(seed)
-    loops = [graph.factors[number] for number in loops_of(graph)]
+    edges = [factor for factor in graph.factors.values() if factor.kind == "between"]
+    loops = [edge for edge in edges if abs(edge.keys[0] - edge.keys[1]) != 1]
     wrong: set[int] = set()
     while len(wrong) < round(0.1 * len(loops)):
         i, j = (int(k) for k in rng.choice(len(graph), 2, replace=False))
@@ -135,7 +135,7 @@ def bad_starts(count: int, extent_m: float, seeds: int) -> dict[str, np.ndarray]
 def start_badly(path: Path, seeds: int) -> None:
     best = min(bare(path, True, "given").error, bare(path, True, "own").error, ours(path).error)
     graph = PoseGraph.load(path)
-    extent_m = float(np.ptp(to_matrices(graph.coordinates_or_nan)[:, :3, 3], axis=0).max())
+    extent_m = float(np.ptp([graph.initial(key)[:3, 3] for key in graph.keys], axis=0).max())
     for name, poses in bad_starts(len(graph), extent_m, seeds).items():
         for key, pose in zip(graph.keys, poses, strict=True):
             graph.set_initial(key, pose)

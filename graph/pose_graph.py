@@ -1,275 +1,300 @@
-"""The pose graph: poses by key, measurements between and of them, and one call that solves it."""
+"""The pose graph that users build: poses by key, measurements of and between them, and one call that solves it."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import astuple
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hybridlio.core.errors import DataError, GraphError
-from hybridlio.core.geodesy import check_geodetic, enu_from_geodetic
+from hybridlio.core.arrays import Array
+from hybridlio.core.errors import GraphError
+from hybridlio.core.geodesy import GeodeticPoint, check_geodetic, enu_from_geodetic
 from hybridlio.core.sensors import ImuNoise, ImuSamples
-from hybridlio.graph.model.graph_data import GraphData
+from hybridlio.graph.formats.files import read_graph, write_graph
+from hybridlio.graph.model import coordinates as co
+from hybridlio.graph.model.connectivity import components
+from hybridlio.graph.model.graph_data import GraphData, PosesByKey
 from hybridlio.graph.model.keys import Key, check_key
-from hybridlio.graph.model.measurements import Factor, RobustLike, label, make_noise, make_robust
-
-if TYPE_CHECKING:
-    from hybridlio.graph.solve.levenberg import Progress
-    from hybridlio.graph.solve.online_solver import OnlineSolver
-    from hybridlio.graph.solve.optimise import Backend, Initial
-    from hybridlio.graph.solve.solution import Solution
-    from hybridlio.graph.solve.starts import Method
+from hybridlio.graph.model.measurements import Factor, Kind, factor_label
+from hybridlio.graph.model.new_factors import between_factor, check_direction, imu_factor, prior_factor, vector_factor
+from hybridlio.graph.model.noise import NoiseInput, RobustLike
+from hybridlio.graph.solve.batch import solve_batch
+from hybridlio.graph.solve.initial_values import InitialMethod, find_initial_values
+from hybridlio.graph.solve.nonlinear import IterationProgress, silent
+from hybridlio.graph.solve.online_solver import OnlineSolver
+from hybridlio.graph.solve.replay import solve_online
+from hybridlio.graph.solve.settings import ONLINE_SOLVERS, InitialName, OnlineSolverName, Settings, SolverName
+from hybridlio.graph.solve.solution import Solution
 
 _UP = np.array([0.0, 0.0, 1.0])
-_STANDS_STILL_M_S = 0.01
+_STANDING_SIGMA_M_S = 0.01  # of a standing vehicle: it sways on its springs by millimetres in a second
 
 
-class PoseGraph(GraphData):
-    """Poses and measurements; :meth:`optimize` finds the poses that fit them best.
+class PoseGraph:
+    """Poses and measurements; :meth:`optimize` finds the poses that fit the measurements best.
 
-    Keys are integers or ``(robot, index)``. Poses are ``(4, 4)``; covariances are ``(6, 6)``, rotation first, of a
-    right perturbation. A planar graph (``dimension=2``) has poses ``(4, 4)`` in the plane z = 0, also taken as
-    ``(3, 3)``, and covariances ``(3, 3)`` of heading, x, y. Inertial data, GPS and attitude need a graph in space; its
-    world then has gravity along −z, and its poses are those of the IMU.
+    Keys are integers or ``(robot, index)``. Poses are ``(4, 4)``; covariances are ``(6, 6)`` in rad² and m², rotation
+    first, of a right perturbation. A planar graph (``dimension=2``) has poses ``(4, 4)`` in the plane z = 0, also taken
+    as ``(3, 3)``, and covariances ``(3, 3)`` of heading, x, y. Inertial data, GPS and attitude need a graph in space;
+    world then has gravity along −z, and poses are those of the IMU.
 
-    A call that raises leaves the graph as it was.
+    A call that raises leaves the graph unchanged. Unknown or malformed keys raise ``GraphError``, malformed values
+    ``DataError``.
     """
 
+    def __init__(self, dimension: co.Dimension = 3) -> None:
+        self._data = GraphData(dimension)
+
+    def __repr__(self) -> str:
+        edges, others = len(self._data.edges), len(self._data.other_factors)
+        return (
+            f"<PoseGraph {self.dimension}D: {len(self)} poses, {len(self.fixed)} fixed, {edges} between-factors, "
+            f"{others} other factors>"
+        )
+
+    def __len__(self) -> int:
+        return len(self._data)
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._data
+
+    # poses
+
+    @property
+    def dimension(self) -> co.Dimension:
+        """2 for a planar graph, 3 for one in space."""
+        return self._data.dimension
+
+    @property
+    def keys(self) -> list[Key]:
+        """Keys of all poses, in the order they were added."""
+        return self._data.keys
+
+    def add_pose(self, key: Key, initial: ArrayLike | None = None) -> None:
+        """Add a pose, with its initial value if it is known; raise GraphError where the key is in use."""
+        key = check_key(key)
+        if key in self._data:
+            raise GraphError(f"pose {key} exists already; use set_initial to change its initial value")
+        self._data.add_pose(key, None if initial is None else co.from_matrix(initial, self.dimension, f"pose {key}"))
+
+    def set_initial(self, key: Key, pose: ArrayLike | None) -> None:
+        """Replace the initial value of a pose, or remove it (None)."""
+        (key,) = self._data.known_keys(key, what="initial value")
+        self._data.set_initial(key, None if pose is None else co.from_matrix(pose, self.dimension, f"pose {key}"))
+
+    def initial(self, key: Key) -> Array | None:
+        """Return the initial value ``(4, 4)`` of a pose, or None."""
+        (key,) = self._data.known_keys(key, what="initial value")
+        found = self._data.initial_value(key)
+        return None if found is None else np.asarray(co.to_matrices(found[None])[0])
+
+    def start_from(self, solution: PosesByKey) -> None:
+        """Take a solution's poses as initial values, for the keys that both have."""
+        self._data.start_from(solution)
+
+    @property
+    def fixed(self) -> frozenset[Key]:
+        """Keys of the poses that are held at their initial values."""
+        return self._data.fixed
+
+    def fix(self, key: Key) -> None:
+        """Hold a pose at its initial value: the usual way to anchor a graph without priors."""
+        self._data.fix(*self._data.known_keys(key, what="fix"))
+
+    def unfix(self, key: Key) -> None:
+        """Release a fixed pose."""
+        self._data.unfix(*self._data.known_keys(key, what="unfix"))
+
+    @property
+    def origin(self) -> GeodeticPoint | None:
+        """Place on Earth of world's origin, whose axes then are east, north and up; None until it is set."""
+        return self._data.origin
+
+    def set_origin(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> None:
+        """Set world's origin on Earth (WGS 84; metres above the ellipsoid); it cannot change, as fixes depend on it."""
+        self._data.set_origin(check_geodetic(latitude_deg, longitude_deg, altitude_m, "origin"))
+
     # factors: each call returns the factor's id
+
+    @property
+    def factors(self) -> Mapping[int, Factor]:
+        """Factors by id, in the order they were added; read only."""
+        return self._data.factors
+
+    def remove(self, factor_id: int) -> None:
+        """Remove a factor; its poses stay. Raise GraphError where no factor has this id."""
+        self._data.remove(factor_id)
 
     def add_prior(
         self, key: Key, pose: ArrayLike, covariance: ArrayLike | None = None, *, information: ArrayLike | None = None,
         sigmas: ArrayLike | None = None, robust: RobustLike = None,
     ) -> int:  # fmt: skip
-        """A pose measured in world; adds the pose where it is new, with this as its initial value.
-
-        Raises:
-            DataError: not a pose, or the covariance is not symmetric positive definite.
-            GraphError: none or several of covariance, information, sigmas.
-        """
-        key = check_key(key)
-        name = label("prior", (key,))
-        measured = self._coordinates(pose, name)
-        noise = make_noise(name, self._size, covariance, information, sigmas)
-        factor = Factor("prior", (key,), measured, noise, make_robust(robust, self._size, name))
-        if key not in self:
-            self.put_pose(key, measured)
-        return self._add(factor)
+        """Add a measured pose in world; a new pose starts from it. Noise and kernel as in :meth:`add_between`."""
+        factor = prior_factor(self._data, key, pose, NoiseInput(covariance, information, sigmas), robust)
+        if factor.keys[0] not in self._data:
+            self._data.add_pose(factor.keys[0], factor.measured)
+        return self._data.add_factor(factor)
 
     def add_between(
         self, i: Key, j: Key, T_i_j: ArrayLike, covariance: ArrayLike | None = None, *,
         information: ArrayLike | None = None, sigmas: ArrayLike | None = None, robust: RobustLike = None,
     ) -> int:  # fmt: skip
-        """Pose j measured in the frame of pose i; adds pose j where it is new.
+        """Add a measurement of pose j in the frame of pose i; a new pose j is added.
 
         Args:
-            i, j: keys; ``i`` must be known.
+            i, j: keys; the graph must have ``i``.
             T_i_j: ``(4, 4)``.
-            covariance, information, sigmas: one of them, of a right perturbation of ``T_i_j``, rotation first.
-            robust: ``huber``, ``cauchy``, ``geman-mcclure`` or ``dcs``, alone or with a width.
+            covariance, information, sigmas: exactly one of them, of a right perturbation of ``T_i_j``, rotation first.
+            robust: ``huber``, ``cauchy``, ``geman-mcclure`` or ``dcs``, alone or with a width in standard deviations.
 
         Raises:
             DataError: not a pose, or the covariance is not symmetric positive definite.
             GraphError: unknown key, a pose joined to itself, none or several of covariance, information, sigmas.
         """
-        name = label("between", (i, j))
-        (i,) = self._known(i, what=name)
-        j = check_key(j)
-        if i == j:
-            raise GraphError(f"{name}: joins a pose to itself")
-        measured = self._coordinates(T_i_j, name)
-        noise = make_noise(name, self._size, covariance, information, sigmas)
-        factor = Factor("between", (i, j), measured, noise, make_robust(robust, self._size, name))
-        if j not in self:
-            self.put_pose(j, None)
-        return self._add(factor)
+        factor = between_factor(self._data, (i, j), T_i_j, NoiseInput(covariance, information, sigmas), robust)
+        if factor.keys[1] not in self._data:
+            self._data.add_pose(factor.keys[1])
+        return self._data.add_factor(factor)
 
     def add_gps(
         self, key: Key, position_m: ArrayLike, sigmas: ArrayLike | None = None, lever_arm_m: ArrayLike = (0, 0, 0), *,
         covariance: ArrayLike | None = None, robust: RobustLike = None,
     ) -> int:  # fmt: skip
-        """The antenna's position ``(3,)`` in world; ``lever_arm_m`` is the antenna in the body's frame."""
-        vectors = (position_m, lever_arm_m)
-        return self._add_vectors("gps", key, vectors, 3, covariance, sigmas, robust)
+        """Add the antenna's position ``(3,)`` in world; ``lever_arm_m`` is the antenna's position in the body frame."""
+        vectors, noise = (position_m, lever_arm_m), NoiseInput(covariance, sigmas=sigmas)
+        return self._add_vectors("gps", key, vectors, noise, robust)
 
     def add_gps_geodetic(
         self, key: Key, latitude_deg: float, longitude_deg: float, altitude_m: float, sigmas: ArrayLike | None = None,
         lever_arm_m: ArrayLike = (0, 0, 0), *, covariance: ArrayLike | None = None, robust: RobustLike = None,
     ) -> int:  # fmt: skip
-        """The antenna's place on Earth; world is east, north, up at ``origin``, which the first fix sets if need be.
+        """Add the antenna's place on Earth; world is east, north, up at ``origin``, which is the first fix if not set.
 
         Args:
-            key: a pose that is known.
+            key: of a pose that the graph has.
             latitude_deg, longitude_deg, altitude_m: on WGS 84, metres above the ellipsoid (not above sea level).
-            sigmas, covariance: one of them, of east, north, up in metres.
-            lever_arm_m: ``(3,)`` the antenna in the body's frame.
-            robust: as for other factors.
-
-        Raises:
-            DataError: not finite, no such latitude or longitude, or as for other factors.
-            GraphError: unknown key, a planar graph, none or both of covariance and sigmas.
+            sigmas, covariance: exactly one of them, of east, north, up in metres.
+            lever_arm_m, robust: as in :meth:`add_gps`.
         """
-        point = check_geodetic(latitude_deg, longitude_deg, altitude_m, label("gps", (key,)))
+        point = check_geodetic(latitude_deg, longitude_deg, altitude_m, factor_label("gps", (key,)))
         origin = self.origin or point
         position = enu_from_geodetic([point], origin)[0]
         number = self.add_gps(key, position, sigmas, lever_arm_m, covariance=covariance, robust=robust)
-        self.origin = origin
+        self._data.origin = origin
         return number
 
     def add_attitude(
         self, key: Key, direction_world: ArrayLike, direction_body: ArrayLike, sigma_rad: float,
         robust: RobustLike = None,
     ) -> int:  # fmt: skip
-        """A direction known in world and seen in the body's frame, each ``(3,)``; lengths do not matter.
-
-        Raises:
-            DataError: a direction of no length, or as for other factors.
-        """
+        """Add a direction known in world and measured in the body frame, ``(3,)`` each, of any length but zero."""
         for direction in (direction_world, direction_body):
-            if not np.any(np.asarray(direction)):
-                raise DataError(f"{label('attitude', (key,))}: a direction has no length")
-        vectors = (direction_world, direction_body)
-        return self._add_vectors("attitude", key, vectors, 2, None, sigma_rad, robust)
+            check_direction(direction, factor_label("attitude", (key,)))
+        vectors, noise = (direction_world, direction_body), NoiseInput(sigmas=sigma_rad)
+        return self._add_vectors("attitude", key, vectors, noise, robust)
 
     def add_gravity(self, key: Key, accel_m_s2: ArrayLike, sigma_rad: float, robust: RobustLike = None) -> int:
-        """Roll and pitch from an accelerometer at rest or in steady motion, which shows what is up."""
+        """Add roll and pitch from an accelerometer at rest or in steady motion, whose specific force points up."""
         return self.add_attitude(key, _UP, accel_m_s2, sigma_rad, robust)
 
     def add_velocity(self, key: Key, velocity_m_s: ArrayLike, sigmas: ArrayLike, robust: RobustLike = None) -> int:
-        """The body's velocity in world ``(3,)``."""
-        return self._add_vectors("velocity", key, (velocity_m_s,), 3, None, sigmas, robust)
+        """Add the body's velocity ``(3,)`` in world."""
+        return self._add_vectors("velocity", key, (velocity_m_s,), NoiseInput(sigmas=sigmas), robust)
 
-    def add_zero_velocity(self, key: Key, sigma_m_s: float = _STANDS_STILL_M_S) -> int:
-        """The body stands still."""
+    def add_zero_velocity(self, key: Key, sigma_m_s: float = _STANDING_SIGMA_M_S) -> int:
+        """Add that the body stands still."""
         return self.add_velocity(key, np.zeros(3), sigma_m_s)
 
     def add_bias(self, key: Key, accel_m_s2: ArrayLike, gyro_rad_s: ArrayLike, sigmas: ArrayLike) -> int:
-        """The IMU's biases; ``sigmas`` are six, accelerometer first.
+        """Add the IMU's biases, ``(3,)`` each; ``sigmas`` are six, accelerometer first.
 
-        A chain of inertial factors without one has biases of zero at its start, as sure as its :class:`ImuNoise` says.
+        A chain of inertial factors without one starts from biases of zero, with the sigmas of its :class:`ImuNoise`.
         """
-        accel, gyro = np.asarray(accel_m_s2, dtype=np.float64), np.asarray(gyro_rad_s, dtype=np.float64)
-        return self._add_vectors("bias", key, (accel, gyro), 6, None, sigmas, None)
+        return self._add_vectors("bias", key, (accel_m_s2, gyro_rad_s), NoiseInput(sigmas=sigmas))
 
     def add_imu(self, i: Key, j: Key, samples: ImuSamples, noise: ImuNoise | None = None) -> int:
-        """Raw samples from the time of pose i (the first) to that of pose j (the last); both poses must be known.
-
-        Velocities and biases of both come with it.
-
-        Raises:
-            DataError: fewer than two samples.
-            GraphError: unknown key, a planar graph.
-        """
-        name = label("imu", (i, j))
-        i, j = self._known(i, j, what=name)
-        self._in_space(name)
-        if i == j:
-            raise GraphError(f"{name}: joins a pose to itself")
-        if len(samples) < 2:
-            raise DataError(f"{name}: {len(samples)} IMU samples; at least 2 are needed")
-        densities = np.array(astuple(noise or ImuNoise()))
-        if not (np.isfinite(densities).all() and densities.min() > 0):
-            raise DataError(f"{name}: noise densities must be finite and positive, got {densities.tolist()}")
-        return self._add(Factor("imu", (i, j), densities, samples=samples))
+        """Add two or more raw samples, the first at pose i, the last at pose j; brings both velocities and biases."""
+        return self._data.add_factor(imu_factor(self._data, (i, j), samples, noise or ImuNoise()))
 
     # solving
 
     def components(self) -> list[list[Key]]:
-        """The parts that no between- or IMU factor joins, largest first."""
-        from hybridlio.graph.model.checks import components
+        """Return the connected components over between- and IMU factors, largest first."""
+        return components(self._data)
 
-        return components(self)
-
-    def initialise(self, method: Method = "chordal") -> None:
-        """Find initial values from the between-factors: ``odometry``, ``spanning-tree`` or ``chordal``.
+    def initialise(self, method: InitialMethod = "chordal") -> None:
+        """Replace the initial values by ones found from the between-factors.
 
         ``odometry`` follows the chain of consecutive keys; ``spanning-tree`` goes breadth first from the fixed or
-        measured poses; ``chordal`` solves for all rotations at once, relaxed to linear least squares, then for all
-        positions (Carlone et al., "Initialization techniques for 3D SLAM", ICRA 2015).
-
-        Raises:
-            GraphError: some poses cannot be reached; names them.
+        measured poses; ``chordal`` solves for all rotations, relaxed to linear least squares, then for all positions
+        (Carlone et al., "Initialization techniques for 3D SLAM", ICRA 2015). GraphError names poses out of reach.
         """
-        from hybridlio.graph.solve.starts import find
-
-        self._initial.array[:] = find(self, method)
+        self._data.set_all_initial(find_initial_values(self._data, method))
 
     def optimize(
-        self, backend: Backend = "auto", *, initial: Initial = "auto", max_iterations: int = 100,
-        tolerance: float = 1e-6, lag: int = 200, progress: Progress | None = None,
+        self, backend: SolverName = "auto", *, initial: InitialName = "auto", max_iterations: int = 100,
+        tolerance: float = 1e-6, lag: int = 200, progress: IterationProgress | None = None,
     ) -> Solution:  # fmt: skip
         """Find the poses, velocities and biases that fit all factors best.
 
         Args:
-            backend: ``batch`` is Gauss-Newton, damped where the error would rise; ``gnc`` finds and rejects wrong loop
-                closures (graduated non-convexity, Yang et al., RA-L 2020) and takes factors between consecutive keys
-                for right; ``incremental`` and ``fixed-lag`` give the graph pose by pose, in its order, to what
-                :meth:`online` makes; ``auto`` is ``batch``.
-            initial: ``auto`` starts from the given initial values or from chordal ones, whichever fit better; from
-                ``given`` ones, or those that a method of :meth:`initialise` finds, where it says so. Online backends
-                start each pose from its neighbours.
+            backend: ``batch`` (or ``auto``) is Gauss-Newton, damped where the error would rise; ``gnc`` rejects wrong
+                loop closures by graduated non-convexity (Yang et al., RA-L 2020) and trusts factors between consecutive
+                keys; ``incremental`` and ``fixed-lag`` give the graph pose by pose to the solvers of :meth:`online`.
+            initial: ``auto`` starts from the given initial values or from chordal ones, whichever fit better;
+                ``given`` from the given ones; a method of :meth:`initialise` from what it finds.
+                Online backends start each pose from its neighbours.
             max_iterations: of Gauss-Newton and Levenberg-Marquardt together.
             tolerance: share of the error that further iterations may still gain.
-            lag: poses that ``fixed-lag`` keeps.
+            lag: number of poses that ``fixed-lag`` keeps.
             progress: called with the stage, the iteration and the error there.
 
         Raises:
+            ConfigError: an unknown name, or a number that is not positive.
             GraphError: the factors do not determine every pose; names the keys.
         """
-        from hybridlio.graph.solve.optimise import Settings, optimise
-
-        return optimise(self, Settings(backend, initial, max_iterations, tolerance, lag), progress)
+        settings = Settings(backend, initial, max_iterations, tolerance, lag)
+        solve = solve_online if backend in ONLINE_SOLVERS else solve_batch
+        return solve(self._data, settings, progress or silent)
 
     def online(
-        self, backend: Literal["incremental", "fixed-lag"] = "incremental", *, lag: int = 200, forget: bool = False
+        self, backend: OnlineSolverName = "incremental", *, lag: int = 200, forget: bool = False
     ) -> OnlineSolver:
-        """A solver that follows this graph while it grows; its ``update()`` takes in what has changed.
+        """Return a solver that follows this graph while it grows: its ``update()`` takes over what has changed.
 
         Args:
             backend: ``incremental`` keeps everything (iSAM2); ``fixed-lag`` the newest poses, in constant time.
-            lag: poses that ``fixed-lag`` keeps.
-            forget: whether ``fixed-lag`` takes the factors of poses that leave the lag out of the graph, and leaves
+            lag: number of poses that ``fixed-lag`` keeps.
+            forget: whether ``fixed-lag`` removes the factors of poses that leave the lag from the graph, and keeps
                 their last estimates as initial values, so that the graph stays small too.
-
-        Raises:
-            ConfigError: no such backend, or a lag that is not positive.
         """
-        from hybridlio.graph.solve.online_solver import OnlineSolver
-
-        return OnlineSolver(self, backend, lag, forget)
+        return OnlineSolver(self._data, backend, lag, forget)
 
     # files
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> PoseGraph:
-        """Read ``.npz``, ``.g2o`` or TORO's ``.graph``; text is told by its tags, in the plane or in space.
-
-        A text file that holds neither FIX nor prior has its pose of lowest number fixed, as is usual.
+        """Read ``.npz``, ``.g2o`` or TORO's ``.graph``; in text with neither FIX nor prior the lowest pose is fixed.
 
         Raises:
-            DataError: the file is missing, truncated or garbled; names the row.
+            DataError: the file is missing, truncated or malformed; names the row.
         """
-        from hybridlio.graph.formats.files import load
-
-        data = load(path)
-        graph = cls(data.dimension)
-        vars(graph).update(vars(data))
+        graph = cls()
+        graph._data = read_graph(path)
         return graph
 
     def save(self, path: str | os.PathLike[str], solution: Solution | None = None) -> None:
-        """Write ``.npz`` (everything), ``.g2o`` or TORO's ``.graph``, by the name's ending.
-
-        Args:
-            path: the file.
-            solution: whose poses to write; by default the initial values.
+        """Write ``.npz`` (everything), ``.g2o`` or TORO's ``.graph``, with the initial values or a solution's poses.
 
         Raises:
             GraphError: the format cannot hold what is in the graph.
-            DataError: unknown ending, or the place cannot be written to.
+            DataError: unknown ending, or the file cannot be written.
         """
-        from hybridlio.graph.formats.files import save
+        write_graph(self._data, path, solution)
 
-        save(self, path, solution)
+    def _add_vectors(
+        self, kind: Kind, key: Key, vectors: tuple[ArrayLike, ...], noise: NoiseInput, robust: RobustLike = None
+    ) -> int:
+        return self._data.add_factor(vector_factor(self._data, kind, key, vectors, noise, robust))

@@ -1,4 +1,4 @@
-"""Which file format a pose graph is in, by its name's ending."""
+"""Choice of a pose graph's file format by the file name's ending."""
 
 from __future__ import annotations
 
@@ -12,15 +12,24 @@ from hybridlio.graph.formats.text_writer import write_text
 from hybridlio.graph.model.graph_data import GraphData, PosesByKey
 
 
-def load(path: str | os.PathLike[str]) -> GraphData:
-    """Read a pose graph: ``.npz`` is ours, anything else text."""
+def read_graph(path: str | os.PathLike[str]) -> GraphData:
+    """Read a pose graph: ``.npz``, or text (g2o's or TORO's) under any other ending.
+
+    Raises:
+        DataError: the file is missing, truncated or malformed; names the row of text.
+    """
     return read_npz(path) if Path(path).suffix == ".npz" else read_text(path)
 
 
-def save(data: GraphData, path: str | os.PathLike[str], solution: PosesByKey | None) -> None:
-    """Write a pose graph, with a solution's poses as initial values if one is given."""
+def write_graph(data: GraphData, path: str | os.PathLike[str], solution: PosesByKey | None) -> None:
+    """Write a pose graph, with a solution's poses as initial values if one is given.
+
+    Raises:
+        DataError: unknown ending, or the file cannot be written.
+        GraphError: the format cannot hold what is in the graph.
+    """
     if solution is not None:
-        data = data.without()
+        data = data.copy()
         data.start_from(solution)
     suffix = Path(path).suffix
     if suffix == ".npz":
@@ -29,5 +38,5 @@ def save(data: GraphData, path: str | os.PathLike[str], solution: PosesByKey | N
         write_text(data, path, "g2o" if suffix == ".g2o" else "toro")
     else:
         raise DataError(
-            f"{path}: a pose graph is saved as .npz, .g2o, .graph or .toro, not {suffix or 'without ending'}"
+            f"{path}: cannot save a pose graph under the ending {suffix or '(none)'}; use .npz, .g2o, .graph or .toro"
         )

@@ -1,9 +1,9 @@
-"""Pose graphs as text: g2o's format, which g2o, GTSAM, Ceres and SE-Sync read, and TORO's, which came before it.
+"""Row formats of pose graphs in text: g2o's, which g2o, GTSAM, Ceres and SE-Sync read, and the older TORO's.
 
-One row a vertex or an edge. ``VERTEX_SE3:QUAT id x y z qx qy qz qw``; ``EDGE_SE3:QUAT from to x y z qx qy qz qw`` with
-the upper triangle of the information matrix, **translation first**, taken for that of a right perturbation in radians
-and metres, as GTSAM takes it. Other writers keep six digits, a centimetre at a kilometre from the start; here every
-number reads back as it was.
+One row per vertex or edge. ``VERTEX_SE3:QUAT id x y z qx qy qz qw``; ``EDGE_SE3:QUAT from to x y z qx qy qz qw`` and
+the upper triangle of the information matrix, **translation first**, which is taken to be of a right perturbation in
+radians and metres, as GTSAM does. Other writers keep six digits, which is a centimetre at a kilometre from the origin;
+here every number is written so that it reads back exactly.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from hybridlio.core.estimates import RelativePose
 from hybridlio.core.files import write_whole
 from hybridlio.graph.model import coordinates as co
 
-What: TypeAlias = Literal["vertex", "edge", "prior"]
+RowKind: TypeAlias = Literal["vertex", "edge", "prior"]
 Angles: TypeAlias = Literal["quaternion", "rpy", "heading"]
 
 
 @dataclass(frozen=True)
-class Row:
-    """What a row of text holds after its tag.
+class RowFormat:
+    """What follows the tag in a row of text.
 
     Attributes:
-        what: vertex, edge or prior.
+        kind: vertex, edge or prior.
         dimension: 2 or 3.
         angles: how the rotation is written.
-        ids: integers at its start.
-        triangle: order of the information matrix: ``(row, column)`` of each number, translation first.
+        ids: number of integers at the start.
+        triangle: ``(row, column)`` in the information matrix, translation first, of each number at the end.
     """
 
-    what: What
+    kind: RowKind
     dimension: co.Dimension
     angles: Angles
     ids: int
@@ -45,41 +45,41 @@ class Row:
 
     @property
     def pose_size(self) -> int:
-        """How many numbers the pose takes."""
+        """Number of values of the pose."""
         return {"quaternion": 7, "rpy": 6, "heading": 3}[self.angles]
 
     @property
     def length(self) -> int:
-        """How many words follow the tag."""
+        """Number of words after the tag."""
         return self.ids + self.pose_size + len(self.triangle)
 
 
-def _upper(size: int) -> tuple[tuple[int, int], ...]:
+def _upper_triangle(size: int) -> tuple[tuple[int, int], ...]:
     return tuple((i, j) for i in range(size) for j in range(i, size))
 
 
 _TORO_PLANAR = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
 
-ROWS = {
-    "VERTEX_SE3:QUAT": Row("vertex", 3, "quaternion", 1),
-    "EDGE_SE3:QUAT": Row("edge", 3, "quaternion", 2, _upper(6)),
-    "EDGE_SE3_PRIOR": Row("prior", 3, "quaternion", 2, _upper(6)),  # its second number is that of an offset
-    "VERTEX_SE2": Row("vertex", 2, "heading", 1),
-    "EDGE_SE2": Row("edge", 2, "heading", 2, _upper(3)),
-    "EDGE_PRIOR_SE2": Row("prior", 2, "heading", 1, _upper(3)),
-    "VERTEX3": Row("vertex", 3, "rpy", 1),
-    "EDGE3": Row("edge", 3, "rpy", 2, _upper(6)),
-    "VERTEX2": Row("vertex", 2, "heading", 1),
-    "EDGE2": Row("edge", 2, "heading", 2, _TORO_PLANAR),
-    "VERTEX": Row("vertex", 2, "heading", 1),
-    "EDGE": Row("edge", 2, "heading", 2, _TORO_PLANAR),
-    "ODOMETRY": Row("edge", 2, "heading", 2, _TORO_PLANAR),
+ROW_FORMATS = {
+    "VERTEX_SE3:QUAT": RowFormat("vertex", 3, "quaternion", 1),
+    "EDGE_SE3:QUAT": RowFormat("edge", 3, "quaternion", 2, _upper_triangle(6)),
+    "EDGE_SE3_PRIOR": RowFormat("prior", 3, "quaternion", 2, _upper_triangle(6)),  # the second id is of an offset
+    "VERTEX_SE2": RowFormat("vertex", 2, "heading", 1),
+    "EDGE_SE2": RowFormat("edge", 2, "heading", 2, _upper_triangle(3)),
+    "EDGE_PRIOR_SE2": RowFormat("prior", 2, "heading", 1, _upper_triangle(3)),
+    "VERTEX3": RowFormat("vertex", 3, "rpy", 1),
+    "EDGE3": RowFormat("edge", 3, "rpy", 2, _upper_triangle(6)),
+    "VERTEX2": RowFormat("vertex", 2, "heading", 1),
+    "EDGE2": RowFormat("edge", 2, "heading", 2, _TORO_PLANAR),
+    "VERTEX": RowFormat("vertex", 2, "heading", 1),
+    "EDGE": RowFormat("edge", 2, "heading", 2, _TORO_PLANAR),
+    "ODOMETRY": RowFormat("edge", 2, "heading", 2, _TORO_PLANAR),
 }
-# the same file with the triangle row by row, as some write it under TORO's tags
-BY_ROWS = {tag: Row("edge", 2, "heading", 2, _upper(3)) for tag in ("EDGE2", "EDGE", "ODOMETRY")}
+# The same tags in files whose writers order the triangle row by row instead of as TORO does.
+ROW_BY_ROW = {tag: RowFormat("edge", 2, "heading", 2, _upper_triangle(3)) for tag in ("EDGE2", "EDGE", "ODOMETRY")}
 
-# what pose graphs do not have: landmarks and cameras, and what only places them
-OTHER = frozenset(
+# Tags that a reader skips: landmarks, cameras, and measurements and parameters of them.
+SKIPPED_TAGS = frozenset(
     {
         *("VERTEX_XY", "VERTEX_TRACKXYZ", "VERTEX_POINTXYZ", "VERTEX_CAM", "LANDMARK", "BR", "EQUIV"),
         *("EDGE_SE2_XY", "EDGE_BEARING_SE2_XY", "EDGE_BEARING_RANGE_SE2_XY", "EDGE_PRIOR_SE2_XY", "EDGE_XY_PRIOR"),
@@ -90,46 +90,47 @@ OTHER = frozenset(
 
 
 def pose_numbers(coordinates: Array, angles: Angles) -> Array:
-    """A row's numbers for a pose from its coordinates."""
+    """Return a row's numbers of a pose from its coordinates."""
     if angles != "rpy":
         return coordinates
-    angles_rad = Rotation.from_quat(coordinates[3:]).as_euler("ZYX")
-    return np.concatenate([coordinates[:3], angles_rad[::-1]])
+    yaw_pitch_roll = Rotation.from_quat(coordinates[3:]).as_euler("ZYX")
+    return np.concatenate([coordinates[:3], yaw_pitch_roll[::-1]])
 
 
-def information_numbers(information: Array, row: Row) -> Array:
-    """A row's numbers for an information matrix, rotation first."""
-    order = co.TEXT_ORDER[row.dimension]
+def information_numbers(information: Array, row_format: RowFormat) -> Array:
+    """Return a row's numbers of an information matrix ``(d, d)``, rotation first."""
+    order = co.TEXT_ORDER[row_format.dimension]
     ordered = information[np.ix_(order, order)]
-    return np.array([ordered[cell] for cell in row.triangle])
+    return np.array([ordered[cell] for cell in row_format.triangle])
 
 
 def format_numbers(values: Array) -> str:
-    """As short as they read back exactly."""
+    """Return the numbers as the shortest text that reads back exactly."""
     return " ".join(map(repr, values.tolist()))
 
 
 def write_g2o(
     path: str | os.PathLike[str], poses: Array, edges: Iterable[tuple[int, int, RelativePose]], first: int = 0
 ) -> None:
-    """Write a pose graph in space without making one.
+    """Write poses and relative poses in g2o's format, without a pose graph.
 
     Args:
         path: the file.
         poses: ``(N, 4, 4)``, one vertex each.
         edges: from, to, and the relative pose measured between them.
-        first: the number of the first vertex; the others follow.
+        first: number of the first vertex; the others follow.
 
     Raises:
-        DataError: the place cannot be written to.
+        DataError: the file cannot be written.
     """
-    row = ROWS["EDGE_SE3:QUAT"]
-    lines = [f"VERTEX_SE3:QUAT {k} {_pose(pose)}" for k, pose in enumerate(poses, first)]
+    edge_format = ROW_FORMATS["EDGE_SE3:QUAT"]
+    lines = [f"VERTEX_SE3:QUAT {k} {_format_pose(pose)}" for k, pose in enumerate(poses, first)]
     for i, j, edge in edges:
-        information = information_numbers(np.asarray(np.linalg.inv(edge.covariance), dtype=np.float64), row)
-        lines.append(f"EDGE_SE3:QUAT {i} {j} {_pose(edge.pose)} {format_numbers(information)}")
+        matrix = np.asarray(np.linalg.inv(edge.covariance), dtype=np.float64)
+        information = format_numbers(information_numbers(matrix, edge_format))
+        lines.append(f"EDGE_SE3:QUAT {i} {j} {_format_pose(edge.pose)} {information}")
     write_whole(path, "\n".join(lines) + "\n")
 
 
-def _pose(pose: Array) -> str:
+def _format_pose(pose: Array) -> str:
     return format_numbers(co.from_matrices(pose[None], 3)[0])

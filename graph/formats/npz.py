@@ -1,4 +1,4 @@
-"""Pose graphs as NumPy archives: everything a graph holds, to the last bit, without pickles."""
+"""Pose graphs as NumPy archives: everything that a graph holds, to the last bit, without pickles."""
 
 from __future__ import annotations
 
@@ -9,25 +9,27 @@ from typing import Any, get_args
 
 import numpy as np
 
-from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.files import UNREADABLE_NPZ, write_whole
+from hybridlio.core.geodesy import check_geodetic
 from hybridlio.core.sensors import ImuSamples
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.edge_table import FORMS
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, check_key
-from hybridlio.graph.model.measurements import Factor, Kind, Noise, Robust, check_vector, make_noise, make_robust
+from hybridlio.graph.model.measurements import Factor, Kind
+from hybridlio.graph.model.new_factors import check_vector
+from hybridlio.graph.model.noise import Noise, NoiseInput, Robust, make_noise, make_robust
 
 _FORMAT = "hybridlio pose graph 1"
-_NO_ROBOT = -1
+_NO_ROBOT = -1  # in the robots' column, of an integer key
 
 
 def write_npz(data: GraphData, path: str | os.PathLike[str]) -> None:
     """Write all of a graph.
 
     Raises:
-        DataError: the place cannot be written to.
+        DataError: the file cannot be written.
     """
     keys = data.keys
     key_table = _key_table([(key,) for key in keys], 1)
@@ -36,7 +38,7 @@ def write_npz(data: GraphData, path: str | os.PathLike[str]) -> None:
         "dimension": np.array(data.dimension),
         "next_id": np.array(data.next_id),
         "keys": key_table,
-        "initial": data.coordinates_or_nan,
+        "initial": data.initial_values,
         "fixed": np.array([key in data.fixed for key in keys], dtype=bool),
     }
     if data.origin is not None:
@@ -44,9 +46,9 @@ def write_npz(data: GraphData, path: str | os.PathLike[str]) -> None:
     if len(data.edges):
         arrays |= {f"between_{name}": column for name, column in _edge_columns(data, key_table[:, 0]).items()}
     for kind in get_args(Kind):
-        numbered = {number: factor for number, factor in data.others.items() if factor.kind == kind}
-        if numbered:
-            arrays |= {f"{kind}_{name}": column for name, column in _columns(numbered).items()}
+        of_kind = {factor_id: factor for factor_id, factor in data.other_factors.items() if factor.kind == kind}
+        if of_kind:
+            arrays |= {f"{kind}_{name}": column for name, column in _factor_columns(of_kind).items()}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     write_whole(path, buffer.getvalue())
@@ -54,7 +56,7 @@ def write_npz(data: GraphData, path: str | os.PathLike[str]) -> None:
 
 def _edge_columns(data: GraphData, keys: Any) -> dict[str, Any]:
     table = data.edges
-    kernels = [table.robust.get(number) for number in table.ids.tolist()]
+    kernels = [table.robust.get(factor_id) for factor_id in table.ids.tolist()]
     return {
         "id": table.ids,
         "keys": keys[table.ends],
@@ -62,19 +64,20 @@ def _edge_columns(data: GraphData, keys: Any) -> dict[str, Any]:
         "kernel": np.array([kernel.kernel if kernel else "" for kernel in kernels]),
         "width": np.array([kernel.width if kernel else np.nan for kernel in kernels]),
         "noise_form": np.array(FORMS)[table.form],
-        "noise": table.noise,
+        "noise": table.noise_values,
     }
 
 
 def _key_table(keys: list[tuple[Key, ...]], width: int) -> Any:
+    """Return keys as ``(M, width, 2)`` robots and indices."""
     rows = [[(_NO_ROBOT, key) if isinstance(key, int) else key for key in row] for row in keys]
     return np.array(rows, dtype=np.int64).reshape(-1, width, 2)
 
 
-def _columns(numbered: dict[int, Factor]) -> dict[str, Any]:
-    factors = list(numbered.values())
+def _factor_columns(by_id: dict[int, Factor]) -> dict[str, Any]:
+    factors = list(by_id.values())
     columns: dict[str, Any] = {
-        "id": np.array(list(numbered), dtype=np.int64),
+        "id": np.array(list(by_id), dtype=np.int64),
         "keys": _key_table([factor.keys for factor in factors], len(factors[0].keys)),
         "measured": np.array([factor.measured for factor in factors]),
         "kernel": np.array([factor.robust.kernel if factor.robust else "" for factor in factors]),
@@ -97,46 +100,51 @@ def read_npz(path: str | os.PathLike[str]) -> GraphData:
     """Read what :func:`write_npz` wrote.
 
     Raises:
-        DataError: the file cannot be read, is damaged, or is something else.
+        DataError: the file cannot be read, is damaged, or is not a pose graph.
     """
     path = Path(path)
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         if str(arrays["format"]) != _FORMAT:
-            raise DataError(f"{path}: written as {arrays['format']!s}; this release reads {_FORMAT}")
+            raise DataError(f"{path}: has format {arrays['format']!s}; this release reads {_FORMAT}")
         return _assemble(arrays)
     except OSError as error:
         raise DataError(f"cannot read {path}: {error}") from error
     except UNREADABLE_NPZ as error:
-        raise DataError(f"{path}: no pose graph, or a damaged one: {error}") from error
+        raise DataError(f"{path}: not a pose graph, or a damaged one: {error}") from error
 
 
 def _assemble(arrays: dict[str, Any]) -> GraphData:
-    graph = GraphData(int(arrays["dimension"]))  # type: ignore[arg-type]
+    data = GraphData(int(arrays["dimension"]))  # type: ignore[arg-type]
     if "origin" in arrays:
-        graph.set_origin(*arrays["origin"].tolist())
-    size = len(co.IDENTITY[graph.dimension])
-    for (key,), initial, fixed in zip(
-        _key_rows(arrays["keys"]), arrays["initial"].reshape(-1, size), arrays["fixed"], strict=True
-    ):
-        if key in graph:
-            raise DataError(f"pose {key} is there twice")
-        graph.put_pose(key, None if np.isnan(initial).all() else check_vector(initial, size, f"pose {key}"))
-        if fixed:
-            graph.fix(key)
-    numbered: dict[int, Factor] = {}
+        latitude_deg, longitude_deg, height_m = arrays["origin"].tolist()
+        data.set_origin(check_geodetic(latitude_deg, longitude_deg, height_m, "origin"))
+    _add_poses(data, arrays)
+    by_id: dict[int, Factor] = {}
     for kind in get_args(Kind):
         prefix = f"{kind}_"
         columns = {name[len(prefix) :]: value for name, value in arrays.items() if name.startswith(prefix)}
         if columns:
-            numbered |= _factors(kind, columns)
-    for number in sorted(numbered):
-        if missing := [key for key in numbered[number].keys if key not in graph]:
-            raise DataError(f"{numbered[number].label}: there is no pose {missing[0]}")
-        graph.put_factor(numbered[number], number)
-    graph.next_id = max(graph.next_id, int(arrays["next_id"]))
-    return graph
+            by_id |= _factors(kind, columns)
+    for factor_id in sorted(by_id):
+        if missing := [key for key in by_id[factor_id].keys if key not in data]:
+            raise DataError(f"{by_id[factor_id].label}: no pose has key {missing[0]}")
+        data.add_factor(by_id[factor_id], factor_id)
+    data.next_id = max(data.next_id, int(arrays["next_id"]))
+    return data
+
+
+def _add_poses(data: GraphData, arrays: dict[str, Any]) -> None:
+    size = len(co.IDENTITY[data.dimension])
+    initial = arrays["initial"].reshape(-1, size)
+    for (key,), coordinates, fixed in zip(_key_rows(arrays["keys"]), initial, arrays["fixed"], strict=True):
+        if key in data:
+            raise DataError(f"pose {key} occurs twice")
+        unknown = np.isnan(coordinates).all()
+        data.add_pose(key, None if unknown else check_vector(coordinates, size, f"pose {key}"))
+        if fixed:
+            data.fix(key)
 
 
 def _key_rows(table: Any) -> list[tuple[Key, ...]]:
@@ -149,22 +157,21 @@ def _key_rows(table: Any) -> list[tuple[Key, ...]]:
 def _factors(kind: Kind, columns: dict[str, Any]) -> dict[int, Factor]:
     found = {}
     samples = _samples(columns)
-    for row, (number, keys) in enumerate(zip(columns["id"].tolist(), _key_rows(columns["keys"]), strict=True)):
+    for row, (factor_id, keys) in enumerate(zip(columns["id"].tolist(), _key_rows(columns["keys"]), strict=True)):
         measured = columns["measured"][row]
         name = f"{kind} {keys}"
         noise = _noise(columns, row, name) if "noise" in columns else None
         kernel = str(columns["kernel"][row])
         robust: Robust | None = make_robust((kernel, float(columns["width"][row])), 1, name) if kernel else None
         measured = check_vector(measured, len(measured), name)
-        found[number] = Factor(kind, keys, measured, noise, robust, samples[row] if samples else None)
+        found[factor_id] = Factor(kind, keys, measured, noise, robust, samples[row] if samples else None)
     return found
 
 
 def _noise(columns: dict[str, Any], row: int, name: str) -> Noise:
     form, values = str(columns["noise_form"][row]), np.array(columns["noise"][row])
-    given: dict[str, Array | None] = {"covariance": None, "information": None, "sigmas": None}
-    given[form] = np.diagonal(values).copy() if form == "sigmas" else values
-    return make_noise(name, len(values), **given)
+    values = np.diagonal(values).copy() if form == "sigmas" else values
+    return make_noise(name, len(values), NoiseInput(**{form: values}))
 
 
 def _samples(columns: dict[str, Any]) -> list[ImuSamples]:

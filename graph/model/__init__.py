@@ -1,1 +1,1 @@
-"""A pose graph as plain data: keys, coordinates, measurements, edges, checks."""
+"""A pose graph as plain data: keys, coordinates, measurements, edges, and checks of its structure."""

@@ -1,6 +1,7 @@
-"""Poses as a pose graph keeps them: the numbers that text formats hold, so that nothing is lost between the two.
+"""Poses as coordinates, the form in which a pose graph stores them and text formats write them.
 
-In space seven numbers, ``x y z qx qy qz qw``; in the plane three, ``x y θ``. At the boundary both are ``(4, 4)``.
+In space seven numbers, ``x y z qx qy qz qw``; in the plane three, ``x y θ``. Storing what a file holds, instead of a
+matrix, makes files read and written back equal to the last bit. Users see ``(4, 4)`` matrices in both cases.
 """
 
 from __future__ import annotations
@@ -20,39 +21,41 @@ Dimension: TypeAlias = Literal[2, 3]
 
 IDENTITY: dict[int, Array] = {2: np.zeros(3), 3: np.r_[np.zeros(6), 1.0]}
 TANGENT_SIZE: dict[int, int] = {2: 3, 3: 6}
-# ours, rotation first, in the order of GTSAM's tangent vectors (Pose2 has x, y, θ) and of text formats' information
+# Positions of our tangent components, rotation first, in GTSAM's tangent vectors (Pose2 has x, y, θ) and in the
+# information matrices of text formats (translation first).
 GTSAM_ORDER: dict[int, list[int]] = {2: [1, 2, 0], 3: [0, 1, 2, 3, 4, 5]}
 TEXT_ORDER: dict[int, list[int]] = {2: [1, 2, 0], 3: [3, 4, 5, 0, 1, 2]}
 
-_PLANAR = np.ix_([0, 1, 3], [0, 1, 3])
+_PLANAR = np.ix_([0, 1, 3], [0, 1, 3])  # cells of a (4, 4) pose that a (3, 3) planar pose fills
+_PLANAR_TOLERANCE = 1e-9  # rad, m: rounding of a matrix product, far below any measurement
 
 
 def from_matrix(T: ArrayLike, dimension: Dimension, name: str) -> Array:
-    """Coordinates of one pose ``(4, 4)``; in the plane ``(3, 3)`` is taken too.
+    """Return the coordinates of one pose ``(4, 4)``; a planar graph also takes ``(3, 3)``.
 
     Raises:
-        DataError: not a rigid transform; in the plane, one that leaves it.
+        DataError: not a rigid transform, or out of the plane of a planar graph; the message starts with ``name``.
     """
     T = np.asarray(T, dtype=np.float64)
     if dimension == 3:
         T = se3.check_pose(T, name)
         return np.concatenate([T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)])
     if T.shape == (3, 3):
-        T = _lifted(T)
+        T = _lift(T)
     T = se3.check_pose(T, name)
-    if np.abs(T - _lifted(T[_PLANAR])).max() > 1e-9:
-        raise DataError(f"{name}: leaves the plane (z, roll or pitch is not zero), but the graph is planar")
+    if np.abs(T - _lift(T[_PLANAR])).max() > _PLANAR_TOLERANCE:
+        raise DataError(f"{name}: the graph is planar, but the pose's z, roll or pitch is not zero")
     return np.array([T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0])])
 
 
-def _lifted(T: Array) -> Array:
+def _lift(T: Array) -> Array:
     lifted = np.eye(4)
     lifted[_PLANAR] = T
     return lifted
 
 
 def to_matrices(coordinates: Array) -> Array:
-    """Poses ``(N, 4, 4)`` of coordinates ``(N, 7)`` or ``(N, 3)``."""
+    """Return the poses ``(N, 4, 4)`` of coordinates ``(N, 7)`` or ``(N, 3)``."""
     if coordinates.shape[1] == 7:
         return se3.make(Rotation.from_quat(coordinates[:, 3:]).as_matrix(), coordinates[:, :3])
     c, s = np.cos(coordinates[:, 2]), np.sin(coordinates[:, 2])
@@ -62,24 +65,25 @@ def to_matrices(coordinates: Array) -> Array:
     return T
 
 
-def gtsam_poses(coordinates: Array) -> list[Any]:
-    """The poses as GTSAM has them: ``Pose3``, in the plane ``Pose2``."""
-    if coordinates.shape[1] == 3:
-        return [gtsam.Pose2(x, y, theta) for x, y, theta in coordinates.tolist()]
-    turn, make = gtsam.Rot3.Quaternion, gtsam.Pose3
-    quaternions = coordinates[:, 3:] / np.linalg.norm(coordinates[:, 3:], axis=1, keepdims=True)
-    return [make(turn(w, x, y, z), t) for (x, y, z, w), t in zip(quaternions.tolist(), coordinates[:, :3], strict=True)]
-
-
 def from_matrices(T: Array, dimension: Dimension) -> Array:
-    """Coordinates ``(N, 7)`` or ``(N, 3)`` of poses ``(N, 4, 4)`` that are known to be such."""
+    """Return the coordinates ``(N, 7)`` or ``(N, 3)`` of valid poses ``(N, 4, 4)``, without checks."""
     if dimension == 2:
         return np.column_stack([T[:, 0, 3], T[:, 1, 3], np.arctan2(T[:, 1, 0], T[:, 0, 0])])
     return np.hstack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)])
 
 
+def gtsam_poses(coordinates: Array) -> list[Any]:
+    """Return the poses as GTSAM's ``Pose3``, or ``Pose2`` in the plane."""
+    if coordinates.shape[1] == 3:
+        return [gtsam.Pose2(x, y, theta) for x, y, theta in coordinates.tolist()]
+    make_rotation, make_pose = gtsam.Rot3.Quaternion, gtsam.Pose3
+    quaternions = coordinates[:, 3:] / np.linalg.norm(coordinates[:, 3:], axis=1, keepdims=True)
+    columns = zip(quaternions.tolist(), coordinates[:, :3], strict=True)
+    return [make_pose(make_rotation(w, x, y, z), t) for (x, y, z, w), t in columns]
+
+
 def our_order(matrix: Array, dimension: Dimension) -> Array:
-    """A matrix over GTSAM's tangent vectors in our order, rotation first."""
+    """Return a matrix over GTSAM's tangent vectors in our order, rotation first."""
     if dimension == 3:
         return np.array(matrix)
     order = np.argsort(GTSAM_ORDER[2])
@@ -87,7 +91,17 @@ def our_order(matrix: Array, dimension: Dimension) -> Array:
 
 
 def relative_covariance(joint: Any, a: int, b: int, T_b_a: Array, dimension: Dimension) -> Array:
-    """Covariance of the pose ``b`` in the frame of pose ``a`` from GTSAM's joint marginal, which names them so."""
+    """Return the covariance ``(d, d)`` of pose ``b`` in the frame of pose ``a``.
+
+    First-order propagation through ``T_a_b = T_a⁻¹ T_b``: a right perturbation of ``T_a`` acts on ``T_a_b`` by
+    ``-Ad(T_b_a)``, one of ``T_b`` by the identity.
+
+    Args:
+        joint: GTSAM's joint marginal covariance of both poses.
+        a, b: GTSAM's variables of the poses.
+        T_b_a: pose ``a`` in the frame of pose ``b``, ``(4, 4)``.
+        dimension: of the graph.
+    """
     blocks = np.block([[our_order(joint.at(m, n), dimension) for n in (a, b)] for m in (a, b)])
     J = np.hstack([-adjoint(T_b_a, dimension), np.eye(TANGENT_SIZE[dimension])])
     covariance = J @ blocks @ J.T
@@ -95,6 +109,6 @@ def relative_covariance(joint: Any, a: int, b: int, T_b_a: Array, dimension: Dim
 
 
 def adjoint(T: Array, dimension: Dimension) -> Array:
-    """Adjoint of one pose ``(4, 4)``, in our order: ``(6, 6)``, in the plane ``(3, 3)``."""
+    """Return the adjoint of one pose ``(4, 4)`` in our order: ``(6, 6)``, or ``(3, 3)`` in the plane."""
     full = se3.adjoint(T)
     return full if dimension == 3 else np.asarray(full[2:5, 2:5])

@@ -1,4 +1,4 @@
-"""Between-factors by column, as a pose graph keeps them: most work is done on all of them at once."""
+"""Between-factors stored by column, because most work is done on all of them at once."""
 
 from __future__ import annotations
 
@@ -7,20 +7,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybridlio.core.arrays import Array
+from hybridlio.core.arrays import Array, Index, Mask
 from hybridlio.graph.model import coordinates as co
-from hybridlio.graph.model.keys import Key
-from hybridlio.graph.model.measurements import Factor, Form, Noise, Robust
+from hybridlio.graph.model.noise import Form, Noise, Robust
 
 FORMS: tuple[Form, ...] = ("covariance", "information", "sigmas")
-_LEAST_ROOM = 16
+_SMALLEST_CAPACITY = 16  # rows: a small graph then grows its columns once or twice
 
 
-class Rows:
-    """An array that rows are added to at its end, in constant time each."""
+class GrowingArray:
+    """An array that takes new rows at its end in amortised constant time each."""
 
     def __init__(self, shape: tuple[int, ...], dtype: Any = np.float64) -> None:
-        self._room = np.empty((0, *shape), dtype=dtype)
+        self._buffer = np.empty((0, *shape), dtype=dtype)
         self._count = 0
 
     def __len__(self) -> int:
@@ -28,136 +27,125 @@ class Rows:
 
     @property
     def array(self) -> NDArray[Any]:
-        """The rows so far; the next change may take the memory away from under it."""
-        return self._room[: self._count]
+        """View of the rows so far; only valid until the next :meth:`extend`, which may move the memory."""
+        return self._buffer[: self._count]
 
     def extend(self, rows: ArrayLike) -> None:
-        """Add rows."""
-        rows = np.asarray(rows, dtype=self._room.dtype)
-        need = self._count + len(rows)
-        if need > len(self._room):
-            room = np.empty((max(need, 2 * self._count, _LEAST_ROOM), *self._room.shape[1:]), dtype=self._room.dtype)
-            room[: self._count] = self.array
-            self._room = room
-        self._room[self._count : need] = rows
-        self._count = need
+        """Add rows at the end."""
+        rows = np.asarray(rows, dtype=self._buffer.dtype)
+        needed = self._count + len(rows)
+        if needed > len(self._buffer):
+            capacity = max(needed, 2 * self._count, _SMALLEST_CAPACITY)
+            buffer = np.empty((capacity, *self._buffer.shape[1:]), dtype=self._buffer.dtype)
+            buffer[: self._count] = self.array
+            self._buffer = buffer
+        self._buffer[self._count : needed] = rows
+        self._count = needed
 
-    def where(self, keep: NDArray[np.bool_] | slice) -> Rows:
-        """A copy of some rows."""
-        copy = Rows(self._room.shape[1:], self._room.dtype)
-        copy._room = np.array(self.array[keep])
-        copy._count = len(copy._room)
+    def where(self, keep: Mask | slice) -> GrowingArray:
+        """Return a copy of some rows."""
+        copy = GrowingArray(self._buffer.shape[1:], self._buffer.dtype)
+        copy._buffer = np.array(self.array[keep])
+        copy._count = len(copy._buffer)
         return copy
 
 
 class EdgeTable:
-    """Columns of ids, both ends' places, measured coordinates, noise and its form; kernels by id."""
+    """Between-factors by row: id, both poses, measured coordinates, noise and its form.
+
+    Attributes:
+        robust: kernels by factor id, of the edges that have one.
+    """
 
     def __init__(self, dimension: co.Dimension) -> None:
         size = co.TANGENT_SIZE[dimension]
         self._columns = {
-            "id": Rows((), np.int64),
-            "ends": Rows((2,), np.int64),
-            "measured": Rows(co.IDENTITY[dimension].shape),
-            "noise": Rows((size, size)),  # sigmas stand on the diagonal
-            "form": Rows((), np.int8),
+            "id": GrowingArray((), np.int64),
+            "ends": GrowingArray((2,), np.int64),
+            "measured": GrowingArray(co.IDENTITY[dimension].shape),
+            "noise": GrowingArray((size, size)),
+            "form": GrowingArray((), np.int8),
         }
         self.robust: dict[int, Robust] = {}
-        self._made: dict[int, Factor] = {}
 
     def __len__(self) -> int:
         return len(self._columns["id"])
 
-    def __contains__(self, number: object) -> bool:
-        return isinstance(number, int | np.integer) and self._row(int(number)) is not None
+    def __contains__(self, factor_id: object) -> bool:
+        return isinstance(factor_id, int | np.integer) and self.row(int(factor_id)) is not None
 
     @property
-    def ids(self) -> NDArray[np.int64]:
-        """``(M,)``, rising."""
+    def ids(self) -> Index:
+        """Factor ids ``(M,)``, ascending."""
         return self._columns["id"].array
 
     @property
-    def ends(self) -> NDArray[np.int64]:
-        """``(M, 2)`` places of the poses in the graph's order."""
+    def ends(self) -> Index:
+        """Indices ``(M, 2)`` of both poses in the graph's order."""
         return self._columns["ends"].array
 
     @property
     def measured(self) -> Array:
-        """``(M, 7)`` or ``(M, 3)`` coordinates."""
+        """Coordinates ``(M, 7)`` or ``(M, 3)`` of ``T_i_j``."""
         return self._columns["measured"].array
 
     @property
-    def noise(self) -> Array:
-        """``(M, d, d)`` as given, each in its form; sigmas on the diagonal."""
+    def noise_values(self) -> Array:
+        """Noise ``(M, d, d)``, each in the form it was given; sigmas are on the diagonal."""
         return self._columns["noise"].array
 
     @property
     def form(self) -> NDArray[np.int8]:
-        """``(M,)`` which of :data:`FORMS`."""
+        """Form of the noise ``(M,)``, an index into :data:`FORMS`."""
         return self._columns["form"].array
 
     @property
     def information(self) -> Array:
-        """``(M, d, d)``."""
-        information = self.noise
+        """Information matrices ``(M, d, d)``."""
+        information = self.noise_values
         others = np.flatnonzero(self.form != FORMS.index("information"))
         if len(others):
             information = information.copy()
         for row in others:
-            information[row] = self._noise(int(row)).information
+            information[row] = self.noise(int(row)).information
         return information
+
+    def noise(self, row: int) -> Noise:
+        """Return the noise of a row as an object."""
+        form, values = FORMS[self.form[row]], self.noise_values[row]
+        return Noise(form, np.diagonal(values).copy() if form == "sigmas" else values.copy())
+
+    def row(self, factor_id: int) -> int | None:
+        """Return the row of a factor, or None where the table does not hold it."""
+        row = int(np.searchsorted(self.ids, factor_id))
+        return row if row < len(self) and self.ids[row] == factor_id else None
 
     def extend(
         self, ids: ArrayLike, ends: ArrayLike, measured: ArrayLike, noise: ArrayLike, form: ArrayLike
     ) -> None:  # fmt: skip
-        """Add rows whose ids are higher than all that are there."""
-        for rows, values in zip(self._columns.values(), (ids, ends, measured, noise, form), strict=True):
-            rows.extend(values)
+        """Add rows whose ids are higher than all in the table."""
+        for column, values in zip(self._columns.values(), (ids, ends, measured, noise, form), strict=True):
+            column.extend(values)
 
-    def append(self, number: int, ends: tuple[int, int], factor: Factor) -> None:
-        """Add one."""
-        assert factor.noise is not None
-        noise = factor.noise
+    def append(
+        self, factor_id: int, ends: tuple[int, int], measured: Array, noise: Noise, robust: Robust | None
+    ) -> None:  # fmt: skip
+        """Add one row."""
         values = np.diag(noise.values) if noise.form == "sigmas" else noise.values
-        self.extend([number], [ends], factor.measured[None], values[None], [FORMS.index(noise.form)])
-        if factor.robust is not None:
-            self.robust[number] = factor.robust
+        self.extend([factor_id], [ends], measured[None], values[None], [FORMS.index(noise.form)])
+        if robust is not None:
+            self.robust[factor_id] = robust
 
-    def remove(self, number: int) -> None:
-        """Take one out that is there."""
-        keep = self.ids != number
-        self._columns = {name: rows.where(keep) for name, rows in self._columns.items()}
-        self.robust.pop(number, None)
-        self._made.pop(number, None)
+    def remove(self, factor_id: int) -> None:
+        """Remove the row of a factor that the table holds."""
+        keep = self.ids != factor_id
+        self._columns = {name: column.where(keep) for name, column in self._columns.items()}
+        self.robust.pop(factor_id, None)
 
-    def where(self, keep: NDArray[np.bool_] | slice) -> EdgeTable:
-        """A copy of some rows."""
+    def where(self, keep: Mask | slice) -> EdgeTable:
+        """Return a copy of some rows."""
         copy = EdgeTable.__new__(EdgeTable)
-        copy._columns = {name: rows.where(keep) for name, rows in self._columns.items()}
-        left = self.robust.keys() & copy.ids.tolist() if self.robust else ()
-        copy._made = {}
-        copy.robust = {number: self.robust[number] for number in left}
+        copy._columns = {name: column.where(keep) for name, column in self._columns.items()}
+        kept = self.robust.keys() & copy.ids.tolist() if self.robust else ()
+        copy.robust = {factor_id: self.robust[factor_id] for factor_id in kept}
         return copy
-
-    def factor(self, number: int, keys: list[Key]) -> Factor:
-        """One as an object.
-
-        Raises:
-            KeyError: there is none of this id.
-        """
-        row = self._row(number)
-        if row is None:
-            raise KeyError(number)
-        if number not in self._made:
-            i, j = self.ends[row].tolist()
-            measured, robust = self.measured[row].copy(), self.robust.get(number)
-            self._made[number] = Factor("between", (keys[i], keys[j]), measured, self._noise(row), robust)
-        return self._made[number]
-
-    def _noise(self, row: int) -> Noise:
-        form, values = FORMS[self.form[row]], self.noise[row]
-        return Noise(form, np.diagonal(values).copy() if form == "sigmas" else values.copy())
-
-    def _row(self, number: int) -> int | None:
-        row = int(np.searchsorted(self.ids, number))
-        return row if row < len(self) and self.ids[row] == number else None

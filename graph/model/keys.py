@@ -1,7 +1,7 @@
-"""Names of poses: an integer, or (robot, index) where several robots share a graph.
+"""Keys of poses: an integer, or (robot, index) where several robots share a graph.
 
-In text formats, which know integers only, (robot, index) is written as GTSAM's symbols are: the robot's letter, ``a``
-for robot 0, in the top byte.
+Text formats know only integers. There, (robot, index) is packed like a GTSAM symbol: the robot's letter in the top byte
+(``a`` for robot 0), the index in the other seven.
 """
 
 from __future__ import annotations
@@ -12,40 +12,41 @@ from hybridlio.core.errors import GraphError
 
 Key: TypeAlias = "int | tuple[int, int]"
 
-_INDEX_BITS = 56
-_FIRST_LETTER = ord("a")
-_LAST_ROBOT = 127 - _FIRST_LETTER  # the top byte stays within a signed 64-bit integer
-PLAIN_KEYS = _FIRST_LETTER << _INDEX_BITS  # integers below it are keys by themselves
+_INDEX_BITS = 56  # of GTSAM's 64-bit symbols; the letter takes the other eight
+_FIRST_LETTER = ord("a")  # of robot 0, as GTSAM's examples for several robots do
+_LAST_ROBOT = 127 - _FIRST_LETTER  # keeps the packed key within a signed 64-bit integer
+PLAIN_KEYS = _FIRST_LETTER << _INDEX_BITS  # integers below it are not packed
+_LISTED_KEYS = 10  # keys that a message lists before it only counts the rest
 
 
 def check_key(key: object) -> Key:
-    """The key, as plain integers.
+    """Return the key as plain integers.
 
     Raises:
         GraphError: neither an integer nor (robot, index), or out of range.
     """
     if isinstance(key, tuple) and len(key) == 2:
-        robot, index = (_integer(part, key) for part in key)
+        robot, index = (_check_integer(part, key) for part in key)
         if robot > _LAST_ROBOT or index >= 1 << _INDEX_BITS:
-            raise GraphError(f"key {key!r}: a robot is at most {_LAST_ROBOT}, an index below 2**{_INDEX_BITS}")
+            raise GraphError(f"key {key!r}: a robot must be at most {_LAST_ROBOT}, an index below 2**{_INDEX_BITS}")
         return robot, index
-    number = _integer(key, key)
+    number = _check_integer(key, key)
     if number >= PLAIN_KEYS:
-        raise GraphError(f"key {key!r}: an integer key is below {PLAIN_KEYS}")
+        raise GraphError(f"key {key!r}: an integer key must be below {PLAIN_KEYS}")
     return number
 
 
-def _integer(value: object, key: object) -> int:
+def _check_integer(value: object, key: object) -> int:
     if isinstance(value, bool) or not hasattr(value, "__index__"):
-        raise GraphError(f"key {key!r}: a key is an integer or (robot, index), both integers")
+        raise GraphError(f"key {key!r}: a key must be an integer or (robot, index), both integers")
     number = int(value.__index__())
     if number < 0:
-        raise GraphError(f"key {key!r}: keys are not negative")
+        raise GraphError(f"key {key!r}: a key must not be negative")
     return number
 
 
 def to_integer(key: Key) -> int:
-    """The key as text formats have it."""
+    """Return the key as the integer that text formats hold."""
     if isinstance(key, int):
         return key
     robot, index = key
@@ -53,7 +54,7 @@ def to_integer(key: Key) -> int:
 
 
 def from_integer(number: int) -> Key:
-    """Inverse of :func:`to_integer`.
+    """Return the key that a text format's integer stands for; inverse of :func:`to_integer`.
 
     Raises:
         GraphError: no key has this number.
@@ -64,7 +65,7 @@ def from_integer(number: int) -> Key:
     return check_key((letter - _FIRST_LETTER, number & ((1 << _INDEX_BITS) - 1)))
 
 
-def named(keys: list[Key], most: int = 10) -> str:
-    """The keys for a message, the first few of many."""
-    text = ", ".join(str(key) for key in keys[:most])
-    return text if len(keys) <= most else f"{text} and {len(keys) - most} more"
+def list_keys(keys: list[Key]) -> str:
+    """Return the keys as text for a message: the first ten, then the count of the rest."""
+    text = ", ".join(str(key) for key in keys[:_LISTED_KEYS])
+    return text if len(keys) <= _LISTED_KEYS else f"{text} and {len(keys) - _LISTED_KEYS} more"

@@ -16,7 +16,7 @@ from hybridlio.core.errors import ConfigError
 from hybridlio.core.estimates import State
 from hybridlio.graph.base import noise
 from hybridlio.graph.base.truncated_squares import GRADUATION, chi2_bound, first_control, truncated_weights
-from hybridlio.graph.model.measurements import KERNELS, Robust, default_width
+from hybridlio.graph.model.noise import KERNELS, Robust, default_width
 from hybridlio.graph.run.factor_groups import (
     FactorGroup,
     GroupFactors,

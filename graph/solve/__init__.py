@@ -1,1 +1,1 @@
-"""Solvers of a pose graph: batch, GNC, online, and their starts."""
+"""Solvers of a pose graph: batch, graduated non-convexity and online, and the initial values they start from."""

@@ -1,4 +1,4 @@
-"""What has come to a pose graph, and gone from it, since an online solver last looked."""
+"""Changes of a pose graph since an online solver last read it."""
 
 from __future__ import annotations
 
@@ -13,31 +13,36 @@ from hybridlio.graph.model.measurements import Factor
 
 
 @dataclass(frozen=True, eq=False)
-class News:
-    """Since the last update.
+class Changes:
+    """Changes since the last update.
 
     Attributes:
-        poses: places of new poses.
-        rows: new rows of the table of between-factors.
-        others: other new factors by id, in order.
-        gone: ids of factors that were taken out.
-        fixed, freed: keys that are held, or no longer.
+        poses: indices of new poses.
+        edge_rows: new rows of the edge table.
+        other_factors: other new factors by id, ascending.
+        removed: ids of factors that were removed.
+        fixed: keys of poses that were fixed.
+        unfixed: keys of poses that were released.
     """
 
     poses: range
-    rows: slice
-    others: dict[int, Factor]
-    gone: list[int]
+    edge_rows: slice
+    other_factors: dict[int, Factor]
+    removed: list[int]
     fixed: list[Key]
-    freed: list[Key]
+    unfixed: list[Key]
 
     def __bool__(self) -> bool:
-        changed = self.others or self.gone or self.fixed or self.freed
-        return bool(len(self.poses) or self.rows.start < self.rows.stop or changed)
+        changed = self.other_factors or self.removed or self.fixed or self.unfixed
+        return bool(len(self.poses) or self.edge_rows.start < self.edge_rows.stop or changed)
+
+    def of_kind(self, *kinds: str) -> list[Factor]:
+        """Return the new factors of some kinds, between-factors excepted."""
+        return [factor for factor in self.other_factors.values() if factor.kind in kinds]
 
 
-class Reader:
-    """Reads what is new in constant time; only where factors were taken out it looks at all."""
+class ChangeTracker:
+    """Finds changes in constant time each; only where factors were removed it goes through all."""
 
     def __init__(self, data: GraphData) -> None:
         self._data = data
@@ -45,27 +50,29 @@ class Reader:
         self._fixed: frozenset[Key] = frozenset()
         self._ids: set[int] = set()
 
-    def read(self) -> News:
-        """What is new; the same again until :meth:`took`."""
+    def read(self) -> Changes:
+        """Return the changes since the last :meth:`accept`."""
         data = self._data
         first = int(np.searchsorted(data.edges.ids, self._next_id))
-        newest = takewhile(lambda number: number >= self._next_id, reversed(data.others))
-        others = {number: data.others[number] for number in sorted(newest)}
-        old = len(data.factors) - (len(data.edges) - first) - len(others)
-        gone = [number for number in self._ids if number not in data.factors] if old < len(self._ids) else []
+        newest = takewhile(lambda factor_id: factor_id >= self._next_id, reversed(data.other_factors))
+        others = {factor_id: data.other_factors[factor_id] for factor_id in sorted(newest)}
+        kept = len(data.factors) - (len(data.edges) - first) - len(others)
+        removed = (
+            [factor_id for factor_id in self._ids if factor_id not in data.factors] if kept < len(self._ids) else []
+        )
         fixed = data.fixed
-        return News(
-            range(self._poses, len(data)), slice(first, len(data.edges)), others, gone,
-            sorted(fixed - self._fixed, key=data.places.__getitem__), list(self._fixed - fixed),
+        return Changes(
+            range(self._poses, len(data)), slice(first, len(data.edges)), others, removed,
+            sorted(fixed - self._fixed, key=data.index.__getitem__), list(self._fixed - fixed),
         )  # fmt: skip
 
-    def took(self, news: News) -> None:
-        """Count it as known."""
-        self._poses, self._next_id = news.poses.stop, self._data.next_id
-        self._ids.update(self._data.edges.ids[news.rows].tolist(), news.others)
-        self._ids.difference_update(news.gone)
+    def accept(self, changes: Changes) -> None:
+        """Count the changes as known."""
+        self._poses, self._next_id = changes.poses.stop, self._data.next_id
+        self._ids.update(self._data.edges.ids[changes.edge_rows].tolist(), changes.other_factors)
+        self._ids.difference_update(changes.removed)
         self._fixed = self._data.fixed
 
     def forget(self, ids: set[int]) -> None:
-        """Count factors as never there, though they may be in the graph."""
+        """Ignore the removal of some factors from now on."""
         self._ids -= ids

@@ -9,18 +9,17 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import splu
 
 from hybridlio.core import se3
-from hybridlio.core.arrays import Array
+from hybridlio.core.arrays import Array, Mask
 from hybridlio.core.errors import GraphError
 from hybridlio.graph.model.edge_arrays import Edges
 
 
-def chordal(roots: dict[int, Array], count: int, edges: Edges) -> Array:
-    """Poses ``(N, 4, 4)`` that fit the edges, with each root ``(4, 4)`` where it is given.
+def chordal_poses(roots: dict[int, Array], count: int, edges: Edges) -> Array:
+    """Return poses ``(count, 4, 4)`` that fit the edges, with each root held at its pose ``(4, 4)``.
 
     Raises:
         GraphError: some pose is joined to no root.
@@ -31,19 +30,19 @@ def chordal(roots: dict[int, Array], count: int, edges: Edges) -> Array:
     known = np.zeros(count, dtype=bool)
     known[list(roots)] = True
     if len(edges.i) and not known.all():
-        by_rotation, by_position = edges.weights()
-        T[:, :3, :3] = rotations(T, known, edges, by_rotation)
-        T[:, :3, 3] = positions(T, known, edges, by_position)
+        rotation_weights, position_weights = edges.weights()
+        T[:, :3, :3] = _rotations(T, known, edges, rotation_weights)
+        T[:, :3, 3] = _positions(T, known, edges, position_weights)
     return T
 
 
-def rotations(T: Array, known: NDArray[np.bool_], edges: Edges, weights: Array) -> Array:
-    """Rotations ``(N, 3, 3)``: ``R_i R_ij = R_j`` for any matrices; then the nearest rotations."""
+def _rotations(T: Array, known: Mask, edges: Edges, weights: Array) -> Array:
+    """Solve ``R_i R_ij = R_j`` over all matrices, then return the nearest rotations ``(N, 3, 3)``."""
     d = 2 if edges.planar else 3
     count, m = len(T), len(edges.i)
     root = np.sqrt(weights / weights.mean())
     row, column = np.indices((d, d))
-    # the unknowns are the transposes, stacked: R_ijᵀ R_iᵀ − R_jᵀ = 0
+    # The unknowns are the transposes, stacked to (d·N, d): R_ijᵀ R_iᵀ − R_jᵀ = 0 is linear in them, d rows per edge.
     rows = (d * np.arange(m)[:, None, None] + row).ravel()
     columns = (d * edges.i[:, None, None] + column).ravel()
     values = (root[:, None, None] * np.swapaxes(edges.T[:, :d, :d], 1, 2)).ravel()
@@ -59,21 +58,21 @@ def rotations(T: Array, known: NDArray[np.bool_], edges: Edges, weights: Array) 
     return np.asarray(se3.orthonormalise(lifted)[:, :3, :3])
 
 
-def positions(T: Array, known: NDArray[np.bool_], edges: Edges, weights: Array) -> Array:
-    """Positions ``(N, 3)`` for the rotations in ``T``: ``t_j − t_i = R_i t_ij``."""
+def _positions(T: Array, known: Mask, edges: Edges, weights: Array) -> Array:
+    """Solve ``t_j − t_i = R_i t_ij`` with the rotations of ``T`` for positions ``(N, 3)``."""
     m = len(edges.i)
     root = np.sqrt(weights / weights.mean())
-    number = np.arange(m)
-    A = csr_matrix((np.r_[-root, root], (np.r_[number, number], np.r_[edges.i, edges.j])), (m, len(T)))
+    row = np.arange(m)
+    A = csr_matrix((np.r_[-root, root], (np.r_[row, row], np.r_[edges.i, edges.j])), (m, len(T)))
     steps = (T[edges.i, :3, :3] @ edges.T[:, :3, 3, None])[..., 0]
     return _solve(A, root[:, None] * steps, T[:, :3, 3], known)
 
 
-def _solve(A: Any, b: Array, given: Array, known: NDArray[np.bool_]) -> Array:
-    """Least squares ``A x = b`` with the known rows of ``x`` as given."""
+def _solve(A: Any, b: Array, given: Array, known: Mask) -> Array:
+    """Solve least squares ``A x = b`` with the known rows of ``x`` held at ``given``."""
     free = A[:, ~known]
     rest = b - A[:, known] @ given[known]
-    options = {"SymmetricMode": True}
+    options = {"SymmetricMode": True}  # with the ordering and threshold below: sparse Cholesky by SuperLU
     try:
         normal = splu((free.T @ free).tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
     except RuntimeError as error:

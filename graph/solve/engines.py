@@ -1,6 +1,7 @@
-"""iSAM2 under a pose graph that grows: over everything, or over a lag of poses with the older ones marginalised.
+"""iSAM2 for a pose graph that grows: over all poses, or over a lag of poses with the older ones marginalised.
 
-An update that cannot be solved leaves GTSAM's solver in pieces; both engines then make it anew from what it held.
+An update that cannot be solved leaves GTSAM's solver in an invalid state; both engines then rebuild it from the factors
+that it held.
 """
 
 from __future__ import annotations
@@ -10,49 +11,62 @@ from typing import Any, Protocol
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import X
 
 from hybridlio.core.errors import GraphError
 from hybridlio.graph.base.isam import gtsam_message, make_isam_params
 
-# Linearised anew beyond these changes, rad and m; every tenth update looks.
-_TURN, _SHIFT, _SPEED, _BIAS = 0.01, 0.1, 0.1, (0.05, 0.005)
-_WILDFIRE_THRESHOLD = 1e-3
-_X0 = X(0)
+# Changes beyond which a variable is linearised anew, checked at every tenth update: rad, m, m/s, and m/s² and rad/s of
+# the biases. Smaller than those of an odometry run (hybridlio.graph.base.isam): a pose graph may span a few metres and
+# have loops that are precise to centimetres.
+_TURN_RAD, _SHIFT_M, _SPEED_M_S, _BIASES = 0.01, 0.1, 0.1, (0.05, 0.005)
+_WILDFIRE_THRESHOLD = 1e-3  # changes below it (rad, m) stay where they are: a tenth of the turn above
 
 
 class Engine(Protocol):
-    """What an online solver asks of iSAM2."""
+    """What an online solver needs from iSAM2.
+
+    Attributes:
+        solver: GTSAM's solver.
+    """
 
     solver: Any
 
     def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, removed: list[int]) -> list[int]:
-        """Add factors and variables, take factors out by their slots; the new factors' slots.
+        """Add factors and variables, remove factors by slot, and return the slots of the new factors.
 
         Raises:
-            GraphError: cannot be solved.
+            GraphError: the graph cannot be solved.
         """
         ...
 
     def iterate(self) -> bool:
-        """Linearise anew what has moved, and solve; whether anything had."""
+        """Linearise anew what has moved and solve; return whether anything had moved."""
         ...
 
     def restore(self, kept: Collection[int]) -> dict[int, int]:
-        """As before an update that failed; ``kept`` are the slots from then, which get the numbers of the answer."""
+        """Rebuild the solver as it was before a failed update.
+
+        Args:
+            kept: slots of the factors from before that update.
+
+        Returns:
+            The new slot of each.
+        """
         ...
 
     def joint(self, variables: list[int]) -> Any:
-        """GTSAM's joint marginal covariance."""
+        """Return GTSAM's joint marginal covariance of some variables."""
         ...
 
 
 class Incremental:
-    """iSAM2 by QR (Kaess et al., IJRR 2012)."""
+    """iSAM2 with QR over all poses (Kaess et al., IJRR 2012)."""
 
     def __init__(self, dimension: int) -> None:
         self._params = _params(dimension, reuse_slots=False)
         self.solver = gtsam.ISAM2(self._params)
+        self._removed: dict[int, Any] = {}  # of the last update, by slot
+        self._new: Collection[int] = ()  # variables of a failed update
 
     def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, removed: list[int]) -> list[int]:
         """See :class:`Engine`."""
@@ -78,10 +92,10 @@ class Incremental:
             if values.exists(variable):
                 values.erase(variable)
         slots = sorted(kept)
-        graph, numbers = _compacted({slot: self._removed.get(slot) or held.at(slot) for slot in slots})
+        graph, new_slots = _compact({slot: self._removed.get(slot) or held.at(slot) for slot in slots})
         self.solver = gtsam.ISAM2(self._params)
         self.solver.update(graph, values)
-        return numbers
+        return new_slots
 
     def joint(self, variables: list[int]) -> Any:
         """See :class:`Engine`."""
@@ -89,11 +103,12 @@ class Incremental:
 
 
 class FixedLag:
-    """The newest poses in iSAM2 by QR; GTSAM's smoother marginalises a pose when ``lag`` newer ones are there."""
+    """iSAM2 with QR over the newest poses; GTSAM's smoother marginalises a pose when ``lag`` newer ones exist."""
 
     def __init__(self, dimension: int, lag: int) -> None:
         self._params, self._lag = _params(dimension, reuse_slots=True), float(lag)
         self.solver = gtsam.IncrementalFixedLagSmoother(self._lag, self._params)
+        self._before = gtsam.NonlinearFactorGraph(), gtsam.Values()  # a failed update
 
     def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, removed: list[int]) -> list[int]:
         """See :class:`Engine`."""
@@ -114,11 +129,11 @@ class FixedLag:
     def restore(self, kept: Collection[int]) -> dict[int, int]:
         """See :class:`Engine`."""
         held, values = self._before
-        # marginals have slots beside the kept ones
-        graph, numbers = _compacted({slot: held.at(slot) for slot in range(held.size()) if held.exists(slot)})
+        # all slots, not only the kept ones: some hold marginals of poses that have left the lag
+        graph, new_slots = _compact({slot: held.at(slot) for slot in range(held.size()) if held.exists(slot)})
         self.solver = gtsam.IncrementalFixedLagSmoother(self._lag, self._params)
         self.solver.update(graph, values, _stamps(values), [])
-        return {slot: numbers[slot] for slot in kept}
+        return {slot: new_slots[slot] for slot in kept}
 
     def joint(self, variables: list[int]) -> Any:
         """See :class:`Engine`."""
@@ -126,23 +141,26 @@ class FixedLag:
 
 
 def _params(dimension: int, reuse_slots: bool) -> gtsam.ISAM2Params:
-    pose = np.r_[np.full(3, _TURN), np.full(3, _SHIFT)] if dimension == 3 else np.array([_SHIFT, _SHIFT, _TURN])
-    thresholds = {"x": pose, "v": np.full(3, _SPEED), "b": np.repeat(_BIAS, 3)}
+    turn_3, shift_3 = np.full(3, _TURN_RAD), np.full(3, _SHIFT_M)
+    pose = np.r_[turn_3, shift_3] if dimension == 3 else np.array([_SHIFT_M, _SHIFT_M, _TURN_RAD])
+    thresholds = {"x": pose, "v": np.full(3, _SPEED_M_S), "b": np.repeat(_BIASES, 3)}
     params = make_isam_params(thresholds, _WILDFIRE_THRESHOLD)
     if reuse_slots:
-        params.findUnusedFactorSlots, params.relinearizeSkip = True, 1  # looking at a lag costs little
+        # few variables are in a lag: checking all at each update is cheap
+        params.findUnusedFactorSlots, params.relinearizeSkip = True, 1
     return params
 
 
 def _stamps(values: gtsam.Values) -> Any:
-    """A variable's age is its pose's place."""
+    """Return the time of each variable for GTSAM's smoother: the index of its pose."""
     variables = values.keys()
     return {variable: float(gtsam.Symbol(variable).index()) for variable in variables}
 
 
-def _compacted(held: dict[int, Any]) -> tuple[gtsam.NonlinearFactorGraph, dict[int, int]]:
-    graph, numbers = gtsam.NonlinearFactorGraph(), {}
+def _compact(held: dict[int, Any]) -> tuple[gtsam.NonlinearFactorGraph, dict[int, int]]:
+    """Return a graph of the factors without gaps, and the new slot of each old one."""
+    graph, new_slots = gtsam.NonlinearFactorGraph(), {}
     for slot, factor in held.items():
-        numbers[slot] = graph.size()
+        new_slots[slot] = graph.size()
         graph.add(factor)
-    return graph, numbers
+    return graph, new_slots

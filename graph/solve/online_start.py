@@ -1,4 +1,4 @@
-"""Where an online solver lets new poses, velocities and biases start, and whether its news determine them."""
+"""Initial values of the variables that an update of an online solver adds, and whether its factors determine them."""
 
 from __future__ import annotations
 
@@ -11,153 +11,189 @@ from gtsam.symbol_shorthand import B, V, X
 from hybridlio.core.errors import GraphError
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
-from hybridlio.graph.model.keys import named
 from hybridlio.graph.model.measurements import Factor
-from hybridlio.graph.solve.build import Builder
-from hybridlio.graph.solve.changes import News
+from hybridlio.graph.solve.builder import Builder
+from hybridlio.graph.solve.changes import Changes
 
 
-def is_reached(data: GraphData, news: News, moving: set[int]) -> bool:
-    """Whether steps from poses that are known, or priors, lead to every new pose, and velocities come along.
+def determines_new_poses(data: GraphData, changes: Changes, with_velocity: set[int]) -> bool:
+    """Return whether the new factors lead from estimated poses or priors to every new pose and its velocity.
 
-    Told from the news alone. False where it cannot be told so quickly.
+    A quick, sufficient test from the changes alone; :func:`hybridlio.graph.model.checks.check_determined` looks at the
+    whole graph.
+
+    Args:
+        data: the graph.
+        changes: since the last update.
+        with_velocity: indices of the poses whose velocity is estimated.
     """
-    places, new = data.places, news.poses
-    known = {places[f.keys[0]] for f in news.others.values() if f.kind == "prior"} | {places[k] for k in news.fixed}
-    speeds = {places[f.keys[0]] for f in news.others.values() if f.kind == "velocity"} | moving
-    steps = [(i, j, False) for i, j in data.edges.ends[news.rows].tolist()]
-    inertial = [factor for factor in news.others.values() if factor.kind == "imu"]
-    steps += [(places[i], places[j], True) for i, j in (factor.keys for factor in inertial)]
-    changed = True
-    while changed:
-        changed = False
-        for i, j, moves in steps:
-            for a, b in ((i, j), (j, i)):
-                here = a < new.start or a in known
-                if here and not (b < new.start or b in known) and (not moves or a in speeds):
-                    known.add(b)
-                    changed = True
-            if moves and (i in speeds) != (j in speeds):
-                speeds |= {i, j}
-                changed = True
-    told = all(places[key] in speeds for factor in inertial for key in factor.keys)
-    return told and all(place in known for place in new)
+    index = data.index
+    placed = {index[f.keys[0]] for f in changes.of_kind("prior")} | {index[key] for key in changes.fixed}
+    moving = {index[f.keys[0]] for f in changes.of_kind("velocity")} | with_velocity
+    reach = _Reach(changes.poses.start, placed, moving)
+    edges = data.edges.ends[changes.edge_rows].tolist()
+    inertial = [(index[f.keys[0]], index[f.keys[1]]) for f in changes.of_kind("imu")]
+    while reach.grow(edges, inertial):
+        pass
+    return all(reach.velocities.issuperset(ends) for ends in inertial) and reach.poses.issuperset(changes.poses)
 
 
-class Guess:
-    """Values of what is new: along the new factors from what is known, or as given."""
+class _Reach:
+    """New poses, and velocities of any, that factors determine so far."""
 
-    def __init__(self, data: GraphData, news: News, solver: Any, moving: set[int], biased: set[int]) -> None:
-        self._data, self._news, self._solver = data, news, solver
-        self._moving, self._biased = moving, biased
+    def __init__(self, first_new: int, poses: set[int], velocities: set[int]) -> None:
+        self._first_new, self.poses, self.velocities = first_new, poses, velocities
+
+    def grow(self, edges: list[list[int]], inertial: list[tuple[int, int]]) -> bool:
+        """Follow each factor once; return whether any led further."""
+        before = len(self.poses), len(self.velocities)
+        for i, j in edges:
+            if self._has_pose(i) or self._has_pose(j):
+                self.poses |= {i, j}
+        for i, j in inertial:
+            self._follow_samples(i, j)
+        return before != (len(self.poses), len(self.velocities))
+
+    def _follow_samples(self, i: int, j: int) -> None:
+        if any(self._has_pose(k) and k in self.velocities for k in (i, j)):
+            self.poses |= {i, j}
+        if not self.velocities.isdisjoint((i, j)):
+            self.velocities |= {i, j}
+
+    def _has_pose(self, index: int) -> bool:
+        return index < self._first_new or index in self.poses
+
+
+class OnlineStart:
+    """Initial values of new variables: along the new factors from estimated poses, else as given by the user.
+
+    Args:
+        data: the graph.
+        changes: since the last update.
+        solver: GTSAM's solver with the estimates so far.
+        with_velocity: indices of the poses whose velocity it estimates.
+        with_bias: indices of the poses whose biases it estimates.
+
+    Attributes:
+        builder: makes factors, with IMU samples preintegrated around :meth:`bias`.
+    """
+
+    def __init__(
+        self, data: GraphData, changes: Changes, solver: Any, with_velocity: set[int], with_bias: set[int]
+    ) -> None:
+        self._data, self._changes, self._solver = data, changes, solver
+        self._with_velocity, self._with_bias = with_velocity, with_bias
         self._poses: dict[int, Any] = {}
         self._velocities: dict[int, Any] = {}
-        self._biases = {data.places[f.keys[0]]: f.measured for f in news.others.values() if f.kind == "bias"}
+        self._biases = {data.index[f.keys[0]]: f.measured for f in changes.of_kind("bias")}
         self.builder = Builder(data, self.bias)
 
-    def bias(self, place: int) -> gtsam.imuBias.ConstantBias:
-        """Of a pose, around which samples are summed up: as estimated, or as measured, or none."""
-        if place in self._biased:
-            estimated: gtsam.imuBias.ConstantBias = self._solver.calculateEstimateConstantBias(B(place))
+    def bias(self, index: int) -> gtsam.imuBias.ConstantBias:
+        """Return a pose's biases, around which samples are preintegrated: estimated, else measured, else zero."""
+        if index in self._with_bias:
+            estimated: gtsam.imuBias.ConstantBias = self._solver.calculateEstimateConstantBias(B(index))
             return estimated
-        given = self._biases.get(place, np.zeros(6))
-        return gtsam.imuBias.ConstantBias(given[:3], given[3:])
+        measured = self._biases.get(index, np.zeros(6))
+        return gtsam.imuBias.ConstantBias(measured[:3], measured[3:])
 
     def values(self) -> gtsam.Values:
-        """Of all variables that are new.
+        """Return initial values of all new variables.
 
         Raises:
-            GraphError: nothing says where a pose may lie; names it.
+            GraphError: no factor leads to a new pose and it has no initial value; names it.
         """
-        inertial = [factor for factor in self._news.others.values() if factor.kind == "imu"]
-        self._carry_biases(inertial)
+        inertial = self._changes.of_kind("imu")
+        self._pass_biases_on(inertial)
         self._follow_edges()
         for factor in inertial:
             self._predict(factor)
         self._follow_edges()
-        self._take_given()
+        self._use_given()
         values = gtsam.Values()
-        for place, pose in sorted(self._poses.items()):
-            values.insert(X(place), pose)
+        for index, pose in sorted(self._poses.items()):
+            values.insert(X(index), pose)
         self._insert_motion(values, inertial)
         return values
 
-    def _carry_biases(self, inertial: list[Factor]) -> None:
+    def _pass_biases_on(self, inertial: list[Factor]) -> None:
+        """Start the biases of each IMU factor's second pose at those of its first."""
         for factor in inertial:
-            i, j = (self._data.places[key] for key in factor.keys)
-            if j not in self._biases and j not in self._biased:
+            i, j = (self._data.index[key] for key in factor.keys)
+            if j not in self._biases and j not in self._with_bias:
                 self._biases[j] = self.bias(i).vector()
 
-    def _known(self, place: int) -> Any:
-        """A pose as GTSAM has it, or None."""
-        if place < self._news.poses.start:
+    def _pose(self, index: int) -> Any:
+        """Return a pose as GTSAM's, or None where it is not known yet."""
+        if index < self._changes.poses.start:
             kind = "Pose3" if self._data.dimension == 3 else "Pose2"
-            return getattr(self._solver, f"calculateEstimate{kind}")(X(place))
-        return self._poses.get(place)
+            return getattr(self._solver, f"calculateEstimate{kind}")(X(index))
+        return self._poses.get(index)
 
     def _follow_edges(self) -> None:
-        table, rows = self._data.edges, self._news.rows
-        steps = list(zip(table.ends[rows].tolist(), co.gtsam_poses(table.measured[rows]), strict=True))
-        while steps:
-            rest = []
-            for (i, j), T in steps:
-                here, there = self._known(i), self._known(j)
-                if there is None and here is not None:
-                    self._poses[j] = here.compose(T)
-                elif here is None and there is not None:
-                    self._poses[i] = there.compose(T.inverse())
-                elif here is None:
-                    rest.append(((i, j), T))
-            if len(rest) == len(steps):
+        """Place new poses along new edges from known ones, until no edge leads further."""
+        table, rows = self._data.edges, self._changes.edge_rows
+        edges = list(zip(table.ends[rows].tolist(), co.gtsam_poses(table.measured[rows]), strict=True))
+        while edges:
+            waiting = []
+            for (i, j), T_i_j in edges:
+                pose_i, pose_j = self._pose(i), self._pose(j)
+                if pose_j is None and pose_i is not None:
+                    self._poses[j] = pose_i.compose(T_i_j)
+                elif pose_i is None and pose_j is not None:
+                    self._poses[i] = pose_j.compose(T_i_j.inverse())
+                elif pose_i is None:
+                    waiting.append(((i, j), T_i_j))
+            if len(waiting) == len(edges):
                 return
-            steps = rest
+            edges = waiting
 
     def _predict(self, factor: Factor) -> None:
-        """Where the samples lead from the pose and velocity before them."""
-        i, j = (self._data.places[key] for key in factor.keys)
-        pose, velocity = self._known(i), self._velocity(i)
+        """Place the second pose of an IMU factor, and its velocity, by its samples."""
+        i, j = (self._data.index[key] for key in factor.keys)
+        pose, velocity = self._pose(i), self._velocity(i)
         if pose is None or velocity is None:
             return
-        samples = self.builder.other(factor).preintegratedMeasurements()
+        samples = self.builder.factor(factor).preintegratedMeasurements()
         then = samples.predict(gtsam.NavState(pose, velocity), self.bias(i))
-        if self._known(j) is None:
+        if self._pose(j) is None:
             self._poses[j] = then.pose()
-        if j not in self._moving:
+        if j not in self._with_velocity:
             self._velocities[j] = then.velocity()
 
-    def _velocity(self, place: int) -> Any:
-        if place in self._moving:
-            return self._solver.calculateEstimateVector(V(place))
-        if place not in self._velocities:
-            for factor in self._news.others.values():
-                if factor.kind == "velocity" and self._data.places[factor.keys[0]] == place:
-                    self._velocities[place] = factor.measured
-        return self._velocities.get(place)
+    def _velocity(self, index: int) -> Any:
+        if index in self._with_velocity:
+            return self._solver.calculateEstimateVector(V(index))
+        if index not in self._velocities:
+            for factor in self._changes.of_kind("velocity"):
+                if self._data.index[factor.keys[0]] == index:
+                    self._velocities[index] = factor.measured
+        return self._velocities.get(index)
 
-    def _take_given(self) -> None:
-        missing = [place for place in self._news.poses if place not in self._poses]
-        priors = {self._data.places[f.keys[0]]: f.measured for f in self._news.others.values() if f.kind == "prior"}
-        for place in missing:
-            (key,) = self._data.keys_at([place])
-            at = priors.get(place, self._data.coordinates(key))
+    def _use_given(self) -> None:
+        """Place the new poses that no factor led to by their priors or given initial values."""
+        missing = [index for index in self._changes.poses if index not in self._poses]
+        priors = {self._data.index[f.keys[0]]: f.measured for f in self._changes.of_kind("prior")}
+        for index in missing:
+            (key,) = self._data.keys_at([index])
+            at = priors.get(index, self._data.initial_value(key))
             if at is None:
-                raise GraphError(f"nothing says where pose {named([key])} may lie; give an initial value")
-            self._poses[place] = co.gtsam_poses(at[None])[0]
+                raise GraphError(f"no factor places pose {key}; give an initial value")
+            self._poses[index] = co.gtsam_poses(at[None])[0]
             self._follow_edges()
 
     def _insert_motion(self, values: gtsam.Values, inertial: list[Factor]) -> None:
-        """Velocities and biases that come with inertial and velocity factors."""
-        places = self._data.places
-        biased = {places[k] for f in self._news.others.values() if f.kind in ("imu", "bias") for k in f.keys}
-        moving = {places[k] for f in self._news.others.values() if f.kind in ("imu", "velocity") for k in f.keys}
+        """Insert the velocities and biases that new factors bring."""
+        index = self._data.index
+        with_bias = {index[key] for f in self._changes.of_kind("imu", "bias") for key in f.keys}
+        with_velocity = {index[key] for f in self._changes.of_kind("imu", "velocity") for key in f.keys}
         for factor in inertial:
-            i, j = (places[key] for key in factor.keys)
-            samples = self.builder.other(factor).preintegratedMeasurements()
-            mean = (self._known(j).translation() - self._known(i).translation()) / samples.deltaTij()
-            for place in (i, j):
-                if self._velocity(place) is None:
-                    self._velocities[place] = mean
-        for place in sorted(moving - self._moving):
-            values.insert(V(place), self._velocity(place))
-        for place in sorted(biased - self._biased):
-            values.insert(B(place), self.bias(place))
+            i, j = (index[key] for key in factor.keys)
+            samples = self.builder.factor(factor).preintegratedMeasurements()
+            mean = (self._pose(j).translation() - self._pose(i).translation()) / samples.deltaTij()
+            for k in (i, j):
+                if self._velocity(k) is None:
+                    self._velocities[k] = mean
+        for k in sorted(with_velocity - self._with_velocity):
+            values.insert(V(k), self._velocity(k))
+        for k in sorted(with_bias - self._with_bias):
+            values.insert(B(k), self.bias(k))

@@ -1,4 +1,4 @@
-"""A finished graph given to an online solver pose by pose, as if it had just been measured."""
+"""A finished graph solved online: given to an online solver pose by pose, as if it were being measured."""
 
 from __future__ import annotations
 
@@ -6,44 +6,71 @@ import gtsam
 import numpy as np
 
 from hybridlio.core.errors import GraphError
+from hybridlio.graph.model.checks import check_determined
 from hybridlio.graph.model.graph_data import GraphData
-from hybridlio.graph.solve.levenberg import Progress
+from hybridlio.graph.solve.builder import Builder
+from hybridlio.graph.solve.initial_values import choose_start
+from hybridlio.graph.solve.nonlinear import IterationProgress, SolverResult, biases_of, poses_of
 from hybridlio.graph.solve.online_solver import OnlineSolver
+from hybridlio.graph.solve.settings import Settings
+from hybridlio.graph.solve.solution import Solution
 
-_LAST_UPDATES = 3  # each linearises anew what has moved
+_LAST_UPDATES = 3  # each linearises anew what has moved: two usually converge, the third confirms
 
 
-def replay(data: GraphData, backend: str, lag: int, report: Progress) -> tuple[gtsam.Values, int]:
-    """Values of all poses and of the velocities and biases in the lag, and how many updates it took.
+def solve_online(graph: GraphData, settings: Settings, report: IterationProgress) -> Solution:
+    """Solve a graph by an online solver, in the order in which its poses were added.
 
-    Each update brings one pose, and the factors whose last pose it is; the first ones wait until they are determined.
+    Velocities and biases of poses that left the lag are reported at their initial values.
 
     Raises:
-        GraphError: a factor reaches behind the lag, or the graph cannot be solved.
+        GraphError: the factors do not determine every pose, or a factor spans more than the lag; names the keys.
     """
-    if backend == "fixed-lag":
-        _check_spans(data, lag)
+    check_determined(graph)
+    data = graph.copy()
+    found, updates = _replay(data, settings, report)
+    values = Builder(data).values(poses_of(found, data.dimension))
+    estimated = found.keys()
+    for variable in estimated:
+        values.erase(variable)
+    values.insert(found)
+    start = Builder(data).values(choose_start(data, settings.initial))
+    factors = Builder(data, biases_of(values)).graph()
+    errors = float(factors.error(start)), float(factors.error(values))
+    return Solution(
+        data, SolverResult(data, factors, values, poses_of(values, data.dimension), *errors, updates, True, True)
+    )  # fmt: skip
+
+
+def _replay(data: GraphData, settings: Settings, report: IterationProgress) -> tuple[gtsam.Values, int]:
+    """Return all poses with the velocities and biases in the lag, and the number of updates.
+
+    Each update brings one pose and the factors that become complete with it. Where the first poses are not determined
+    by themselves, the first update waits for twice as many each time.
+    """
+    if settings.backend == "fixed-lag":
+        _check_spans(data, settings.lag)
     grown = GraphData(data.dimension)
-    solver = OnlineSolver(grown, backend, lag, forget=False)
-    keys, initial, latest = data.keys, data.coordinates_or_nan, _by_latest(data)
-    updates, wait = 0, 1
-    for place, key in enumerate(keys):
-        grown.put_poses([key], initial[place : place + 1])
-        for number in latest[place]:
-            grown.put_factor(data.factors[number])
+    solver = OnlineSolver(grown, settings.backend, settings.lag, forget=False)
+    keys, initial, complete = data.keys, data.initial_values, _ids_by_latest_pose(data)
+    updates, needed = 0, 1
+    for k, key in enumerate(keys):
+        grown.add_poses([key], initial[k : k + 1])
+        for factor_id in complete[k]:
+            grown.add_factor(data.factors[factor_id])
         if key in data.fixed:
             grown.fix(key)
-        if not len(solver) and place + 1 < min(wait, len(keys)):
+        if not len(solver) and k + 1 < min(needed, len(keys)):
             continue
         try:
             solver.update()
             updates += 1
         except GraphError:
-            if place + 1 == len(keys):
+            if k + 1 == len(keys):
                 raise
             if len(solver):
                 continue
-            wait = 2 * (place + 1)
+            needed = 2 * (k + 1)
         report("updating", updates, 0.0)
     for _ in range(_LAST_UPDATES):
         solver.update()
@@ -57,11 +84,11 @@ def _check_spans(data: GraphData, lag: int) -> None:
         raise GraphError(f"{factor.label}: its poses are {spans.max()} apart in order, but the lag is {lag} poses")
 
 
-def _by_latest(data: GraphData) -> list[list[int]]:
-    """Ids of the factors by the place of their latest pose."""
+def _ids_by_latest_pose(data: GraphData) -> list[list[int]]:
+    """Return, by pose, the ids of the factors whose latest pose it is."""
     latest: list[list[int]] = [[] for _ in range(len(data))]
-    for number, place in zip(data.edges.ids.tolist(), data.edges.ends.max(axis=1, initial=0).tolist(), strict=True):
-        latest[place].append(number)
-    for number, factor in data.others.items():
-        latest[max(data.places[key] for key in factor.keys)].append(number)
-    return [sorted(numbers) for numbers in latest]
+    for factor_id, k in zip(data.edges.ids.tolist(), data.edges.ends.max(axis=1, initial=0).tolist(), strict=True):
+        latest[k].append(factor_id)
+    for factor_id, factor in data.other_factors.items():
+        latest[max(data.index[key] for key in factor.keys)].append(factor_id)
+    return [sorted(ids) for ids in latest]

@@ -1,4 +1,4 @@
-"""What optimising a pose graph gives."""
+"""Result of optimising a pose graph."""
 
 from __future__ import annotations
 
@@ -16,30 +16,38 @@ from hybridlio.graph.base.isam import gtsam_message, incremental_solver
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key
-from hybridlio.graph.solve.build import Builder
-from hybridlio.graph.solve.levenberg import Solved
+from hybridlio.graph.solve.builder import Builder
+from hybridlio.graph.solve.nonlinear import SolverResult
 
 
 class Solution:
-    """Poses, velocities and biases of a solved graph, and how well they fit. Later changes to the graph leave it alone.
+    """Poses, velocities and biases of a solved graph, and how well they fit; independent of later changes to the graph.
 
     Attributes:
-        error_before: half the sum of squared, whitened residuals at the start (robust ones by their kernel).
-        error: the same at the answer; rejected factors do not count.
+        error_before: half the sum of squared, whitened residuals at the start, under the robust kernels.
+        error: the same at the optimum, without rejected factors.
         iterations: Gauss-Newton and Levenberg-Marquardt steps.
         converged: whether the error had stopped falling.
-        rejected: ids of the factors that ``gnc`` found to be wrong; empty for other solvers.
+        rejected: ids of the factors that ``gnc`` found to be wrong; empty for other backends.
     """
 
-    def __init__(self, data: GraphData, solved: Solved, rejected: frozenset[int] = frozenset()) -> None:
-        self.error_before = solved.error_before
-        self.error = solved.error
-        self.iterations = solved.iterations
-        self.converged = solved.converged
+    def __init__(self, data: GraphData, result: SolverResult, rejected: frozenset[int] = frozenset()) -> None:
+        self.error_before = result.error_before
+        self.error = result.error
+        self.iterations = result.iterations
+        self.converged = result.converged
         self.rejected = rejected
         self._data = data
-        self._solved = solved
-        self._index = data.places
+        self._result = result
+        self._index = data.index
+
+    def __repr__(self) -> str:
+        state = "converged" if self.converged else "not converged"
+        rejected = f", {len(self.rejected)} factors rejected" if self.rejected else ""
+        return (
+            f"<Solution: {len(self._index)} poses, error {self.error_before:.6g} -> {self.error:.6g} "
+            f"in {self.iterations} iterations, {state}{rejected}>"
+        )
 
     def __contains__(self, key: object) -> bool:
         return key in self._index
@@ -51,76 +59,99 @@ class Solution:
 
     @cached_property
     def poses(self) -> Array:
-        """All poses ``(N, 4, 4)``, in the order of :attr:`keys`."""
-        return co.to_matrices(self._solved.poses)
+        """All poses ``(N, 4, 4)`` in world, in the order of :attr:`keys`."""
+        return co.to_matrices(self._result.poses)
 
     @property
     def coordinates(self) -> Array:
-        """All poses as text formats have them: ``(N, 7)`` x y z qx qy qz qw, in the plane ``(N, 3)`` x y θ."""
-        return self._solved.poses.copy()
+        """All poses as text formats hold them: ``(N, 7)`` x y z qx qy qz qw, or ``(N, 3)`` x y θ in the plane."""
+        return self._result.poses.copy()
 
     def pose(self, key: Key) -> Array:
-        """A pose ``(4, 4)`` in world."""
-        return np.array(self.poses[self._at(key)])
+        """Return a pose ``(4, 4)`` in world.
+
+        Raises:
+            GraphError: no pose has this key.
+        """
+        return np.array(self.poses[self._known(key)])
 
     def velocity(self, key: Key) -> Array:
-        """The body's velocity ``(3,)`` in world, m/s.
+        """Return the body's velocity ``(3,)`` in world, m/s.
 
         Raises:
             GraphError: no factor gives this pose a velocity.
         """
-        variable = self._variable(V(self._at(key)), key, "velocity")
-        return np.array(self._solved.values.atVector(variable))
+        variable = self._variable(V(self._known(key)), key, "velocity")
+        return np.array(self._result.values.atVector(variable))
 
     def bias(self, key: Key) -> tuple[Array, Array]:
-        """Biases of accelerometer (m/s²) and gyroscope (rad/s), ``(3,)`` each.
+        """Return the biases of accelerometer (m/s²) and gyroscope (rad/s), ``(3,)`` each.
 
         Raises:
             GraphError: no factor gives this pose biases.
         """
-        variable = self._variable(B(self._at(key)), key, "biases")
-        bias = self._solved.values.atConstantBias(variable)
+        variable = self._variable(B(self._known(key)), key, "biases")
+        bias = self._result.values.atConstantBias(variable)
         return np.array(bias.accelerometer()), np.array(bias.gyroscope())
 
     def covariance(self, key: Key) -> Array:
-        """Covariance ``(6, 6)`` of a pose in world, rotation first, right perturbation; in the plane ``(3, 3)``.
+        """Return the marginal covariance of a pose in world, of a right perturbation.
 
-        Marginal over everything else; a fixed pose's is that of holding it, 1e-6 rad and m.
+        It is ``(6, 6)`` in rad² and m², rotation first; in the plane ``(3, 3)`` of heading, x, y. A fixed pose has the
+        covariance of the prior that holds it, 1e-6 rad and m.
+
+        Raises:
+            GraphError: no pose has this key, or the graph is too ill-conditioned for covariances.
         """
-        covariance = np.asarray(self._marginals.marginalCovariance(X(self._at(key))))
+        covariance = np.asarray(self._marginals.marginalCovariance(X(self._known(key))))
         return co.our_order((covariance + covariance.T) / 2, self._data.dimension)
 
     def relative_covariance(self, i: Key, j: Key) -> Array:
-        """Covariance ``(6, 6)`` of the pose of j in the frame of i, ``T_i_j = T_i⁻¹ T_j``; in the plane ``(3, 3)``.
+        """Return the covariance of ``T_i_j = T_i⁻¹ T_j``, the pose of j in the frame of i; shape as :meth:`covariance`.
 
-        Takes into account how the two depend on each other: neighbours far from the start know each other well.
+        The correlation of the two poses counts: far from the start, neighbours are uncertain in world but not to each
+        other.
+
+        Raises:
+            GraphError: as :meth:`covariance`.
         """
-        a, b = self._at(i), self._at(j)
-        size = co.TANGENT_SIZE[self._data.dimension]
+        a, b = self._known(i), self._known(j)
         if a == b:
-            return np.zeros((size, size))
+            return np.zeros((self._data.tangent_size,) * 2)
         joint = self._marginals.jointMarginalCovariance([X(a), X(b)])
         T_j_i = se3.between(self.poses[b], self.poses[a])
         return co.relative_covariance(joint, X(a), X(b), T_j_i, self._data.dimension)
 
     def residual(self, factor_id: int) -> Array:
-        """What a factor's measurement and the answer differ by, not divided by its deviations; rejected ones too.
+        """Return the difference of a factor's measurement and the solution, not whitened; of rejected factors too.
 
-        For poses a tangent vector, rotation first (rad, m); for inertial factors rotation, position, velocity, biases.
+        A pose's is a tangent vector, rotation first (rad, m); an inertial factor's holds rotation, position, velocity
+        and biases.
+
+        Raises:
+            GraphError: no factor has this id.
         """
-        return self._residuals[self._factor(factor_id)][0]
+        return self._residuals[self._known_factor(factor_id)][0]
 
     def chi2(self, factor_id: int) -> float:
-        """χ² of a factor: its residual in units of its covariance, squared, without the robust kernel."""
-        return self._residuals[self._factor(factor_id)][1]
+        """Return χ² of a factor: its squared residual in units of its covariance, without the robust kernel.
+
+        Raises:
+            GraphError: no factor has this id.
+        """
+        return self._residuals[self._known_factor(factor_id)][1]
 
     def all_chi2(self) -> dict[int, float]:
-        """χ² of every factor, by id."""
+        """Return χ² of every factor, by id."""
         return {factor_id: chi2 for factor_id, (_, chi2) in self._residuals.items()}
 
     def weight(self, factor_id: int) -> float:
-        """What the factor's robust kernel leaves of its weight, 0 to 1; 0 for a rejected one."""
-        factor = self._data.factors[self._factor(factor_id)]
+        """Return the factor, 0 to 1, by which the robust kernel scales a factor's information; 0 for a rejected one.
+
+        Raises:
+            GraphError: no factor has this id.
+        """
+        factor = self._data.factors[self._known_factor(factor_id)]
         if factor_id in self.rejected:
             return 0.0
         return 1.0 if factor.robust is None else factor.robust.weight(np.sqrt(self.chi2(factor_id)))
@@ -131,40 +162,41 @@ class Solution:
         graph = builder.graph(robust=False)
         order = np.argsort(co.GTSAM_ORDER[2]) if self._data.dimension == 2 else slice(None)
         found = {}
-        for slot, factor_id in enumerate(builder.slots()):
+        for slot, factor_id in enumerate(builder.factor_ids()):
             factor: Any = graph.at(slot)
-            residual = np.asarray(factor.unwhitenedError(self._solved.values))[order]
-            found[factor_id] = residual, 2 * float(factor.error(self._solved.values))
+            residual = np.asarray(factor.unwhitenedError(self._result.values))[order]
+            found[factor_id] = residual, 2 * float(factor.error(self._result.values))
         return found
 
     @cached_property
     def _marginals(self) -> gtsam.Marginals | gtsam.ISAM2:
-        try:
-            if not self._solved.orthogonal:
-                return gtsam.Marginals(self._solved.graph, self._solved.values)
-        except RuntimeError:  # Cholesky finds it indeterminate: QR may not
-            return self._by_qr()
-        return self._by_qr()
+        if not self._result.used_qr:
+            try:
+                return gtsam.Marginals(self._result.graph, self._result.values)
+            except RuntimeError:  # Cholesky finds the system indeterminate
+                return self._marginals_by_qr()
+        return self._marginals_by_qr()
 
-    def _by_qr(self) -> gtsam.ISAM2:
+    def _marginals_by_qr(self) -> gtsam.ISAM2:
+        """Return iSAM2 with QR: GTSAM's ``Marginals`` fails on long chains."""
         isam = incremental_solver()
         try:
-            isam.update(self._solved.graph, self._solved.values)
+            isam.update(self._result.graph, self._result.values)
         except RuntimeError as error:
-            raise GraphError(f"covariances: {gtsam_message(error)}") from error
+            raise GraphError(f"covariances cannot be computed: {gtsam_message(error)}") from error
         return isam
 
-    def _at(self, key: Key) -> int:
+    def _known(self, key: Key) -> int:
         if key not in self._index:
             raise GraphError(f"no pose has key {key}")
         return self._index[key]
 
     def _variable(self, variable: int, key: Key, what: str) -> int:
-        if not self._solved.values.exists(variable):
-            raise GraphError(f"pose {key} has no {what}; inertial and velocity factors give them")
+        if not self._result.values.exists(variable):
+            raise GraphError(f"pose {key} has no {what}; inertial and velocity factors add them")
         return variable
 
-    def _factor(self, factor_id: int) -> int:
+    def _known_factor(self, factor_id: int) -> int:
         if factor_id not in self._data.factors:
-            raise GraphError(f"there was no factor {factor_id}")
+            raise GraphError(f"no factor has id {factor_id}")
         return factor_id

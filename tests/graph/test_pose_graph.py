@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import gtsam
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ import pytest
 from hybridlio.core import se3
 from hybridlio.core.errors import GraphError
 from hybridlio.graph import PoseGraph
-from hybridlio.graph.model.measurements import Robust
+from hybridlio.graph.model.noise import Robust
 
 SIGMAS = np.array([0.01, 0.02, 0.03, 0.1, 0.2, 0.3])
 
@@ -292,3 +294,24 @@ def test_a_straight_chain_of_5000_poses_solves_in_every_solver(rng, solver, dime
     # the heading walks randomly, so the far end's side is off by σ √(n³/3)
     side = solution.covariance(4999)[4, 4] if dimension == 3 else solution.covariance(4999)[2, 2]
     assert np.sqrt(side) == pytest.approx(1e-4 * np.sqrt(4999**3 / 3), rel=0.01)
+
+
+def test_the_public_names_are_those_that_users_need():
+    assert {name for name in dir(PoseGraph()) if not name.startswith("_")} == {
+        *("dimension", "keys", "factors", "fixed", "origin", "components"),
+        *("add_pose", "initial", "set_initial", "start_from", "fix", "unfix", "set_origin", "remove"),
+        *("add_prior", "add_between", "add_imu", "add_velocity", "add_zero_velocity", "add_bias"),
+        *("add_gps", "add_gps_geodetic", "add_attitude", "add_gravity"),
+        *("initialise", "optimize", "online", "load", "save"),
+    }
+
+
+def test_repr_is_one_informative_line(rng):
+    graph = random_graph(rng)
+    graph.fix(0)
+    assert repr(graph) == "<PoseGraph 3D: 12 poses, 1 fixed, 14 between-factors, 1 other factors>"
+    solution = graph.optimize()
+    pattern = r"<Solution: 12 poses, error [\d.e+]+ -> [\d.e+]+ in \d+ iterations, converged>"
+    assert re.fullmatch(pattern, repr(solution))
+    rejecting = graph.optimize("gnc")
+    assert re.search(r"converged(, \d+ factors rejected)?>$", repr(rejecting))

@@ -67,7 +67,7 @@ def assert_same(a: PoseGraph, b: PoseGraph, ids: bool = True, forms: bool = True
     """To the last bit."""
     assert (a.dimension, a.keys, a.fixed) == (b.dimension, b.keys, b.fixed)
     for key in a.keys:
-        np.testing.assert_array_equal(a.coordinates(key), b.coordinates(key))
+        np.testing.assert_array_equal(a.initial(key), b.initial(key))
     assert not ids or list(a.factors) == list(b.factors)
     assert len(a.factors) == len(b.factors)
     for mine, other in zip(a.factors.values(), b.factors.values(), strict=True):
@@ -196,13 +196,13 @@ def test_landmarks_are_left_out_with_a_warning(tmp_path, caplog):
 E0 = "EDGE_SE2 0 1 1.5 0.25 0.5 1 0 0 2 0 "
 DAMAGED = {
     "truncated": (PLANE[:-8], "row 3.*11 values"),
-    "a word": (PLANE.replace("0.25 0.5\n", "0.25 abc\n"), "row 2: 'abc'"),
+    "a word": (PLANE.replace("0.25 0.5\n", "0.25 abc\n"), "row 2: 'abc' is not a number"),
     "not finite": (PLANE.replace("0.25 0.5\n", "0.25 nan\n"), "row 2.*finite"),
-    "a garbled tag": (PLANE.replace("EDGE_SE2", "EDGE_SEX"), "row 3: 'EDGE_SEX'"),
+    "a garbled tag": (PLANE.replace("EDGE_SE2", "EDGE_SEX"), "row 3: unknown tag 'EDGE_SEX'"),
     "a garbled number": (PLANE.replace("SE2 1 ", "SE2 1x "), "row 2.*1x"),
-    "an edge to nowhere": (PLANE.replace("EDGE_SE2 0 1", "EDGE_SE2 0 9"), "row 3: there is no vertex 9"),
+    "an edge to nowhere": (PLANE.replace("EDGE_SE2 0 1", "EDGE_SE2 0 9"), "row 3: no vertex has id 9"),
     "an edge to itself": (PLANE.replace("EDGE_SE2 0 1", "EDGE_SE2 1 1"), "row 3.*itself"),
-    "a vertex twice": (PLANE.replace("SE2 1 ", "SE2 0 ", 1), "row 2: pose 0 is there already"),
+    "a vertex twice": (PLANE.replace("SE2 1 ", "SE2 0 ", 1), "row 2: pose 0 exists already"),
     "information not positive": (PLANE.replace("2 0.3 3", "2 0.3 -3"), "row 3.*positive definite"),
     "plane and space": (PLANE + SPACE, "in the plane and in space"),
     "nothing": ("", "no poses"),
@@ -236,7 +236,7 @@ def test_files_that_are_not_there_or_cannot_hold_the_graph_are_refused(rng, tmp_
     with pytest.raises(DataError, match=r"missing\.npz"):
         PoseGraph.load(tmp_path / "missing.npz")
     graph = full_graph(rng)
-    with pytest.raises(DataError, match=r"not \.csv"):
+    with pytest.raises(DataError, match=r"ending \.csv"):
         graph.save(tmp_path / "a.csv")
     add_inertial(graph, rng)
     with pytest.raises(GraphError, match=r"cannot hold 2 × imu, 1 × gps.*npz"):

@@ -119,7 +119,7 @@ def test_news_that_do_not_determine_a_pose_are_refused_and_change_nothing(rng, b
     graph.add_pose(50)
     loose = graph.add_between(50, 51, se3.exp(STEP), sigmas=SIGMAS)
     factors = dict(graph.factors)
-    with pytest.raises(GraphError, match=r"poses 50, 51 may still move"):
+    with pytest.raises(GraphError, match=r"poses 50, 51 are free in"):
         solver.update()
     assert dict(graph.factors) == factors
     assert 50 not in solver
@@ -179,7 +179,7 @@ def test_a_pose_that_left_the_lag_stays_where_it_was_and_takes_no_factors(rng):
     graph.remove(late)
     solver.update()
     graph.remove(1)
-    with pytest.raises(GraphError, match="factor 1 was taken out, but had left the lag"):
+    with pytest.raises(GraphError, match="factor 1 was removed after its poses had left the lag"):
         solver.update()
 
 

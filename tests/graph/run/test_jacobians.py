@@ -26,7 +26,7 @@ from hybridlio.graph.model.coordinates import from_matrices
 from hybridlio.graph.run import factors
 from hybridlio.graph.run.gps_factors import GpsGroup, _plumb_factor
 from hybridlio.graph.run.scan_numbers import ScanNumbers
-from hybridlio.graph.solve.build import Builder
+from hybridlio.graph.solve.builder import Builder
 
 STEP = 1e-5
 TOLERANCE = 1e-8
@@ -69,7 +69,7 @@ def pose_graph(dimension: int) -> Case:
         graph.add_imu(1, 2, samples(rng))
         graph.add_bias(1, 0.1 * rng.normal(size=3), 0.01 * rng.normal(size=3), sigmas=0.2)
         graph.add_imu(0, 1, samples(rng))
-    builder = Builder(graph)
+    builder = Builder(graph._data)
     made, values = builder.graph(), builder.values(from_matrices(np.array(poses), graph.dimension))
     return [made.at(k) for k in range(made.size())], values
 

@@ -1,0 +1,72 @@
+"""Which poses of a graph are joined by which factors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from hybridlio.core.sensors import ImuNoise
+from hybridlio.graph.model.graph_data import GraphData
+from hybridlio.graph.model.keys import Key
+
+
+def group_labels(data: GraphData, kinds: Iterable[str]) -> tuple[int, NDArray[np.int32]]:
+    """Return the number of groups of poses that factors of these kinds join, and each pose's group ``(N,)``."""
+    index = data.index
+    joining = (f for f in data.other_factors.values() if f.kind in kinds and len(f.keys) == 2)
+    ends = np.array([[index[key] for key in f.keys] for f in joining], dtype=np.int64).reshape(-1, 2)
+    if "between" in kinds:
+        ends = np.vstack([data.edges.ends, ends])
+    adjacency = coo_matrix((np.ones(len(ends)), ends.T), shape=(len(data), len(data)))
+    count, labels = connected_components(adjacency, directed=False)
+    return int(count), labels
+
+
+def groups(data: GraphData, kinds: Iterable[str]) -> list[list[Key]]:
+    """Return the groups of poses that factors of these kinds join, largest first, each in the graph's order."""
+    count, labels = group_labels(data, kinds)
+    if count == 1:
+        return [data.keys]
+    found: list[list[Key]] = [[] for _ in range(count)]
+    for key, label in zip(data.keys, labels.tolist(), strict=True):
+        found[label].append(key)
+    return sorted(found, key=len, reverse=True)
+
+
+def components(data: GraphData) -> list[list[Key]]:
+    """Return the connected components over between- and IMU factors, largest first."""
+    return groups(data, ("between", "imu"))
+
+
+class InertialChain(NamedTuple):
+    """Poses that IMU factors join.
+
+    Attributes:
+        keys: of the poses.
+        start: the first pose from which samples lead on.
+        noise: of those samples.
+    """
+
+    keys: list[Key]
+    start: Key
+    noise: ImuNoise
+
+
+def chains_without_bias(data: GraphData) -> list[InertialChain]:
+    """Return the chains of IMU factors without a bias factor; their biases need a prior at the start."""
+    measured = {factor.keys[0] for factor in data.other_factors.values() if factor.kind == "bias"}
+    first: dict[Key, ImuNoise] = {}
+    for factor in data.other_factors.values():
+        if factor.kind == "imu":
+            first.setdefault(factor.keys[0], ImuNoise(*factor.measured))
+    found = []
+    for chain in groups(data, ("imu",)) if first else []:
+        starts = [key for key in chain if key in first]
+        if starts and not measured & set(chain):
+            found.append(InertialChain(chain, starts[0], first[starts[0]]))
+    return found

@@ -1,0 +1,120 @@
+"""Factors from what a user gives: keys, poses, vectors, noise and samples are checked here, and only here."""
+
+from __future__ import annotations
+
+from dataclasses import astuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hybridlio.core.arrays import Array
+from hybridlio.core.errors import DataError, GraphError
+from hybridlio.core.sensors import ImuNoise, ImuSamples
+from hybridlio.graph.model import coordinates as co
+from hybridlio.graph.model.graph_data import GraphData
+from hybridlio.graph.model.keys import Key, check_key
+from hybridlio.graph.model.measurements import Factor, Kind, factor_label
+from hybridlio.graph.model.noise import NoiseInput, RobustLike, make_noise, make_robust
+
+_VECTOR_NOISE_SIZE = {"gps": 3, "attitude": 2, "velocity": 3, "bias": 6}  # a direction has two degrees of freedom
+
+
+def prior_factor(data: GraphData, key: Key, pose: ArrayLike, noise: NoiseInput, robust: RobustLike) -> Factor:
+    """Return a measurement of a pose in world; the graph need not have the pose.
+
+    Raises:
+        DataError: not a pose, or the noise is not symmetric positive definite.
+        GraphError: malformed key, or none or several forms of noise.
+    """
+    key = check_key(key)
+    return _pose_factor(data, "prior", (key,), pose, noise, robust)
+
+
+def between_factor(
+    data: GraphData, ends: tuple[Key, Key], T_i_j: ArrayLike, noise: NoiseInput, robust: RobustLike
+) -> Factor:
+    """Return a measurement of pose j in the frame of pose i; the graph need not have pose j.
+
+    Raises:
+        DataError: not a pose, or the noise is not symmetric positive definite.
+        GraphError: unknown pose i, malformed key, a pose joined to itself, or none or several forms of noise.
+    """
+    name = factor_label("between", ends)
+    (i,) = data.known_keys(ends[0], what=name)
+    j = check_key(ends[1])
+    _require_two_poses(i, j, name)
+    return _pose_factor(data, "between", (i, j), T_i_j, noise, robust)
+
+
+def _pose_factor(
+    data: GraphData, kind: Kind, keys: tuple[Key, ...], pose: ArrayLike, noise: NoiseInput, robust: RobustLike
+) -> Factor:
+    name, size = factor_label(kind, keys), data.tangent_size
+    measured = co.from_matrix(pose, data.dimension, name)
+    return Factor(kind, keys, measured, make_noise(name, size, noise), make_robust(robust, size, name))
+
+
+def vector_factor(
+    data: GraphData, kind: Kind, key: Key, vectors: tuple[ArrayLike, ...], noise: NoiseInput, robust: RobustLike = None
+) -> Factor:
+    """Return a GPS, attitude, velocity or bias factor of one pose.
+
+    Args:
+        data: the graph.
+        kind: ``gps``, ``attitude``, ``velocity`` or ``bias``.
+        key: of the pose.
+        vectors: what is measured, ``(3,)`` each, in the order of :class:`Factor`'s ``measured``.
+        noise: of the measurement.
+        robust: kernel.
+
+    Raises:
+        DataError: a vector is malformed, or the noise is not symmetric positive definite.
+        GraphError: unknown pose, a planar graph, or none or several forms of noise.
+    """
+    name, size = factor_label(kind, (key,)), _VECTOR_NOISE_SIZE[kind]
+    (key,) = data.known_keys(key, what=name)
+    data.require_space(name)
+    measured = np.concatenate([check_vector(vector, 3, name) for vector in vectors])
+    return Factor(kind, (key,), measured, make_noise(name, size, noise), make_robust(robust, size, name))
+
+
+def imu_factor(data: GraphData, ends: tuple[Key, Key], samples: ImuSamples, noise: ImuNoise) -> Factor:
+    """Return an inertial factor between two poses.
+
+    Raises:
+        DataError: fewer than two samples, or noise densities that are not positive.
+        GraphError: unknown pose, a pose joined to itself, or a planar graph.
+    """
+    name = factor_label("imu", ends)
+    i, j = data.known_keys(*ends, what=name)
+    data.require_space(name)
+    _require_two_poses(i, j, name)
+    if len(samples) < 2:
+        raise DataError(f"{name}: at least 2 IMU samples are needed, got {len(samples)}")
+    densities = np.array(astuple(noise))
+    if not (np.isfinite(densities).all() and densities.min() > 0):
+        raise DataError(f"{name}: noise densities must be finite and positive, got {densities.tolist()}")
+    return Factor("imu", (i, j), densities, samples=samples)
+
+
+def check_direction(direction: ArrayLike, name: str) -> None:
+    """Raise DataError where a vector is zero, and so has no direction."""
+    if not np.any(np.asarray(direction)):
+        raise DataError(f"{name}: a direction must not be zero")
+
+
+def check_vector(values: ArrayLike, size: int, name: str) -> Array:
+    """Return the values as float64 ``(size,)``.
+
+    Raises:
+        DataError: wrong shape or not finite.
+    """
+    array = np.array(values, dtype=np.float64)
+    if array.shape != (size,) or not np.isfinite(array).all():
+        raise DataError(f"{name}: expected {size} finite numbers, got {array.tolist()}")
+    return array
+
+
+def _require_two_poses(i: Key, j: Key, name: str) -> None:
+    if i == j:
+        raise GraphError(f"{name}: joins pose {i} to itself")

@@ -1,0 +1,155 @@
+"""Noise of a measurement: a Gaussian in the form it was given, and a robust kernel; checked where they enter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hybridlio.core.arrays import Array
+from hybridlio.core.chi_square import chi_square_quantile
+from hybridlio.core.covariance import check_covariance
+from hybridlio.core.errors import ConfigError, DataError, GraphError
+
+Form: TypeAlias = Literal["covariance", "information", "sigmas"]
+
+KERNELS = ("huber", "cauchy", "geman-mcclure", "dcs")
+_INLIER_SHARE = 0.95  # of good measurements that stay within a kernel's width; the usual 5 % significance level
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Gaussian noise of a measurement in the form it was given, so that a file holds exactly what the user gave.
+
+    Attributes:
+        form: ``covariance``, ``information`` (its inverse) or ``sigmas`` (standard deviations).
+        values: ``(d, d)``, or ``(d,)`` for sigmas; rotation first.
+    """
+
+    form: Form
+    values: Array
+
+    @cached_property
+    def information(self) -> Array:
+        """Information matrix ``(d, d)``."""
+        if self.form == "sigmas":
+            return np.diag(self.values**-2.0)
+        return self.values if self.form == "information" else _inverse(self.values)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance matrix ``(d, d)``."""
+        if self.form == "sigmas":
+            return np.diag(self.values**2)
+        return self.values if self.form == "covariance" else _inverse(self.values)
+
+
+def _inverse(matrix: Array) -> Array:
+    inverse = np.linalg.inv(matrix)
+    return np.asarray((inverse + inverse.T) / 2, dtype=np.float64)
+
+
+class NoiseInput(NamedTuple):
+    """Noise as a user gives it: exactly one of the three must be given."""
+
+    covariance: ArrayLike | None = None
+    information: ArrayLike | None = None
+    sigmas: ArrayLike | None = None
+
+
+def make_noise(name: str, size: int, given: NoiseInput) -> Noise:
+    """Return the noise in the one form that is given.
+
+    Raises:
+        GraphError: none or several of covariance, information and sigmas.
+        DataError: wrong shape, not finite, not symmetric positive definite; the message starts with ``name``.
+    """
+    forms: tuple[Form, ...] = ("covariance", "information", "sigmas")
+    present = [(form, values) for form, values in zip(forms, given, strict=True) if values is not None]
+    if len(present) != 1:
+        raise GraphError(f"{name}: give exactly one of covariance, information and sigmas; got {len(present)} of them")
+    form, values = present[0]
+    array = np.asarray(values, dtype=np.float64)
+    if form == "sigmas":
+        return Noise(form, check_sigmas(array, size, name))
+    return Noise(form, check_covariance(array, name if form == "covariance" else f"{name}: information", size))
+
+
+def check_sigmas(values: Array, size: int, name: str) -> Array:
+    """Return standard deviations ``(size,)``; a single number applies to all components.
+
+    Raises:
+        DataError: wrong shape, not finite or not positive.
+    """
+    values = np.full(size, values) if values.ndim == 0 else values
+    if values.shape != (size,) or not np.isfinite(values).all() or values.min() <= 0:
+        raise DataError(f"{name}: sigmas must be {size} finite, positive standard deviations, got {values.tolist()}")
+    return values.copy()
+
+
+@dataclass(frozen=True)
+class Robust:
+    """A robust kernel (M-estimator).
+
+    Attributes:
+        kernel: one of :data:`KERNELS`.
+        width: norm of the whitened residual, in standard deviations, above which the kernel lowers the weight
+            noticeably (Huber, DCS: at all). Dynamic covariance scaling uses its square.
+    """
+
+    kernel: str
+    width: float
+
+    def loss(self, squared: float) -> float:
+        """Return the kernel's replacement for χ², that is twice its share of the error, at a squared residual norm."""
+        c = self.width**2
+        if self.kernel == "huber":
+            return squared if squared <= c else 2 * self.width * float(np.sqrt(squared)) - c
+        if self.kernel == "cauchy":
+            return c * float(np.log1p(squared / c))
+        if self.kernel == "geman-mcclure":
+            return c * squared / (c + squared)
+        return squared if squared <= c else 4 * c * squared / (c + squared) - c
+
+    def weight(self, norm: float) -> float:
+        """Return the factor, 0 to 1, by which the kernel scales the information at a whitened residual norm."""
+        share = (norm / self.width) ** 2
+        if self.kernel == "huber":
+            return min(1.0, self.width / norm) if norm > 0 else 1.0
+        if self.kernel == "cauchy":
+            return 1 / (1 + share)
+        if self.kernel == "geman-mcclure":
+            return 1 / (1 + share) ** 2
+        return 1.0 if share <= 1 else (2 / (1 + share)) ** 2
+
+
+RobustLike: TypeAlias = "str | tuple[str, float] | Robust | None"
+
+
+def make_robust(robust: RobustLike, size: int, name: str) -> Robust | None:
+    """Return a kernel from its name, or from name and width.
+
+    Args:
+        robust: name, ``(name, width)``, a kernel or None.
+        size: dimension of the residual, for the default width (:func:`default_width`).
+        name: start of the error message.
+
+    Raises:
+        ConfigError: unknown kernel, or a width that is not positive.
+    """
+    if robust is None or isinstance(robust, Robust):
+        return robust
+    kernel, width = (robust, default_width(size)) if isinstance(robust, str) else robust
+    if kernel not in KERNELS:
+        raise ConfigError(f"{name}: unknown robust kernel {kernel!r}; choose one of {', '.join(KERNELS)}")
+    if not (np.isfinite(width) and width > 0):
+        raise ConfigError(f"{name}: the width of a robust kernel must be positive, got {width}")
+    return Robust(kernel, float(width))
+
+
+def default_width(size: int) -> float:
+    """Return the norm that a standard normal vector of ``size`` components stays below with 95 % probability."""
+    return float(np.sqrt(chi_square_quantile(_INLIER_SHARE, size)))

@@ -1,0 +1,35 @@
+"""Solving a whole pose graph at once, with or without rejection of wrong loop closures."""
+
+from __future__ import annotations
+
+from hybridlio.graph.model.checks import check_determined
+from hybridlio.graph.model.graph_data import GraphData
+from hybridlio.graph.solve.gnc import odometry_start, reject_outliers
+from hybridlio.graph.solve.initial_values import choose_start
+from hybridlio.graph.solve.nonlinear import IterationProgress, NonlinearSolver
+from hybridlio.graph.solve.settings import Settings
+from hybridlio.graph.solve.solution import Solution
+
+
+def solve_batch(graph: GraphData, settings: Settings, report: IterationProgress) -> Solution:
+    """Solve a graph by Gauss-Newton and Levenberg-Marquardt, after ``gnc`` where the settings ask for it.
+
+    Raises:
+        GraphError: the factors do not determine every pose; names the keys.
+    """
+    check_determined(graph)
+    data = graph.copy()
+    if settings.backend == "gnc":
+        return _solve_without_outliers(data, settings, report)
+    solver = NonlinearSolver(data, settings.max_iterations, settings.tolerance, report)
+    return Solution(data, solver(choose_start(data, settings.initial)))
+
+
+def _solve_without_outliers(data: GraphData, settings: Settings, report: IterationProgress) -> Solution:
+    start = odometry_start(data) if settings.initial == "auto" else None
+    start = choose_start(data, settings.initial) if start is None else start
+    start, rejected = reject_outliers(data, start, report)
+    kept = data.copy(without=rejected)
+    check_determined(kept)
+    solver = NonlinearSolver(kept, settings.max_iterations, settings.tolerance, report)
+    return Solution(data, solver(start), rejected)

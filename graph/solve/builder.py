@@ -1,0 +1,219 @@
+"""A pose graph as GTSAM's factors and values; variables are ``x`` pose, ``v`` velocity, ``b`` biases, by pose index."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+
+from hybridlio.core.arrays import Array
+from hybridlio.core.errors import GraphError
+from hybridlio.core.estimates import State
+from hybridlio.core.motion_limits import GRAVITY_M_S2
+from hybridlio.core.sensors import NS_PER_S, ImuNoise
+from hybridlio.graph.base.noise import with_kernel
+from hybridlio.graph.base.preintegration import preintegrate
+from hybridlio.graph.model import coordinates as co
+from hybridlio.graph.model.connectivity import InertialChain, chains_without_bias
+from hybridlio.graph.model.edge_table import FORMS
+from hybridlio.graph.model.graph_data import GraphData
+from hybridlio.graph.model.keys import Key
+from hybridlio.graph.model.measurements import Factor
+from hybridlio.graph.model.noise import Robust
+
+BiasAt: TypeAlias = Callable[[int], gtsam.imuBias.ConstantBias]
+
+# rad, m: of the prior that holds a fixed pose. Small against any sensor, large enough that information of 1e12 beside
+# that of edges still solves in double precision.
+FIXED_SIGMA = 1e-6
+_X0 = X(0)
+_GRAVITY = np.array([0.0, 0.0, -GRAVITY_M_S2])
+_PLANAR_SIGMAS = np.array(co.GTSAM_ORDER[2])
+_PLANAR_MATRIX = np.arange(9).reshape(3, 3)[np.ix_(_PLANAR_SIGMAS, _PLANAR_SIGMAS)].ravel()
+_GAUSSIAN: dict[str, Callable[[Array], gtsam.noiseModel.Base]] = {
+    "sigmas": gtsam.noiseModel.Diagonal.Sigmas,
+    "information": gtsam.noiseModel.Gaussian.Information,
+    "covariance": gtsam.noiseModel.Gaussian.Covariance,
+}
+
+
+class Builder:
+    """Makes GTSAM's factors and values of a pose graph.
+
+    Args:
+        data: the graph.
+        bias_at: biases around which the samples of an IMU factor are preintegrated, by index of its first pose; by
+            default those of bias factors, else zero.
+    """
+
+    def __init__(self, data: GraphData, bias_at: BiasAt | None = None) -> None:
+        self.data = data
+        self._bias_at = bias_at or _measured_biases(data)
+        self._models: dict[tuple[str, bytes, Robust | None], gtsam.noiseModel.Base] = {}
+
+    def graph(self, robust: bool = True) -> gtsam.NonlinearFactorGraph:
+        """Return all factors in the order of :meth:`factor_ids`, then the priors of fixed poses and of initial biases.
+
+        Args:
+            robust: whether to apply the robust kernels.
+
+        Raises:
+            GraphError: a fixed pose has no initial value.
+        """
+        graph = gtsam.NonlinearFactorGraph()
+        for edge in self.edges(slice(None), robust):
+            graph.add(edge)
+        for factor in self.data.other_factors.values():
+            graph.add(self.factor(factor, robust))
+        for key in sorted(self.data.fixed, key=self.data.index.__getitem__):
+            graph.add(self.fixed_pose_prior(key))
+        for chain in chains_without_bias(self.data):
+            graph.add(self.initial_bias_prior(chain))
+        return graph
+
+    def factor_ids(self) -> list[int]:
+        """Return the factors' ids in the order of :meth:`graph`: edges, then the others."""
+        return [*self.data.edges.ids.tolist(), *self.data.other_factors]
+
+    def values(self, poses: Array) -> gtsam.Values:
+        """Return initial values: poses at their coordinates, and the velocities and biases that factors concern."""
+        values = gtsam.Values()
+        insert = values.insert
+        for k, pose in enumerate(co.gtsam_poses(poses), _X0):
+            insert(k, pose)
+        for k, velocity in _initial_velocities(self.data, poses).items():
+            insert(V(k), velocity)
+        for k in self.poses_with_bias():
+            insert(B(k), self._bias_at(k))
+        return values
+
+    def poses_with_bias(self) -> list[int]:
+        """Return the indices of the poses whose biases are variables."""
+        kinds = ("imu", "bias")
+        return sorted({self.data.index[k] for f in self.data.other_factors.values() if f.kind in kinds for k in f.keys})
+
+    def edges(self, rows: slice, robust: bool = True) -> list[Any]:
+        """Return the between-factors of some rows of the edge table."""
+        make = gtsam.BetweenFactorPose3 if self.data.dimension == 3 else gtsam.BetweenFactorPose2
+        table = self.data.edges
+        ends = (table.ends[rows] + _X0).tolist()
+        models = self._edge_models(rows, robust)
+        poses = co.gtsam_poses(table.measured[rows])
+        return [make(i, j, T, model) for (i, j), T, model in zip(ends, poses, models, strict=True)]
+
+    def factor(self, factor: Factor, robust: bool = True) -> Any:
+        """Return any factor but a between-factor."""
+        model = None
+        if factor.noise is not None:
+            noise = factor.noise
+            model = self._model(noise.form, noise.values.tobytes(), noise.values, factor.robust if robust else None)
+        return getattr(self, f"_{factor.kind}")(factor, [self.data.index[key] for key in factor.keys], model)
+
+    def fixed_pose_prior(self, key: Key) -> Any:
+        """Return the prior that holds a fixed pose at its initial value.
+
+        Raises:
+            GraphError: the pose has no initial value.
+        """
+        at = self.data.initial_value(key)
+        if at is None:
+            raise GraphError(f"pose {key} is fixed but has no initial value; give one by set_initial")
+        model = gtsam.noiseModel.Diagonal.Sigmas(np.full(self.data.tangent_size, FIXED_SIGMA))
+        return self._pose_prior(self.data.index[key], at, model)
+
+    def initial_bias_prior(self, chain: InertialChain) -> Any:
+        """Return the prior of zero biases at the start of a chain without a bias factor, as wide as its noise says."""
+        sigmas = np.repeat([chain.noise.accel_bias_sigma_m_s2, chain.noise.gyro_bias_sigma_rad_s], 3)
+        model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        variable = B(self.data.index[chain.start])
+        return gtsam.PriorFactorConstantBias(variable, gtsam.imuBias.ConstantBias(), model)
+
+    def _edge_models(self, rows: slice, robust: bool) -> list[gtsam.noiseModel.Base]:
+        """Return one noise model per row; rows of equal noise share one."""
+        table = self.data.edges
+        values = table.noise_values[rows]
+        kernels = table.robust if robust else {}
+        forms, ids = table.form[rows].tolist(), table.ids[rows].tolist()
+        return [
+            self._model(FORMS[form], value.tobytes(), value, kernels.get(factor_id))
+            for factor_id, form, value in zip(ids, forms, values, strict=True)
+        ]
+
+    def _model(self, form: str, value_bytes: bytes, values: Array, kernel: Robust | None) -> gtsam.noiseModel.Base:
+        model = self._models.get((form, value_bytes, kernel))
+        if model is None:
+            if form == "sigmas" and values.ndim == 2:
+                values = np.diagonal(values)
+            model = self._models[form, value_bytes, kernel] = noise_model(form, values, kernel, self.data.dimension)
+        return model
+
+    def _prior(self, factor: Factor, indices: list[int], model: Any) -> Any:
+        return self._pose_prior(indices[0], factor.measured, model)
+
+    def _pose_prior(self, index: int, at: Array, model: Any) -> Any:
+        make = gtsam.PriorFactorPose3 if self.data.dimension == 3 else gtsam.PriorFactorPose2
+        return make(X(index), co.gtsam_poses(at[None])[0], model)
+
+    def _gps(self, factor: Factor, indices: list[int], model: Any) -> Any:
+        z = factor.measured
+        return gtsam.GPSFactorArm(X(indices[0]), z[:3], z[3:], model)
+
+    def _attitude(self, factor: Factor, indices: list[int], model: Any) -> Any:
+        z = factor.measured
+        return gtsam.AttitudeFactorPose3(X(indices[0]), gtsam.Unit3(z[:3]), model, gtsam.Unit3(z[3:]))
+
+    def _velocity(self, factor: Factor, indices: list[int], model: Any) -> Any:
+        return gtsam.PriorFactorVector(V(indices[0]), factor.measured, model)
+
+    def _bias(self, factor: Factor, indices: list[int], model: Any) -> Any:
+        z = factor.measured
+        return gtsam.PriorFactorConstantBias(B(indices[0]), gtsam.imuBias.ConstantBias(z[:3], z[3:]), model)
+
+    def _imu(self, factor: Factor, indices: list[int], _: Any) -> Any:
+        assert factor.samples is not None
+        z, (i, j) = factor.measured, indices
+        bias, zero, stamp_ns = self._bias_at(i), np.zeros(3), int(factor.samples.stamps_ns[0])
+        # preintegration only uses the state's stamp, biases and gravity
+        state = State(
+            stamp_ns, np.eye(4), zero, bias.accelerometer(), bias.gyroscope(), _GRAVITY, np.eye(15), np.eye(3)
+        )  # fmt: skip
+        pim = preintegrate(factor.samples, state, ImuNoise(*z))
+        return gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), pim)
+
+
+def noise_model(form: str, values: Array, kernel: Robust | None, dimension: int) -> gtsam.noiseModel.Base:
+    """Return GTSAM's noise model, in the order of GTSAM's tangent vectors."""
+    if dimension == 2:
+        values = values[_PLANAR_SIGMAS] if form == "sigmas" else values.ravel()[_PLANAR_MATRIX].reshape(3, 3)
+    model = _GAUSSIAN[form](values)
+    return model if kernel is None else with_kernel(model, kernel.kernel, kernel.width)
+
+
+def _measured_biases(data: GraphData) -> BiasAt:
+    """Return biases by pose index: those of bias factors, else zero."""
+    measured = {data.index[f.keys[0]]: f.measured for f in data.other_factors.values() if f.kind == "bias"}
+    zero = np.zeros(6)
+
+    def bias_at(index: int) -> gtsam.imuBias.ConstantBias:
+        bias = measured.get(index, zero)
+        return gtsam.imuBias.ConstantBias(bias[:3], bias[3:])
+
+    return bias_at
+
+
+def _initial_velocities(data: GraphData, poses: Array) -> dict[int, Array]:
+    """Return initial velocities by pose index: from velocity factors, else the mean between an IMU factor's poses."""
+    found: dict[int, Array] = {}
+    for factor in data.other_factors.values():
+        indices = [data.index[key] for key in factor.keys]
+        if factor.kind == "velocity":
+            found[indices[0]] = factor.measured
+        elif factor.kind == "imu" and factor.samples is not None:
+            dt_s = float(factor.samples.stamps_ns[-1] - factor.samples.stamps_ns[0]) / NS_PER_S
+            mean = (poses[indices[1], :3] - poses[indices[0], :3]) / dt_s
+            for k in indices:
+                found.setdefault(k, mean)
+    return found
