@@ -60,4 +60,4 @@ class NetworkResidualSettings:
         check_positive(self, "min_cells", "covariance_scale", "kernel_m", "max_distance_m")
         check_not_negative(self, "refine_steps")
         check_fraction(self, "min_matched")
-        check_setting(self, "start_speeds_m_s", len(self.start_speeds_m_s) > 0, "one number at least")
+        check_setting(self, "start_speeds_m_s", len(self.start_speeds_m_s) > 0, "a list of one number or more")

@@ -1,4 +1,4 @@
-"""The simplest initial poses: the last step again, or none. The Kalman filter is in :mod:`hybridlio.sources.kalman`."""
+"""The simplest initial-pose sources: repeat the last step's velocity, or predict no motion."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from hybridlio.core.sensors import NS_PER_S, Frame
 
 
 class Identity:
-    """No motion, and not much confidence in that."""
+    """Predicts no motion, with the covariance of an unknown one."""
 
     name = "identity"
 
     def predict(self, frame: Frame, state: State) -> RelativePose:
-        """The identity."""
+        """Return the identity."""
         dt_s = (frame.scan.stamp_ns - state.stamp_ns) / NS_PER_S
         return RelativePose(np.eye(4), unknown_motion_covariance(dt_s), source=self.name)
 
     def correct(self, frame: Frame, estimate: RelativePose) -> None:
-        """Nothing to learn."""
+        """Do nothing: there is no state to correct."""
 
 
 class ConstantVelocity:
-    """The last step's twist, for as long as the new step takes."""
+    """Predicts that the twist of the last step continues."""
 
     name = "constant-velocity"
 
@@ -35,7 +35,7 @@ class ConstantVelocity:
         self._stamp_ns = 0
 
     def predict(self, frame: Frame, state: State) -> RelativePose:
-        """The last twist times the time since ``state``; the identity at first."""
+        """Return the last twist times the time since ``state``; the identity before the first step."""
         dt_s = (frame.scan.stamp_ns - state.stamp_ns) / NS_PER_S
         self._stamp_ns = state.stamp_ns
         if self._twist is None:
@@ -43,5 +43,5 @@ class ConstantVelocity:
         return RelativePose(se3.exp(self._twist * dt_s), changed_motion_covariance(dt_s), source=self.name)
 
     def correct(self, frame: Frame, estimate: RelativePose) -> None:
-        """Remember the step as a twist."""
+        """Take the twist from the step to ``frame``."""
         self._twist = se3.log(estimate.pose) * NS_PER_S / (frame.scan.stamp_ns - self._stamp_ns)

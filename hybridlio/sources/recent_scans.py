@@ -1,7 +1,8 @@
-"""Residuals against several recent keyframes beside the last scan, for any source that can compare two scans.
+"""Relative poses to several recent scans beside the last one, from any source that can compare two scans.
 
-A relative pose over a few metres hardly errs more than one over a single step, and does not add up: the path then
-drifts less. What the poses of one scan share is said in :class:`hybridlio.core.estimates.EarlierScanPose`.
+A relative pose over a few metres is hardly less certain than one over a single step, and its error does not add up
+over the steps between. The path then drifts less. :class:`hybridlio.core.estimates.EarlierScanPose` says how the
+errors of one scan's relative poses depend on each other.
 """
 
 from __future__ import annotations
@@ -19,18 +20,18 @@ from hybridlio.core.sensors import Frame
 from hybridlio.core.setting_checks import check_not_negative, check_positive, check_setting
 from hybridlio.sources.innovation_gate import GATE_NIS, normalised_innovation_squared
 
-_FLOOR = np.diag(PREDICTION_FLOOR_SIGMAS**2)  # no way is known better
+_FLOOR = np.diag(PREDICTION_FLOOR_SIGMAS**2)
 
 
 @dataclass(frozen=True)
 class RecentScansSettings:
-    """How many earlier scans, keyframes, each scan is compared with.
+    """Which recent scans each scan is compared with.
 
     Attributes:
-        count: so many of the newest; 0 for none but the last scan.
-        distance_m, angle_deg: a scan this far from the last keyframe becomes one.
-        shared: how much of a relative pose's covariance is noise of its two scans, half each, that their other
-            relative poses have too.
+        count: number of recent scans; 0 compares with the last scan only.
+        distance_m, angle_deg: a scan this far from the newest recent scan becomes one itself.
+        shared: fraction of a relative pose's covariance that is noise of its two scans, half each, and so is shared by
+            all relative poses of a scan.
 
     Raises:
         SettingError: a value is out of range.
@@ -50,110 +51,116 @@ class RecentScansSettings:
 
 
 class PairSource(ResidualSource, Protocol):
-    """A residual source that can compare any two scans that it has seen."""
+    """A residual source that can compare any two scans that it was given."""
 
     @property
-    def seen(self) -> Any:
-        """The scan last looked at, ready to be compared."""
+    def current_scan(self) -> Any:
+        """The last scan given to ``start`` or ``refine``, in the form in which this source compares scans."""
         ...
 
     def pair(self, earlier: Any, current: Any, initial: RelativePose) -> RelativePose:
-        """``T_j_k`` from an earlier scan to the current one; ``initial``, not ok, where that fails."""
+        """Return ``T_j_k`` of the current scan in an earlier one; ``initial`` with ``ok`` False where that fails.
+
+        Args:
+            earlier, current: values of :attr:`current_scan`.
+            initial: about where the current scan is relative to the earlier one.
+        """
         ...
 
 
 @dataclass(frozen=True, eq=False)
-class _Kept:
-    """A scan that was kept, and the way from it to the current one by consecutive steps.
+class _RecentScan:
+    """An earlier scan, and the path from it to the current one by consecutive steps.
 
     Attributes:
         stamp_ns: its stamp.
-        seen: as the source compares it.
-        pose: ``(4, 4)`` of the current scan in this one.
-        unsure: ``(6, 6)`` that has added up on the way.
+        scan: a value of :attr:`PairSource.current_scan`.
+        pose: ``(4, 4)`` pose of the current scan in this one.
+        covariance: ``(6, 6)`` of that pose; the sum over the steps.
     """
 
     stamp_ns: int
-    seen: Any
+    scan: Any
     pose: Array = field(default_factory=lambda: np.eye(4))
-    unsure: Array = field(default_factory=lambda: _FLOOR)
+    covariance: Array = field(default_factory=lambda: _FLOOR)
 
-    def after(self, step: RelativePose) -> _Kept:
-        """Seen from one step farther."""
-        unsure = se3.compose_covariance(self.unsure, step.pose, step.covariance)
-        return replace(self, pose=self.pose @ step.pose, unsure=unsure)
+    def after(self, step: RelativePose) -> _RecentScan:
+        """Return the same scan with the path one step longer."""
+        covariance = se3.compose_covariance(self.covariance, step.pose, step.covariance)
+        return replace(self, pose=self.pose @ step.pose, covariance=covariance)
 
 
 class WithRecentScans:
-    """A source's steps, each with poses relative to the last keyframes.
+    """Adds relative poses to recent scans to the steps of a source.
 
-    After a scan that failed, the last one that did not is among them, so that what the bridge was off by is taken back.
+    The last scan that did not fail is compared too, whether or not it is one of the recent scans: after a bridged scan
+    that undoes the bridge's error.
 
     Args:
-        source: makes the steps, and compares.
-        settings: how many, and how they are weighed.
+        source: makes the steps and compares scans.
+        settings: which scans are compared.
     """
 
     def __init__(self, source: PairSource, settings: RecentScansSettings) -> None:
         self.name = source.name
         self._source, self._settings = source, settings
-        self._keyframes: list[_Kept] = []
-        self._good: _Kept | None = None  # the last scan that did not fail
-        self._before: tuple[list[_Kept], _Kept | None] = ([], None)
+        self._recent: list[_RecentScan] = []
+        self._last_good: _RecentScan | None = None
+        self._before: tuple[list[_RecentScan], _RecentScan | None] = ([], None)  # both, before the last step
         self._stamp_ns = 0
 
     def start(self, frame: Frame) -> None:
-        """Take the first scan, the first keyframe.
+        """Take the first scan, which is also the first recent scan.
 
         Raises:
             DataError: the source cannot start at it.
         """
         self._source.start(frame)
         self._stamp_ns = frame.scan.stamp_ns
-        self._good = _Kept(self._stamp_ns, self._source.seen)
-        self._keyframes = [self._good]
+        self._last_good = _RecentScan(self._stamp_ns, self._source.current_scan)
+        self._recent = [self._last_good]
 
     def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:
-        """The source's step, with the poses relative to keyframes that agree with it."""
+        """Return the source's step, with the relative poses to recent scans that agree with the path."""
         step = self._source.refine(frame, initial)
-        self._before = self._keyframes, self._good
-        self._go_on(step)
-        kept = {k.stamp_ns: k for k in (*self._keyframes, self._good) if k is not None}
-        found = [self._compared(k) for stamp, k in kept.items() if stamp != self._stamp_ns]
+        self._before = self._recent, self._last_good
+        self._advance(step)
+        compared = {k.stamp_ns: k for k in (*self._recent, self._last_good) if k is not None}
+        found = [self._compare(k) for stamp, k in compared.items() if stamp != self._stamp_ns]
         self._stamp_ns = frame.scan.stamp_ns
         if step.ok:
-            self._good = _Kept(self._stamp_ns, self._source.seen)
-            if not self._keyframes or self._is_far(self._keyframes[-1].pose):
-                self._keyframes = [*self._keyframes, self._good][-self._settings.count :]
-        return self._shared(step, [keyframe for keyframe in found if keyframe is not None])
+            self._last_good = _RecentScan(self._stamp_ns, self._source.current_scan)
+            if not self._recent or self._is_far(self._recent[-1].pose):
+                self._recent = [*self._recent, self._last_good][-self._settings.count :]
+        return self._with_shared_noise(step, [pose for pose in found if pose is not None])
 
     def take_back(self, initial: RelativePose) -> None:
-        """Leave the last scan out: the path goes on by ``initial``."""
-        self._keyframes, self._good = self._before
-        self._go_on(initial)
+        """Discard the last scan: the path continues by ``initial``."""
+        self._recent, self._last_good = self._before
+        self._advance(initial)
         if isinstance(self._source, TakesBack):
             self._source.take_back(initial)
 
-    def _go_on(self, step: RelativePose) -> None:
-        self._keyframes = [kept.after(step) for kept in self._keyframes]
-        self._good = None if self._good is None else self._good.after(step)
+    def _advance(self, step: RelativePose) -> None:
+        self._recent = [scan.after(step) for scan in self._recent]
+        self._last_good = None if self._last_good is None else self._last_good.after(step)
 
-    def _compared(self, kept: _Kept) -> EarlierScanPose | None:
-        """The scan relative to a keyframe; None where that fails or is not where the path could have come to."""
-        guess = RelativePose(kept.pose, kept.unsure, self.name)
-        found = self._source.pair(kept.seen, self._source.seen, guess)
-        if not found.ok or normalised_innovation_squared(found, guess) > GATE_NIS:
+    def _compare(self, recent: _RecentScan) -> EarlierScanPose | None:
+        """Return the current scan's pose in a recent one; None if that fails or contradicts the path between them."""
+        path = RelativePose(recent.pose, recent.covariance, self.name)
+        found = self._source.pair(recent.scan, self._source.current_scan, path)
+        if not found.ok or normalised_innovation_squared(found, path) > GATE_NIS:
             return None
-        return EarlierScanPose(kept.stamp_ns, found.pose, found.covariance)
+        return EarlierScanPose(recent.stamp_ns, found.pose, found.covariance)
 
-    def _is_far(self, way: Array) -> bool:
-        angle_deg = np.degrees(np.linalg.norm(se3.so3_log(way[:3, :3])))
-        return bool(np.linalg.norm(way[:3, 3]) > self._settings.distance_m or angle_deg > self._settings.angle_deg)
+    def _is_far(self, pose: Array) -> bool:
+        angle_deg = np.degrees(np.linalg.norm(se3.so3_log(pose[:3, :3])))
+        return bool(np.linalg.norm(pose[:3, 3]) > self._settings.distance_m or angle_deg > self._settings.angle_deg)
 
-    def _shared(self, step: RelativePose, keyframes: list[EarlierScanPose]) -> RelativePose:
-        """With what the step's covariance shares with the keyframes' told from what is each pose's own."""
+    def _with_shared_noise(self, step: RelativePose, found: list[EarlierScanPose]) -> RelativePose:
+        """Split the covariances into the noise that a scan's relative poses share and the rest, each pose's own."""
         if not step.ok or step.drift is not None:
-            return replace(step, earlier_scans=tuple(keyframes))
+            return replace(step, earlier_scans=tuple(found))
         own = 1 - self._settings.shared
-        near = tuple(replace(keyframe, covariance=own * keyframe.covariance) for keyframe in keyframes)
-        return replace(step, drift=own * step.covariance, earlier_scans=near)
+        earlier = tuple(replace(pose, covariance=own * pose.covariance) for pose in found)
+        return replace(step, drift=own * step.covariance, earlier_scans=earlier)

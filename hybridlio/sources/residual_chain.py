@@ -1,4 +1,4 @@
-"""Two residual sources one after the other: the second starts where the first has got to."""
+"""Two residual sources in a row, where the second starts from the first one's answer; and the one that does nothing."""
 
 from __future__ import annotations
 
@@ -12,31 +12,32 @@ from hybridlio.core.sensors import Frame
 
 
 class Proposer(ResidualSource, Protocol):
-    """A residual source that finds a pose quickly and, where it is asked to, says how good it is."""
+    """A residual source that finds a pose quickly, and computes its quality only on demand."""
 
     def propose(self, frame: Frame, initial: RelativePose) -> Array | None:
-        """A pose ``T_k_k1`` ``(4, 4)`` that nothing has judged yet; None where it finds none."""
+        """Return a pose ``T_k_k1`` ``(4, 4)`` without checking its quality; None where there is none."""
         ...
 
     def judge(self, frame: Frame, initial: RelativePose) -> RelativePose:
-        """What ``refine`` says of the frame for which a pose was proposed last."""
+        """Return what ``refine`` would for the frame of the last :meth:`propose`, with covariance and ``ok``."""
         ...
 
 
 class ResidualChain:
-    """Refines by one source, then by another, such as a network's step before the registration to a local map.
+    """Refines by one source, then by another, such as a network's step before registration to a local map.
 
-    Where the initial pose is sure to a decimetre, the first source only proposes where to start. The second looks
-    whether that is better, and answers as it would without: a wrong proposal does no harm, and none has to be judged.
-    Where it is not, the first one's judged answer is the second's initial pose; where the first fails or leaves a
-    direction open, of which the second may see more, the initial pose itself.
+    If the initial pose is certain to a decimetre, the first source only proposes a pose. The second starts there if
+    its scan fits better, and otherwise answers as if there were no proposal. A wrong proposal does no harm, so the cost
+    of judging it is saved.
 
-    The answer is the second's, with its covariance; where that fails, the first's. Only if both do, the initial pose
-    bridges.
+    If the initial pose is less certain, the first source's full answer is the second one's initial pose. Where the
+    first fails or leaves a direction unconstrained, the second starts from the initial pose itself.
+
+    The result is the second source's. If that fails it is the first one's, and if both fail the initial pose bridges.
 
     Args:
-        first: coarse and forgiving, such as the network.
-        second: fine, such as scan matching, and such that it looks at what is ``proposed``.
+        first: coarse and robust, such as the network.
+        second: precise, and able to use :attr:`RelativePose.proposed`, such as scan matching.
     """
 
     def __init__(self, first: Proposer, second: ResidualSource) -> None:
@@ -44,7 +45,7 @@ class ResidualChain:
         self._first, self._second = first, second
 
     def start(self, frame: Frame) -> None:
-        """Give both the first scan.
+        """Give both sources the first scan.
 
         Raises:
             DataError: one of them cannot start at it.
@@ -53,8 +54,8 @@ class ResidualChain:
         self._second.start(frame)
 
     def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:
-        """Both sources' answer, whose details are those of both, each with its source's name in front."""
-        coarse, fine = self._judged(frame, initial) if _is_unsure(initial) else self._proposed(frame, initial)
+        """Return the answer of both sources. Keys of ``details`` are prefixed by the name of their source."""
+        coarse, fine = self._refine_in_turn(frame, initial) if _is_vague(initial) else self._propose(frame, initial)
         answers = ((self._first, coarse), (self._second, fine))
         details = {
             f"{source.name} {key}": value
@@ -65,40 +66,40 @@ class ResidualChain:
         if fine.ok:
             return replace(fine, source=self.name, details=details)
         if coarse is not None and coarse.ok:
-            if isinstance(self._second, TakesBack):  # to keep its place by it, which is as good as a step of its own
+            if isinstance(self._second, TakesBack):  # its path is to continue by the coarse answer, not by `initial`
                 self._second.take_back(coarse)
             return replace(coarse, source=self.name, drift=fine.drift, details=details)
         return replace(fine, details=details)
 
-    def _judged(self, frame: Frame, initial: RelativePose) -> tuple[RelativePose, RelativePose]:
-        """Both answers, the second's from the first's."""
-        coarse = self._first.refine(frame, initial)
-        return coarse, self._second.refine(frame, coarse if coarse.ok and not len(coarse.degenerate) else initial)
-
-    def _proposed(self, frame: Frame, initial: RelativePose) -> tuple[RelativePose | None, RelativePose]:
-        """The second's answer, from where the first proposes or not; the first's where it is needed."""
-        fine = self._second.refine(frame, replace(initial, proposed=self._first.propose(frame, initial)))
-        return None if fine.ok else self._first.judge(frame, initial), fine
-
     def take_back(self, initial: RelativePose) -> None:
-        """Tell those of the two that want to know that their answer was not believed."""
+        """Tell the sources that can take an answer back to do so."""
         for source in (self._first, self._second):
             if isinstance(source, TakesBack):
                 source.take_back(initial)
 
+    def _refine_in_turn(self, frame: Frame, initial: RelativePose) -> tuple[RelativePose, RelativePose]:
+        """Return both answers, the second one's from the first one's."""
+        coarse = self._first.refine(frame, initial)
+        return coarse, self._second.refine(frame, coarse if coarse.ok and not len(coarse.degenerate) else initial)
 
-def _is_unsure(pose: RelativePose) -> bool:
+    def _propose(self, frame: Frame, initial: RelativePose) -> tuple[RelativePose | None, RelativePose]:
+        """Return the second one's answer with the first one's proposal, and the first one's if the second fails."""
+        fine = self._second.refine(frame, replace(initial, proposed=self._first.propose(frame, initial)))
+        return None if fine.ok else self._first.judge(frame, initial), fine
+
+
+def _is_vague(pose: RelativePose) -> bool:
     return pose.translation_sigma_m > VAGUE_TRANSLATION_SIGMA_M
 
 
 class NoResidual:
-    """Leaves the initial pose as it is: a run on the initial poses alone, to compare with."""
+    """Returns the initial pose unchanged, for runs on initial poses alone."""
 
     name = "none"
 
     def start(self, frame: Frame) -> None:
-        """Nothing to keep."""
+        """Do nothing: no scan is needed."""
 
     def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:  # noqa: ARG002
-        """The initial pose itself."""
+        """Return the initial pose."""
         return initial

@@ -15,19 +15,22 @@ class ScanMatchingSettings:
     """How scans are matched.
 
     Attributes:
-        target: ``local-map`` of recent keyframes, or the ``last-scan`` alone.
-        min_range_m, max_range_m: points outside are not used.
-        map_voxel_m: side of the voxels that thin a scan for the map.
-        source_voxel_m: the same for the points that are registered.
-        least_measured: where these stand for fewer measured points, as with a sensor of few beams, voxels are smaller.
-        min_points: with fewer points a scan is bridged by the initial pose.
-        min_matched: with a smaller share of points matched, too.
-        covariance_scale: how much larger the covariance is than independent residuals would make it; points on one
-            surface share its error.
-        drift_share: how much of a step's covariance adds up when the map has taken in a keyframe, once it has many;
-            the rest is scatter about the map. Not used with ``last-scan``, where all of it does.
-        start_speeds_m_s: forward speeds tried where the initial pose is unsure of the translation.
-        start_rates_deg_s: rates of turn tried with each where it is unsure of the rotation too.
+        target: what a scan is matched to: the ``local-map`` of recent keyframes, or the ``last-scan`` alone.
+        min_range_m, max_range_m: points nearer or farther are dropped.
+        map_voxel_m: side of the voxels that a scan is averaged over for the map.
+        source_voxel_m: side of the voxels of which one point each is registered.
+        least_measured: if the points to register are averages over fewer measured points in all, as with a sensor of
+            few beams, smaller voxels are used for them.
+        min_points: a scan with fewer points is bridged by the initial pose.
+        min_matched: a scan with a smaller fraction of points matched is bridged as well.
+        covariance_scale: factor on the covariance of independent residuals, because points on one surface share its
+            error.
+        drift_share: fraction of a step's covariance that adds up over steps when the map, once it is old, gets a
+            keyframe; the rest is scatter about the map. With ``last-scan`` all of it adds up.
+        start_speeds_m_s: forward speeds that are tried if the initial pose does not know the translation.
+        start_rates_deg_s: yaw rates that are tried with each speed if it does not know the rotation either.
+        registration: settings of the registration.
+        local_map: settings of the local map.
 
     Raises:
         SettingError: a value is out of range.
@@ -59,4 +62,4 @@ class ScanMatchingSettings:
             self, "max_range_m", self.max_range_m > self.min_range_m, f"above min_range_m, {self.min_range_m}"
         )
         for name in ("start_speeds_m_s", "start_rates_deg_s"):
-            check_setting(self, name, len(getattr(self, name)) > 0, "one number at least")
+            check_setting(self, name, len(getattr(self, name)) > 0, "a list of one number or more")

@@ -154,7 +154,7 @@ class NetworkResidual:
         return self._answer(after, details)
 
     @property
-    def seen(self) -> _Seen | None:
+    def current_scan(self) -> _Seen | None:
         """The scan last looked at, for :meth:`pair`."""
         return self._last
 

@@ -187,8 +187,11 @@ def test_no_number_may_be_negative_or_none_and_its_path_is_given(path: str, valu
     [
         ({"scan_matching": {"min_range_m": 50.0, "max_range_m": 40.0}}, "scan_matching.max_range_m: must be above min"),
         ({"scan_matching": {"min_matched": 1.1}}, "scan_matching.min_matched: must be between 0 and 1, got 1.1"),
-        ({"scan_matching": {"start_speeds_m_s": []}}, "scan_matching.start_speeds_m_s: must be one number at least"),
-        ({"network": {"start_speeds_m_s": []}}, "network.start_speeds_m_s: must be one number at least"),
+        (
+            {"scan_matching": {"start_speeds_m_s": []}},
+            "scan_matching.start_speeds_m_s: must be a list of one number",
+        ),
+        ({"network": {"start_speeds_m_s": []}}, "network.start_speeds_m_s: must be a list of one number or more"),
         ({"keyframes": {"max_range_m": 1e6}}, "keyframes.max_range_m: must be above 0 and below 164"),
         ({"imu_noise": {"gyro_rad_s_sqrt_hz": float("inf")}}, "imu_noise.gyro_rad_s_sqrt_hz: must be finite"),
         (

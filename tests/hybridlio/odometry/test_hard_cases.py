@@ -22,7 +22,8 @@ from hybridlio.runs.run import Run, run_odometry
 from hybridlio.simulation.faults import block_sector, drop_scans, imu_bias, imu_gap
 from hybridlio.simulation.scenarios import open_scenario
 from hybridlio.sources import scan_matching
-from hybridlio.sources.scan_matching import ScanMatching, SeenScan
+from hybridlio.sources.scan_matching import ScanMatching
+from hybridlio.sources.thinned_scan import ThinnedScan
 
 
 def ran(sequence: Sequence, **names: str) -> Run:
@@ -70,11 +71,11 @@ def test_without_scans_and_samples_the_covariance_says_what_is_not_known(sequenc
     assert (off[10:15] < 4 * np.array(spread[10:15])).all()
 
 
-def seen_by(frame: Frame) -> SeenScan:
+def thinned(frame: Frame) -> ThinnedScan:
     source = ScanMatching()
     source.start(frame)
-    assert source.seen is not None
-    return source.seen
+    assert source.current_scan is not None
+    return source.current_scan
 
 
 def test_between_smooth_walls_the_corners_along_the_ground_turn_no_scan(tmp_path: Path):
@@ -82,8 +83,8 @@ def test_between_smooth_walls_the_corners_along_the_ground_turn_no_scan(tmp_path
     corridor = open_scenario("corridor", tmp_path, seed=1, length_m=16.0)
     assert corridor.reference is not None
     steps = se3.between(corridor.reference.poses[:-1], corridor.reference.poses[1:])
-    seen, turns_rad = [seen_by(frame) for frame in corridor], []
-    for earlier, later, step in zip(seen[:-1], seen[1:], steps, strict=True):
+    scans, turns_rad = [thinned(frame) for frame in corridor], []
+    for earlier, later, step in zip(scans[:-1], scans[1:], steps, strict=True):
         guess = RelativePose(step, 1e-6 * np.eye(6), "truth")
         turns_rad.append(se3.log(se3.between(step, ScanMatching().pair(earlier, later, guess).pose))[0])
     assert abs(np.mean(turns_rad)) < 5e-5

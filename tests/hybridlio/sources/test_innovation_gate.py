@@ -153,7 +153,8 @@ class Slipping(ScanMatching):
         if frame.index not in self._wrong:
             return found
         slipped = se3.exp(np.array([0, 0, 0, self._by_m, 0, 0]))
-        self._path.T_map_lidar = self._path.T_map_lidar @ slipped
+        current = self._state.current
+        self._state = replace(self._state, current=replace(current, T_map_lidar=current.T_map_lidar @ slipped))
         return replace(found, pose=found.pose @ slipped)
 
 

@@ -32,16 +32,16 @@ class Numbered:
     name = "numbered"
 
     def __init__(self) -> None:
-        self.seen: int = 0
+        self.current_scan: int = 0
         self.failed: set[int] = set()
         self.wrong: set[tuple[int, int]] = set()
         self.taken_back: list[int] = []
 
     def start(self, frame: Frame) -> None:
-        self.seen = frame.index
+        self.current_scan = frame.index
 
     def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:
-        self.seen = frame.index
+        self.current_scan = frame.index
         return replace(initial, ok=False) if frame.index in self.failed else RelativePose(STEP, COVARIANCE, self.name)
 
     def pair(self, earlier: int, current: int, initial: RelativePose) -> RelativePose:
@@ -51,7 +51,7 @@ class Numbered:
         return RelativePose(np.linalg.matrix_power(STEP, current - earlier) @ slip, COVARIANCE, self.name)
 
     def take_back(self, initial: RelativePose) -> None:  # noqa: ARG002
-        self.taken_back.append(self.seen)
+        self.taken_back.append(self.current_scan)
 
 
 def frame(k: int) -> Frame:

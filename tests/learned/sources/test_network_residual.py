@@ -210,11 +210,11 @@ def test_any_networks_residual_serves_any_initial_pose(weights, seen, changes):
 def test_scans_several_steps_apart_are_compared_by_their_points_alone(weights, seen):
     scans = [seen(np.linalg.matrix_power(STEP, k), seed=k) for k in range(4)]
     residual = source(weights(imu="feature"), scans, replace(FEW, refine_steps=8))
-    first = residual.seen
+    first = residual.current_scan
     for k in (1, 2, 3):
         residual.refine(frame(k), initial(OFF))
     far = np.linalg.matrix_power(STEP, 3)
-    found = residual.pair(first, residual.seen, RelativePose(far @ se3.exp(OFF), WIDE, source="path"))
+    found = residual.pair(first, residual.current_scan, RelativePose(far @ se3.exp(OFF), WIDE, source="path"))
     assert found.ok
     assert (found.source, found.from_imu) == ("network", False)
     error = se3.log(se3.between(far, found.pose))
@@ -224,9 +224,9 @@ def test_scans_several_steps_apart_are_compared_by_their_points_alone(weights, s
 
 def test_a_pair_of_which_too_little_is_to_be_seen_gives_the_initial_pose_back(weights, seen):
     residual = source(weights(), [seen(np.eye(4)), replace_points(seen(STEP, seed=1), 50)])
-    first = residual.seen
+    first = residual.current_scan
     residual.refine(frame(1), initial(OFF))
-    found = residual.pair(first, residual.seen, initial(OFF))
+    found = residual.pair(first, residual.current_scan, initial(OFF))
     assert not found.ok
     assert np.allclose(found.pose, initial(OFF).pose)
 

@@ -1,0 +1,104 @@
+"""Where scan matching is: its own path through the map, and what is still to happen to the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hybridlio.core import se3
+from hybridlio.core.arrays import Array
+from hybridlio.core.estimates import RelativePose
+
+
+@dataclass(frozen=True, eq=False)
+class PathPoint:
+    """One scan on scan matching's path.
+
+    Attributes:
+        T_map_lidar: ``(4, 4)`` pose of the scan.
+        twist: ``(6,)`` per second, of the step to this scan; None where it is not known.
+        bridged: whether the pose is a prediction, because the scan could not be matched.
+        bridge_covariance: ``(6, 6)`` that the predictions since the last matched scan have added up to.
+        map_changed: whether the map gets a keyframe between the last matched scan and the next one.
+    """
+
+    T_map_lidar: Array
+    twist: Array | None = None
+    bridged: bool = False
+    bridge_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    map_changed: bool = False
+
+    def bridged_by(self, initial: RelativePose) -> PathPoint:
+        """Return the next scan's point if that scan is placed by its initial pose."""
+        covariance = se3.compose_covariance(self.bridge_covariance, initial.pose, initial.covariance)
+        return PathPoint(self.T_map_lidar @ initial.pose, None, True, covariance, self.map_changed)
+
+
+@dataclass(frozen=True, eq=False)
+class MatchingState:
+    """Scan matching's state after a scan. Transitions return a new state.
+
+    Attributes:
+        current: the last scan.
+        previous: the scan before it, to which :meth:`taken_back` returns.
+        doubted: the last scan as it was matched, if that was taken back because the IMU contradicts it; None otherwise.
+            If the IMU is wrong, the next scan is still found from here.
+        keyframe: ``(N, 3)`` points of the last scan, lidar frame, that go into the map before the next scan is matched;
+            None where the scan is no keyframe. They wait because the scan may be taken back.
+        adrift: whether nothing says how far the last scan is from the map. The next keyframe then starts a new map.
+    """
+
+    current: PathPoint
+    previous: PathPoint
+    doubted: PathPoint | None = None
+    keyframe: Array | None = None
+    adrift: bool = False
+
+    @classmethod
+    def started(cls, keyframe: Array) -> MatchingState:
+        """Return the state after the first scan, which is the map's origin and its first keyframe."""
+        origin = PathPoint(np.eye(4), map_changed=True)
+        return cls(origin, origin, keyframe=keyframe)
+
+    def matched(self, T_map_lidar: Array, dt_s: float, is_degenerate: bool, is_vague: bool) -> MatchingState:
+        """Return the state after a scan that was matched.
+
+        Args:
+            T_map_lidar: ``(4, 4)`` the pose found.
+            dt_s: time since the last scan.
+            is_degenerate: whether the scan leaves a direction unconstrained.
+            is_vague: whether the initial pose is too uncertain to fill in for such a direction.
+        """
+        last = self.doubted or (None if self.current.bridged else self.current)
+        twist = None
+        if last is not None and not is_degenerate:
+            twist = se3.log(se3.between(last.T_map_lidar, T_map_lidar)) / dt_s
+        return MatchingState(PathPoint(T_map_lidar, twist), self.current, adrift=is_degenerate and is_vague)
+
+    def bridged(self, initial: RelativePose, first_keyframe: Array | None = None) -> MatchingState:
+        """Return the state after a scan that could not be matched, placed by its initial pose.
+
+        Args:
+            initial: initial relative pose of the step to it.
+            first_keyframe: the scan's points where the map is still empty; None otherwise.
+        """
+        bridge = self.current.bridged_by(initial)
+        return replace(self, current=bridge, previous=self.current, doubted=None, keyframe=first_keyframe)
+
+    def taken_back(self, initial: RelativePose) -> MatchingState:
+        """Return the state after the last scan's match was rejected: placed by its initial pose, and no keyframe."""
+        return replace(self, current=self.previous.bridged_by(initial), doubted=self.current, keyframe=None)
+
+    def keyframe_pending(self, keyframe: Array) -> MatchingState:
+        """Return the state in which the last scan, with these points, goes into the map before the next one."""
+        return replace(self, current=replace(self.current, map_changed=True), keyframe=keyframe)
+
+    def keyframe_inserted(self) -> MatchingState:
+        """Return the state after the pending keyframe has gone into the map."""
+        return replace(self, keyframe=None)
+
+    @property
+    def last_found(self) -> PathPoint:
+        """The last scan where it was matched, even if that was taken back."""
+        return self.doubted or self.current

@@ -1,0 +1,69 @@
+"""A scan as scan matching uses it: points for the map, and fewer of them to register."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from hybridlio.cloud.voxel import voxel_average, voxel_pick
+from hybridlio.core.arrays import Array, Floats, Mask
+from hybridlio.core.sensors import Scan
+from hybridlio.registration.local_map import LocalMap, LocalMapSettings
+from hybridlio.registration.surface import Surface
+from hybridlio.sources.scan_matching_settings import ScanMatchingSettings
+
+_VOXEL_SHRINKAGE = 0.7  # halves a voxel's area, so about doubles its points, at each try to use more of a sparse scan
+# A scan of this many times `least_measured` points is never too sparse: a quarter of them at least is registered with
+# the default voxels, and counting the points in range is saved.
+_AMPLE = 4
+
+
+@dataclass(eq=False)
+class ThinnedScan:
+    """A scan's points in range, thinned.
+
+    Attributes:
+        points: ``(N, 3)`` metres, lidar frame, one a voxel, for the map.
+        source: ``(M, 3)`` some of ``points``, to register.
+        settings: settings of the surface that the scan makes by itself.
+    """
+
+    points: Array
+    source: Array
+    settings: LocalMapSettings
+
+    @cached_property
+    def surface(self) -> Surface | None:
+        """The scan alone as a surface to register others to, in its own frame; None where it makes no planes."""
+        alone = LocalMap(self.settings)
+        alone.insert(self.points, np.eye(4))
+        return alone.surface
+
+
+def thin(scan: Scan, settings: ScanMatchingSettings) -> ThinnedScan:
+    """Average the scan's points over voxels of ``map_voxel_m``, drop those out of range, and pick some to register."""
+    points = voxel_average(scan.points, None, settings.map_voxel_m)[0].astype(np.float64)
+    points = np.asarray(points[_in_range(points, settings)])
+    return ThinnedScan(points, _pick_source(points, scan, settings), settings.local_map)
+
+
+def _pick_source(points: Array, scan: Scan, settings: ScanMatchingSettings) -> Array:
+    """Pick points to register, one a voxel of ``source_voxel_m``; of a sparse sensor, one a smaller voxel.
+
+    Averages over few measured points are noisier, so more of them are needed for the same precision.
+    """
+    side_m, finest_m = settings.source_voxel_m, settings.map_voxel_m / 2
+    picked = voxel_pick(points, side_m)
+    if len(scan) < _AMPLE * settings.least_measured:
+        measured_per_point = np.count_nonzero(_in_range(scan.points, settings)) / max(len(points), 1)
+        while measured_per_point * len(picked) < settings.least_measured and side_m > finest_m:
+            side_m *= _VOXEL_SHRINKAGE
+            picked = voxel_pick(points, side_m)
+    return points.take(picked, axis=0)
+
+
+def _in_range(points: Array | Floats, settings: ScanMatchingSettings) -> Mask:
+    range2 = np.einsum("ij,ij->i", points, points)
+    return np.asarray((range2 > settings.min_range_m**2) & (range2 < settings.max_range_m**2))
