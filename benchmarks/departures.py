@@ -16,7 +16,7 @@ import torch
 from front_end import SIZES, Row, shaken, steps_left
 
 from hybridlio.core import tables
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 from hybridlio.learned.data.pairs import Pairs
 from hybridlio.learned.data.shards import Shard
 from hybridlio.learned.networks.odometry_network import OdometryNetwork, parameter_count
@@ -76,7 +76,7 @@ def main() -> None:
         lines += measured(recipe.name, network.eval(), tests(recipe))
         print(tables.to_markdown(lines[-len(options.test) :], ("preset", "recording")), flush=True)
     text = tables.to_markdown(lines, ("preset", "recording"))
-    write_whole(options.out / "departures.md", text + "\n")
+    write_atomically(options.out / "departures.md", text + "\n")
     print(text)
 
 

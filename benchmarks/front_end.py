@@ -27,7 +27,7 @@ from hybridlio.cloud.preparation import prepare
 from hybridlio.cloud.projection import vertex_map
 from hybridlio.core import se3, tables
 from hybridlio.core.arrays import Array
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.learned.data.pairs import Pairs
@@ -216,7 +216,7 @@ def main() -> None:
         first = (options.simulated + options.real + options.long)[0]
         show("Time for each scan", [row for n in (1, 2) for row in time_rows(network, open_sequence(first), n)])
     if options.out:
-        write_whole(options.out / "front_end.json", json.dumps(told, indent=2) + "\n")
+        write_atomically(options.out / "front_end.json", json.dumps(told, indent=2) + "\n")
 
 
 if __name__ == "__main__":

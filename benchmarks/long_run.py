@@ -34,7 +34,7 @@ import numpy as np
 from hybridlio.commands.terminal import progress
 from hybridlio.core import se3
 from hybridlio.core.estimates import RelativePose
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 from hybridlio.core.packed_arrays import PackedList
 from hybridlio.core.sensors import Calibration, Frame, ImuSamples, Scan
 from hybridlio.datasets.registry import open_sequence
@@ -203,7 +203,7 @@ def main() -> None:
         print(f"{backend}: the last {PART} scans take {ratio:.2f} times the processor time of a run's first, {grew}")
         print(json.dumps(found, indent=2))
     if options.out is not None:
-        write_whole(options.out, json.dumps(results, indent=2) + "\n")
+        write_atomically(options.out, json.dumps(results, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from systems import PEERS, Array, Make, our_systems, peer_systems
 from hybridlio.commands.terminal import progress
 from hybridlio.core import se3, tables
 from hybridlio.core.errors import HybridLioError
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence, part_of
@@ -218,8 +218,8 @@ def main() -> None:
         print(f"\n{parts[-1]}")
     head = ", ".join(f"{key} {value}" for key, value in said.items() if key not in ("packages", "machine"))
     if options.out is not None:
-        write_whole(options.out / "peers.md", "\n".join([head + "\n", *parts]))
-        write_whole(options.out / "peers.json", json.dumps({**said, "recordings": told}, indent=2) + "\n")
+        write_atomically(options.out / "peers.md", "\n".join([head + "\n", *parts]))
+        write_atomically(options.out / "peers.json", json.dumps({**said, "recordings": told}, indent=2) + "\n")
 
 
 if __name__ == "__main__":

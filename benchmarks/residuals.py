@@ -24,7 +24,7 @@ import small_gicp
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose, ResidualSource
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 from hybridlio.core.sensors import ImuNoise
 from hybridlio.datasets.registry import open_sequence, sequence_names
 from hybridlio.datasets.sequence import Sequence, part_of
@@ -145,7 +145,7 @@ def main() -> None:
     for row in rows:
         print(" | ".join(f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()))
     if options.out:
-        write_whole(options.out, json.dumps(rows, indent=2) + "\n")
+        write_atomically(options.out, json.dumps(rows, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from systems import PEERS, our_systems, peer_systems
 
 from hybridlio.commands.terminal import progress
 from hybridlio.core import tables
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.simulation.scenarios import SCENARIOS, open_scenario
 
@@ -124,10 +124,10 @@ def main() -> None:
         text = f"{scenario}: {SCENARIOS[scenario].what}\n\n{tables.to_markdown(words(said), ('system', 'verdict'))}\n"
         print(f"\n{text}", flush=True)
         if options.out is not None:
-            write_whole(options.out / f"{scenario}.md", text)
+            write_atomically(options.out / f"{scenario}.md", text)
     if options.out is not None:
         content = {**circumstances(options), "seeds": seeds, "length_m": options.length_m, "scenarios": found}
-        write_whole(options.out / "scenarios.json", json.dumps(content, indent=2) + "\n")
+        write_atomically(options.out / "scenarios.json", json.dumps(content, indent=2) + "\n")
 
 
 if __name__ == "__main__":

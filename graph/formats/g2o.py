@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 from hybridlio.graph.model import coordinates as co
 
 RowKind: TypeAlias = Literal["vertex", "edge", "prior"]
@@ -129,7 +129,7 @@ def write_g2o(
         matrix = np.asarray(np.linalg.inv(edge.covariance), dtype=np.float64)
         information = format_numbers(information_numbers(matrix, edge_format))
         lines.append(f"EDGE_SE3:QUAT {i} {j} {_format_pose(edge.pose)} {information}")
-    write_whole(path, "\n".join(lines) + "\n")
+    write_atomically(path, "\n".join(lines) + "\n")
 
 
 def _format_pose(pose: Array) -> str:

@@ -10,7 +10,7 @@ from typing import Any, get_args
 import numpy as np
 
 from hybridlio.core.errors import DataError
-from hybridlio.core.files import UNREADABLE_NPZ, write_whole
+from hybridlio.core.files import UNREADABLE_NPZ, write_atomically
 from hybridlio.core.geodesy import check_geodetic
 from hybridlio.core.sensors import ImuSamples
 from hybridlio.graph.model import coordinates as co
@@ -51,7 +51,7 @@ def write_npz(data: GraphData, path: str | os.PathLike[str]) -> None:
             arrays |= {f"{kind}_{name}": column for name, column in _factor_columns(of_kind).items()}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
-    write_whole(path, buffer.getvalue())
+    write_atomically(path, buffer.getvalue())
 
 
 def _edge_columns(data: GraphData, keys: Any) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 from hybridlio.graph.formats.g2o import ROW_FORMATS, format_numbers, information_numbers, pose_numbers
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
@@ -48,7 +48,7 @@ def write_text(data: GraphData, path: str | os.PathLike[str], dialect: Dialect) 
         lines.append(f"PARAMS_SE3OFFSET 0 {format_numbers(co.IDENTITY[3])}")
     for factor in data.factors.values():
         lines += _factor_lines(factor, tags[factor.kind])
-    write_whole(path, "\n".join(lines) + "\n")
+    write_atomically(path, "\n".join(lines) + "\n")
 
 
 def _vertex_lines(data: GraphData, tag: str) -> Iterator[str]:

@@ -165,14 +165,14 @@ def _run_rows(number: int, chosen: list[TableRow], run: RunRow) -> list[Line]:
 
 
 def _finish(folder: Path, number: int, lines: list[Line], budget: str) -> None:
-    from hybridlio.core.files import write_whole
+    from hybridlio.core.files import write_atomically
     from hybridlio.learned.training.comparison import LEGEND, tables, to_json_dict, to_markdown
 
     if not is_first_process():
         return
     text = json.dumps(to_json_dict(number, lines, budget), indent=2, ensure_ascii=False)
-    write_whole(folder / f"table-{number}.json", text + "\n")
-    write_whole(folder / f"table-{number}.md", to_markdown(number, lines, budget))
+    write_atomically(folder / f"table-{number}.json", text + "\n")
+    write_atomically(folder / f"table-{number}.md", to_markdown(number, lines, budget))
     for title, rows in tables(lines).items():
         print_table(_table(f"table {number}, {title}: {budget}", rows, LEGEND))
     print_result(f"wrote {folder / f'table-{number}.md'} and {folder / f'table-{number}.json'}")

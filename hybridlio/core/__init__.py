@@ -1,1 +1,1 @@
-"""The vocabulary of all rooms: errors, arrays, SE(3), sensors, trajectories, protocols of the three seams, files."""
+"""Shared by all rooms: errors, arrays, SE(3), sensors, trajectories, the protocols of the three seams, files."""

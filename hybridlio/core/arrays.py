@@ -1,4 +1,4 @@
-"""Names of the array types that signatures use; shapes stand in docstrings."""
+"""Array types for signatures; docstrings give the shapes."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-Array: TypeAlias = NDArray[np.float64]  # poses, covariances, everything that is estimated
-Floats: TypeAlias = NDArray[np.float32]  # points and maps as sensors and networks have them
+Array: TypeAlias = NDArray[np.float64]  # poses, covariances and everything else that is estimated
+Floats: TypeAlias = NDArray[np.float32]  # points and maps, in the precision of sensors and networks
 Mask: TypeAlias = NDArray[np.bool_]
 Index: TypeAlias = NDArray[np.int64]  # positions in another array
 Stamps: TypeAlias = NDArray[np.int64]  # times in nanoseconds

@@ -1,8 +1,8 @@
-"""The one family of errors: each says what was wrong, where, and what to do."""
+"""The errors that the library raises. Messages say what is wrong, where (file, row, frame index), and what to do."""
 
 
 class HybridLioError(Exception):
-    """Base of every error the library raises on purpose; catch it to catch them all."""
+    """Base class of all errors that the library raises on purpose."""
 
 
 class DataError(HybridLioError):
@@ -10,16 +10,16 @@ class DataError(HybridLioError):
 
 
 class ConfigError(HybridLioError):
-    """A setting is unknown, out of range or contradicts another."""
+    """A setting is unknown, out of range or contradicts another one."""
 
 
 class EstimationError(HybridLioError):
-    """A pose could not be estimated from the input (registration, start-up, alignment)."""
+    """A pose cannot be estimated from the input (registration, start-up, alignment)."""
 
 
 class GraphError(HybridLioError):
-    """A factor graph is malformed or under-constrained; names the keys concerned."""
+    """A factor graph is malformed or under-constrained; the message names the keys."""
 
 
 class MissingDependencyError(HybridLioError):
-    """An optional or system library is absent; names the command that installs it."""
+    """An optional Python package or a system library is missing; the message gives the command that installs it."""

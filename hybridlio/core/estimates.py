@@ -1,7 +1,18 @@
-"""What crosses between the parts: relative poses with covariances, the state, and the three seams' protocols.
+"""What passes between the parts of odometry: relative poses, the state, and the protocols of the three seams.
 
-An initial-pose source and a residual source each answer with a :class:`RelativePose`; the backend takes it and answers
-with a :class:`State`. Nothing else crosses, so any implementation of a seam goes with any other.
+One step goes through three seams, each of which answers one question:
+
+* :class:`InitialPoseSource`: where is this scan relative to the last one, before the scans are compared?
+* :class:`ResidualSource`: how far off was that, by the two scans?
+* :class:`Backend`: what is the state, given all measurements so far?
+
+The two sources answer with a :class:`RelativePose`; the backend takes it and answers with a :class:`State`. Nothing
+else passes between them, so every implementation of one seam works with every implementation of the others. To use an
+implementation of your own, pass an object with the methods of the protocol to :class:`hybridlio.Odometry`; it needs no
+base class.
+
+Frames: ``T_a_b`` maps points of frame b into frame a. Tangent vectors and covariances have rotation first, and belong
+to right perturbations ``T·Exp(ξ)``, as in GTSAM.
 """
 
 from __future__ import annotations
@@ -20,13 +31,16 @@ from hybridlio.core.sensors import Frame
 
 @dataclass(frozen=True, eq=False)
 class EarlierScanPose:
-    """Where a scan is relative to an earlier scan than the last one.
+    """Pose of a scan relative to an earlier scan than the last one.
 
     Attributes:
-        stamp_ns: the earlier scan's.
+        stamp_ns: stamp of the earlier scan j.
         pose: ``T_j_k`` ``(4, 4)``, lidar frames.
-        covariance: ``(6, 6)``, rad² and m², rotation first, of a right perturbation. Beside a step with ``drift`` it is
-            of the pair's own error: the scans' scatter, which all their relative poses share, comes from their steps.
+        covariance: ``(6, 6)``, rad² and m². If the step that it belongs to has ``drift``, this is the error of the pair
+            alone: the scatter of both scans, which all their relative poses share, comes from the steps to them.
+
+    Raises:
+        DataError: the pose is not rigid, or the covariance not positive definite.
     """
 
     stamp_ns: int
@@ -41,20 +55,26 @@ class EarlierScanPose:
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:
-    """Where scan k+1 is relative to scan k, and how sure that is.
+    """Pose of scan k+1 relative to scan k, with its uncertainty: the step between two scans.
+
+    ``RelativePose(pose, covariance, "my-source")`` is all that a source has to return. The other attributes tell the
+    graph how errors of different steps depend on each other.
 
     Attributes:
         pose: ``T_k_k1`` ``(4, 4)``, lidar frames.
-        covariance: ``(6, 6)``, rad² and m², rotation first, of a right perturbation ``T·Exp(ξ)``.
-        source: who says so, such as ``preintegration`` or ``scan-matching``.
-        degenerate: ``(D, 6)`` unit tangent directions that the measurement does not constrain; often empty.
-        ok: False where the source failed and only bridges (the covariance is then wide).
-        drift: ``(6, 6)``, what of the covariance adds up over consecutive steps; the rest is scatter about a map that
-            the next step takes back. None where the steps' errors are independent, so that all of it adds up.
-        from_imu: whether the pose is the inertial data's; a graph that has the IMU itself must not count it twice.
-        proposed: ``(4, 4)``, of an initial pose: where else a residual source may start, if it finds that to be better.
-        earlier_scans: the same scan k+1 relative to earlier scans than k, from a source that looks at several.
-        details: the source's own diagnostics by name (inliers, iterations, error …).
+        covariance: ``(6, 6)``, rad² and m², rotation first, of a right perturbation.
+        source: name of the source, such as ``preintegration`` or ``scan-matching``.
+        degenerate: ``(D, 6)`` unit tangent vectors that the measurement does not constrain; usually none.
+        ok: False if the source failed and the pose only bridges the step; the covariance is then large.
+        drift: ``(6, 6)`` part of the covariance that adds up over consecutive steps. The rest is scatter about a map,
+            which the next step takes back. None if steps have independent errors, so that all of it adds up.
+        from_imu: whether the pose comes from inertial data. A graph that uses the IMU itself must not count it twice.
+        proposed: ``(4, 4)`` in an initial pose, another pose to start at, which a source may use if it fits better.
+        earlier_scans: poses of scan k+1 relative to scans before k, from a source that compares several.
+        details: diagnostics of the source by name, such as inliers and iterations. Records do not keep them.
+
+    Raises:
+        DataError: a pose is not rigid, a covariance is not positive definite, or ``drift`` exceeds ``covariance``.
     """
 
     pose: Array
@@ -75,30 +95,31 @@ class RelativePose:
             object.__setattr__(self, "proposed", se3.check_pose(self.proposed, f"{self.source}: proposed pose"))
         if self.drift is not None:
             object.__setattr__(self, "drift", check_covariance(self.drift, f"{self.source}: drift"))
-            if self.ok:  # else the pose bridges, and its covariance is no part of the path's
+            if self.ok:  # the covariance of a bridge is not the path's, so its drift may exceed it
                 check_covariance(self.covariance - self.drift, f"{self.source}: covariance less drift")
 
     @property
     def translation_sigma_m(self) -> float:
-        """How unsure the translation is, along all axes together."""
+        """Standard deviation of the translation, all axes together."""
         return float(np.sqrt(self.covariance[3:, 3:].trace()))
 
     def wider(self, times: float = 1.0, added: Array | None = None) -> RelativePose:
-        """The same poses, less sure.
+        """Return the same poses with larger covariances.
 
         Args:
-            times: by which every covariance grows.
-            added: ``(6, 6)`` to add to the step's covariance; it does not add up over steps. Added to
-                ``earlier_scans`` as well where they do not share the scatter of the step.
+            times: factor on every covariance.
+            added: ``(6, 6)`` to add to the step's covariance afterwards. It is no drift. It is added to
+                ``earlier_scans`` too, unless their covariances exclude the scatter of the step.
         """
         extra: Array = np.zeros((6, 6)) if added is None else added
-        shared = self.drift is not None
+        has_own_scatter = self.drift is None
         return replace(
             self,
             covariance=times * self.covariance + extra,
             drift=None if self.drift is None else times * self.drift,
             earlier_scans=tuple(
-                replace(k, covariance=times * k.covariance + (0 if shared else extra)) for k in self.earlier_scans
+                replace(earlier, covariance=times * earlier.covariance + (extra if has_own_scatter else 0))
+                for earlier in self.earlier_scans
             ),
         )
 
@@ -108,15 +129,15 @@ class State:
     """The backend's estimate at one scan. World is the IMU's pose at the first scan.
 
     Attributes:
-        stamp_ns: the scan's stamp.
-        T_world_imu: ``(4, 4)``.
-        velocity_m_s: ``(3,)`` of the IMU, in world.
-        accel_bias_m_s2, gyro_bias_rad_s: ``(3,)`` each.
-        gravity_m_s2: ``(3,)`` in world; near (0, 0, -9.81) where the IMU started level.
+        stamp_ns: stamp of the scan.
+        T_world_imu: ``(4, 4)`` pose of the IMU.
+        velocity_m_s: ``(3,)`` velocity of the IMU, in world.
+        accel_bias_m_s2, gyro_bias_rad_s: ``(3,)`` each, in the IMU frame.
+        gravity_m_s2: ``(3,)`` in world; near (0, 0, -9.81) if the IMU was level at the start.
         covariance: ``(15, 15)`` of rotation, position (right perturbation of ``T_world_imu``), velocity, accelerometer
-            bias, gyroscope bias.
+            bias and gyroscope bias, in this order.
         gravity_covariance: ``(3, 3)``, (m/s²)².
-        has_imu: False where no inertial data informs the state; all but the pose is then meaningless.
+        has_imu: False if no inertial data has entered the state; only the pose is then meaningful.
     """
 
     stamp_ns: int
@@ -131,55 +152,104 @@ class State:
 
 
 class InitialPoseSource(Protocol):
-    """Where is this scan relative to the last, before looking at the scans?"""
+    """First seam: predicts each step before its scans are compared.
+
+    Implementations: :mod:`hybridlio.sources.constant_velocity`, :mod:`hybridlio.sources.kalman`, and by names of
+    :data:`hybridlio.odometry.registry.INITIAL_POSE_SOURCES` preintegration and the LSTM.
+
+    Called once a step: ``predict``, then, if a residual source has measured the step, ``correct``.
+
+    Attributes:
+        name: goes into ``RelativePose.source``, tables and files.
+    """
 
     name: str
 
     def predict(self, frame: Frame, state: State) -> RelativePose:
-        """Predict ``T_k_k1``, from the scan that ``state`` is at to ``frame``."""
+        """Return ``T_k_k1``, the motion from scan k, where ``state`` is, to scan k+1 in ``frame``.
+
+        Its covariance matters: it decides how widely the residual source searches. If it comes from inertial data,
+        set ``from_imu``.
+        """
         ...
 
     def correct(self, frame: Frame, estimate: RelativePose) -> None:
-        """Learn what the step to ``frame`` turned out to be."""
+        """Learn from the step to ``frame`` as the backend estimates it; do nothing if there is nothing to learn."""
         ...
 
 
 class ResidualSource(Protocol):
-    """How far off was the initial pose, looking at both scans?"""
+    """Second seam: corrects each initial pose by comparing scans.
+
+    Implementations: :mod:`hybridlio.sources.scan_matching`, :mod:`hybridlio.sources.residual_chain`, and by names of
+    :data:`hybridlio.odometry.registry.RESIDUAL_SOURCES` the network.
+
+    Called once for the first scan: ``start`` (at start-up twice or more, the later calls with a scan that is
+    compensated better); then once a step: ``refine``. Scans come compensated for motion.
+
+    Attributes:
+        name: goes into ``RelativePose.source``, tables and files.
+    """
 
     name: str
 
     def start(self, frame: Frame) -> None:
-        """Take the first scan."""
+        """Take the first scan and forget everything before it.
+
+        Raises:
+            DataError: the scan is unusable. The run then tries to start at the next one.
+        """
         ...
 
     def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:
-        """The refined ``T = δT·T̂`` with its covariance; ``δT`` is ``T @ inverse(T̂)``."""
+        """Return the corrected step ``T = δT·T̂`` with its covariance, where ``T̂`` is the initial pose.
+
+        If the scan cannot be used, return the initial pose with ``ok`` False rather than raise an error.
+        """
         ...
 
 
 @runtime_checkable
 class TakesBack(Protocol):
-    """A residual source that can be told that its last answer was not believed; to be so is each source's choice."""
+    """A residual source that keeps a map or path and can discard its last answer. Implementing it is optional."""
 
     def take_back(self, initial: RelativePose) -> None:
-        """Go on as if the last scan had failed and ``initial`` bridged it."""
+        """Continue as if the last scan had failed and ``initial`` had bridged it.
+
+        Called when the innovation gate rejects the answer, so that a wrong scan does not enter the map.
+        """
         ...
 
 
 class Backend(Protocol):
-    """What does everything together say?"""
+    """Third seam: combines all relative poses and inertial data into the state.
+
+    Implementations: :mod:`hybridlio.sources.dead_reckoning`, and by names of
+    :data:`hybridlio.odometry.registry.BACKENDS` those with a factor graph.
+
+    Called once: ``start`` (again if an IMU starts late, with all steps after it); then once a step: ``update``, then
+    ``last_step``.
+
+    Attributes:
+        name: goes into tables and files.
+    """
 
     name: str
 
     def start(self, state: State) -> None:
-        """Take the first scan's state as prior, with its covariance."""
+        """Take the state at the first scan as prior, with its covariance, and forget everything before it."""
         ...
 
     def update(self, frame: Frame, relative: RelativePose) -> State:
-        """Add the step to ``frame`` and return the state there."""
+        """Add the step to ``frame``, with the frame's inertial samples, and return the state there.
+
+        If ``relative.ok`` is False and there are samples, these bridge the step.
+
+        Raises:
+            GraphError: the estimation failed.
+        """
         ...
 
     def last_step(self) -> RelativePose:
-        """The step to the current scan as the backend now sees it, lidar frames."""
+        """Return the step to the current scan as now estimated, lidar frames."""
         ...

@@ -1,4 +1,4 @@
-"""Files that appear whole: written beside their place under a temporary name, then renamed into it. And YAML, read."""
+"""Atomic writes, folder locks and YAML. A file is written under a temporary name beside its place, then renamed."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from zipfile import BadZipFile
 
 from hybridlio.core.errors import DataError, HybridLioError
 
-# what reading an .npz file that is damaged, or holds something else, can raise
+# raised when an .npz file is damaged or holds something else
 UNREADABLE_NPZ = (
     OSError, ValueError, KeyError, IndexError, TypeError, EOFError, BadZipFile, zlib.error, HybridLioError
 )  # fmt: skip
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder, with those above it, unless it is there.
+    """Make a folder and its parents if they do not exist.
 
     Raises:
-        DataError: it cannot be made.
+        DataError: the folder cannot be made.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise DataError(f"cannot make the folder {path}: {error.strerror}; choose another") from None
+        raise DataError(f"cannot make the folder {path}: {error.strerror}; choose another place") from None
 
 
 @contextlib.contextmanager
@@ -61,14 +61,14 @@ def locked(lock_file: Path, wait: bool = True) -> Iterator[bool]:
 
 
 @contextlib.contextmanager
-def writing_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary path in the same folder that takes ``path``'s place when the block ends well.
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a temporary path in the same folder, and rename it to ``path`` when the block ends without an error.
 
-    The folder is made where it is missing. The temporary name keeps the suffix, as some writers choose a format by it.
-    When the block raises, or is interrupted, what was written is removed and the file at ``path`` stays as it was.
+    The folder is made if it is missing. The temporary name keeps the suffix, because some writers choose the format by
+    it. If the block raises or is interrupted, the temporary file is removed and a file at ``path`` stays unchanged.
 
     Raises:
-        DataError: the place cannot be written to; names ``path`` and the system's reason.
+        DataError: the place cannot be written to.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:12]}{path.suffix}")
@@ -78,36 +78,36 @@ def writing_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.replace(temporary, path)
     except OSError as error:
         if error.filename not in (None, str(temporary), str(path.parent), *map(str, path.parents)):
-            raise  # another file's trouble, met inside the block
+            raise  # concerns another file that the block uses
         raise DataError(
-            f"cannot write {path}: {error.strerror or error}; choose a place with room and rights"
+            f"cannot write {path}: {error.strerror or error}; choose a place with free space and write permission"
         ) from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
 
 
-def write_whole(path: str | os.PathLike[str], data: bytes | str) -> None:
-    """Write ``data`` (text as UTF-8, newlines as given) to ``path``, whole or not at all.
+def write_atomically(path: str | os.PathLike[str], data: bytes | str) -> None:
+    """Write ``data`` (text as UTF-8, newlines unchanged) to ``path`` completely or not at all.
 
     Raises:
         DataError: the place cannot be written to.
     """
-    with writing_whole(path) as temporary:
+    with atomic_path(path) as temporary:
         temporary.write_bytes(data.encode() if isinstance(data, str) else data)
 
 
 def read_yaml(path: str | os.PathLike[str], error: type[HybridLioError] = DataError) -> Any:
-    """The tree of a YAML (or JSON) file; None for an empty one. Nothing in it is executed.
+    """Return the content of a YAML or JSON file, None for an empty one. Tags cannot execute code.
 
     Args:
         path: the file.
-        error: what to raise.
+        error: the error to raise.
 
     Raises:
-        DataError, or what ``error`` says: it cannot be read or is not YAML; names the file and, if known, the line.
+        DataError: or ``error``; the file cannot be read or is not YAML. Names the file and, if known, the line.
     """
-    import yaml  # here, as it is on the way of every import
+    import yaml  # late: this module is imported by most others
 
     try:
         return yaml.safe_load(Path(path).read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Latitude and longitude (WGS 84) to a local east-north-up frame and back, by pymap3d."""
+"""Conversion between geodetic coordinates (WGS 84) and a local east-north-up frame, by pymap3d."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 
 EARTH_RADIUS_M = 6378137.0  # equatorial, WGS 84; KITTI's Mercator projection uses it
+_ORIGIN_ITERATIONS = 5  # each gains a factor of distance over Earth radius: three digits at a few kilometres
 
 
 class GeodeticPoint(NamedTuple):
-    """A place on WGS 84: degrees, and metres above the ellipsoid."""
+    """A position on WGS 84: degrees, and metres above the ellipsoid."""
 
     latitude_deg: float
     longitude_deg: float
@@ -22,7 +23,7 @@ class GeodeticPoint(NamedTuple):
 
 
 def check_geodetic(latitude_deg: float, longitude_deg: float, height_m: float, name: str) -> GeodeticPoint:
-    """The place, as plain numbers.
+    """Return the position as plain floats.
 
     Raises:
         DataError: not finite, a latitude beyond ±90° or a longitude beyond -180° to 360°; the message carries ``name``.
@@ -38,7 +39,7 @@ def check_geodetic(latitude_deg: float, longitude_deg: float, height_m: float, n
 
 
 def enu_from_geodetic(points: ArrayLike, origin: GeodeticPoint) -> Array:
-    """East, north, up ``(N, 3)`` in metres, in the plane at ``origin``, of ``(N, 3)`` degrees, degrees, metres."""
+    """Convert latitude, longitude (degrees) and height (m) ``(N, 3)`` to metres east, north and up of ``origin``."""
     import pymap3d
 
     latitude, longitude, height = np.asarray(points, dtype=np.float64).reshape(-1, 3).T
@@ -46,7 +47,7 @@ def enu_from_geodetic(points: ArrayLike, origin: GeodeticPoint) -> Array:
 
 
 def geodetic_from_enu(positions_m: ArrayLike, origin: GeodeticPoint) -> Array:
-    """Latitude and longitude in degrees and height in metres ``(N, 3)`` of ``(N, 3)`` east, north, up at ``origin``."""
+    """Convert metres east, north and up of ``origin`` ``(N, 3)`` to latitude, longitude (degrees) and height (m)."""
     import pymap3d
 
     east, north, up = np.asarray(positions_m, dtype=np.float64).reshape(-1, 3).T
@@ -54,14 +55,14 @@ def geodetic_from_enu(positions_m: ArrayLike, origin: GeodeticPoint) -> Array:
 
 
 def origin_of(position_m: ArrayLike, point: GeodeticPoint) -> GeodeticPoint:
-    """The origin of the frame in which ``point`` lies at ``position_m`` ``(3,)``.
+    """Return the origin of the east-north-up frame in which ``point`` has the position ``position_m`` ``(3,)``.
 
-    The frame at the point is taken for the one at its origin, and once more with what that gave; over a few kilometres
-    that is exact to a micrometre.
+    Solved by fixed-point iteration, which starts with the origin at the point itself. Over a few kilometres the result
+    is exact to a micrometre.
     """
     position = np.asarray(position_m, dtype=np.float64)
     origin = point
-    for _ in range(5):
+    for _ in range(_ORIGIN_ITERATIONS):
         off = enu_from_geodetic([point], origin)[0] - position
         origin = GeodeticPoint(*geodetic_from_enu([off], origin)[0].tolist())
     return origin

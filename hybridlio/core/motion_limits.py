@@ -15,37 +15,41 @@ from hybridlio.core.arrays import Array
 GRAVITY_M_S2 = 9.81
 GRAVITY_MAGNITUDE_SIGMA_M_S2 = 0.03  # 9.78 at the equator, 9.83 at the poles
 
-ACCELERATION_SIGMA_M_S2 = 2.0  # change of the velocity between two scans
-ANGULAR_ACCELERATION_SIGMA_RAD_S2 = 0.5  # change of the rate between two scans
-JERK_SIGMA_M_S3 = 5.0  # change of the acceleration between two samples
-MEAN_ACCELERATION_SIGMA_M_S2 = 1.5  # acceleration averaged over the first samples, which tilts the measured vertical
-BRIDGED_ACCELERATION_SIGMA_M_S2 = 3.0  # difference of the speed at a step's end from its mean speed, without an IMU
-LARGEST_ACCELERATION_M_S2 = 4.0
-LARGEST_RATE_RAD_S = 0.6
+ACCELERATION_SIGMA_M_S2 = 2.0  # change of velocity between two scans; covers ordinary traffic
+ANGULAR_ACCELERATION_SIGMA_RAD_S2 = 0.5  # change of angular velocity between two scans; 0.05 rad/s in 0.1 s
+JERK_SIGMA_M_S3 = 5.0  # change of acceleration between two samples; builds up full braking in 1.6 s
+MEAN_ACCELERATION_SIGMA_M_S2 = 1.5  # mean over the first samples; tilts the vertical measured from them by 0.15 rad
+BRIDGED_ACCELERATION_SIGMA_M_S2 = 3.0  # speed at a step's end minus its mean speed, per second of step
+LARGEST_ACCELERATION_M_S2 = 4.0  # harder braking is an emergency
+LARGEST_RATE_RAD_S = 0.6  # a right-angle bend in three seconds
 
-UNKNOWN_SPEED_SIGMA_M_S = 20.0  # before anything is measured: 72 km/h
-UNKNOWN_RATE_SIGMA_RAD_S = 0.3
-SWEEP_RATE_SIGMA_RAD_S = 0.02  # a car on its springs, about its mean rate over a step
+UNKNOWN_SPEED_SIGMA_M_S = 20.0  # 72 km/h: one σ covers towns, two a motorway
+UNKNOWN_RATE_SIGMA_RAD_S = 0.3  # half the largest rate
+SWEEP_RATE_SIGMA_RAD_S = 0.02  # pitch and roll of a car on its springs about the mean rate over a step
 
-# Floors of a predicted step's standard deviations (rad, m): no prediction is better, and GTSAM needs them positive.
+# Floors of a predicted step's standard deviations (rad, m). No prediction is better, and GTSAM needs a positive
+# definite covariance even where the time step is tiny.
 PREDICTION_FLOOR_SIGMAS = np.r_[np.full(3, 1e-4), np.full(3, 1e-3)]
-# Floors of a measured step's: no registration of two scans is better.
+# Floors of a measured step's standard deviations (rad, m). No registration of two scans is better: 2 cm of range noise
+# averaged over hundreds of points is 1 mm.
 MEASUREMENT_FLOOR_SIGMAS = np.r_[np.full(3, 5e-5), np.full(3, 1e-3)]
 
-# An initial pose whose translation is less sure than this (all axes together) is treated as unknown.
+# An initial pose whose translation is less certain than this (all axes together) is treated as unknown: it is beyond
+# the width of registration's coarse kernel.
 UNKNOWN_TRANSLATION_SIGMA_M = 0.5
-# One that is less sure than this would place a scan in the map twice.
+# Above this uncertainty, an initial pose alone would show objects of the map twice. Registration's
+# default kernel is as wide.
 VAGUE_TRANSLATION_SIGMA_M = 0.1
 
 
 def unknown_motion_covariance(dt_s: float) -> Array:
-    """Covariance ``(6, 6)`` of a step of ``dt_s`` seconds about which only the kind of vehicle is known."""
+    """Return the covariance ``(6, 6)`` of a step of ``dt_s`` seconds of which nothing is known but the vehicle."""
     sigmas = np.r_[np.full(3, UNKNOWN_RATE_SIGMA_RAD_S), np.full(3, UNKNOWN_SPEED_SIGMA_M_S)] * dt_s
     return np.diag(sigmas**2 + PREDICTION_FLOOR_SIGMAS**2)
 
 
 def changed_motion_covariance(dt_s: float) -> Array:
-    """Covariance ``(6, 6)`` of a step of ``dt_s`` seconds that is predicted from the step before."""
+    """Return the covariance ``(6, 6)`` of a step of ``dt_s`` seconds that is predicted from the step before."""
     rates = np.r_[np.full(3, ANGULAR_ACCELERATION_SIGMA_RAD_S2), np.full(3, ACCELERATION_SIGMA_M_S2)]
     sigmas = rates * dt_s**2
     return np.diag(sigmas**2 + PREDICTION_FLOOR_SIGMAS**2)

@@ -1,4 +1,4 @@
-"""Arrays in less memory, for what is kept of a run and not looked at until its end. Nothing is lost."""
+"""Lossless compression in memory, for data of a run that is not needed before its end."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 _T = TypeVar("_T")
 
-_AT_ONCE = 50
+_TOGETHER = 50  # items compressed at once; more compress hardly better, and reading one unpacks all
 
 
 @dataclass(frozen=True)
 class PackedArray:
-    """Any array of plain values. A covariance takes three fifths: what stands twice in it is kept once."""
+    """A compressed array of numbers. A covariance takes three fifths of its memory, because it is symmetric."""
 
     data: bytes
     dtype: str
@@ -26,29 +26,30 @@ class PackedArray:
 
     @classmethod
     def of(cls, array: NDArray[Any]) -> PackedArray:
-        """The array, packed."""
+        """Compress an array."""
         return cls(zlib.compress(array.tobytes(), 1), array.dtype.str, array.shape)
 
     def array(self) -> NDArray[Any]:
-        """As it was."""
+        """Return the array, bit for bit."""
         return np.frombuffer(zlib.decompress(self.data), self.dtype).reshape(self.shape)
 
 
-def packed(arrays: Mapping[str, NDArray[Any]]) -> dict[str, PackedArray]:
-    """Each of them packed."""
+def pack_arrays(arrays: Mapping[str, NDArray[Any]]) -> dict[str, PackedArray]:
+    """Compress each array."""
     return {name: PackedArray.of(array) for name, array in arrays.items()}
 
 
-def unpacked(arrays: Mapping[str, PackedArray]) -> dict[str, NDArray[Any]]:
-    """As they were."""
+def unpack_arrays(arrays: Mapping[str, PackedArray]) -> dict[str, NDArray[Any]]:
+    """Return the arrays, bit for bit."""
     return {name: array.array() for name, array in arrays.items()}
 
 
 @dataclass(frozen=True)
 class PackedCloud:
-    """Points in whole numbers, sorted by cubic cells of about ``step``: in five ninths of their memory.
+    """Points with integer coordinates, sorted by cubic cells of side ``step``, in five ninths of their memory.
 
-    From one point to the next, cells differ by little. Places within a cell are anyone's guess, but few.
+    Cells of consecutive points are close, so their differences compress well. The positions within a cell are random,
+    but take one byte a coordinate.
     """
 
     cells: bytes
@@ -57,26 +58,25 @@ class PackedCloud:
 
     @classmethod
     def of(cls, cloud: NDArray[np.int16], step: int) -> PackedCloud:
-        """The cloud ``(n, 3)``, packed; ``step`` is at most 256."""
+        """Compress a cloud ``(n, 3)``; ``step`` is at most 256."""
         cells, inside = np.divmod(cloud.T, np.int16(step))
-        ways = np.diff(cells, axis=1, prepend=np.int16(0))
+        differences = np.diff(cells, axis=1, prepend=np.int16(0))
         coder = zlib.compressobj(1, strategy=zlib.Z_HUFFMAN_ONLY)
-        return cls(
-            zlib.compress(ways.tobytes(), 1), coder.compress(inside.astype(np.uint8).tobytes()) + coder.flush(), step
-        )
+        packed_inside = coder.compress(inside.astype(np.uint8).tobytes()) + coder.flush()
+        return cls(zlib.compress(differences.tobytes(), 1), packed_inside, step)
 
     def cloud(self) -> NDArray[np.int16]:
-        """As it was."""
-        ways = np.frombuffer(zlib.decompress(self.cells), np.int16).reshape(3, -1)
+        """Return the cloud, bit for bit."""
+        differences = np.frombuffer(zlib.decompress(self.cells), np.int16).reshape(3, -1)
         inside = np.frombuffer(zlib.decompress(self.inside), np.uint8).reshape(3, -1)
-        cells = np.cumsum(ways, axis=1, dtype=np.int16)
+        cells = np.cumsum(differences, axis=1, dtype=np.int16)
         return np.ascontiguousarray((cells * np.int16(self.step) + inside).T.astype(np.int16))
 
 
 class PackedList(Sequence[_T]):
-    """A list that is added to and seldom read: all but the newest items are packed, in a third of their memory.
+    """A list for appending whose older items are pickled and compressed, in a third of their memory.
 
-    What is read comes back as new objects. Nothing of it goes to files or other processes.
+    Reading an older item returns a new object. The pickles stay in this process, so unpickling them is safe.
     """
 
     def __init__(self) -> None:
@@ -84,18 +84,18 @@ class PackedList(Sequence[_T]):
         self._recent: list[_T] = []
 
     def append(self, item: _T) -> None:
-        """Add one item."""
-        if len(self._recent) >= 2 * _AT_ONCE:  # the newest stay at hand
-            self._packed.append(zlib.compress(pickle.dumps(self._recent[:_AT_ONCE], pickle.HIGHEST_PROTOCOL), 1))
-            del self._recent[:_AT_ONCE]
+        """Append one item."""
+        if len(self._recent) >= 2 * _TOGETHER:  # the newest stay as objects
+            self._packed.append(zlib.compress(pickle.dumps(self._recent[:_TOGETHER], pickle.HIGHEST_PROTOCOL), 1))
+            del self._recent[:_TOGETHER]
         self._recent.append(item)
 
     def __len__(self) -> int:
-        return _AT_ONCE * len(self._packed) + len(self._recent)
+        return _TOGETHER * len(self._packed) + len(self._recent)
 
     def __iter__(self) -> Iterator[_T]:
         for k in range(len(self._packed)):
-            yield from self._part(k)
+            yield from self._unpack(k)
         yield from self._recent
 
     @overload
@@ -106,11 +106,11 @@ class PackedList(Sequence[_T]):
         if isinstance(index, slice):
             return list(self)[index]
         k = range(len(self))[index]
-        part, place = divmod(k, _AT_ONCE)
+        part, place = divmod(k, _TOGETHER)
         if part < len(self._packed):
-            return self._part(part)[place]
-        return self._recent[k - _AT_ONCE * len(self._packed)]
+            return self._unpack(part)[place]
+        return self._recent[k - _TOGETHER * len(self._packed)]
 
-    def _part(self, k: int) -> list[_T]:
-        items: list[_T] = pickle.loads(zlib.decompress(self._packed[k]))  # this process's own
+    def _unpack(self, k: int) -> list[_T]:
+        items: list[_T] = pickle.loads(zlib.decompress(self._packed[k]))  # made by this process
         return items

@@ -16,11 +16,11 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 
 _EYE, _LAST = np.eye(3), [0.0, 0.0, 0.0, 1.0]
-_SMALL_ANGLE_RAD = 1e-4  # below it the closed forms lose digits and the series are exact to 1e-17
+_SMALL_ANGLE_RAD = 1e-4  # below it the closed forms lose digits, while the series' next terms are below 1e-17
 
 
 def hat(v: ArrayLike) -> Array:
-    """Skew matrix ``(..., 3, 3)`` of vectors ``(..., 3)``: ``hat(a) @ b == cross(a, b)``."""
+    """Return the skew matrices ``(..., 3, 3)`` of vectors ``(..., 3)``: ``hat(a) @ b == cross(a, b)``."""
     v = np.asarray(v, dtype=np.float64)
     out = np.zeros((*v.shape[:-1], 3, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
@@ -29,21 +29,21 @@ def hat(v: ArrayLike) -> Array:
 
 
 def so3_exp(rotvec: ArrayLike) -> Array:
-    """Rotation matrices ``(..., 3, 3)`` of rotation vectors ``(..., 3)`` in radians."""
+    """Return the rotation matrices ``(..., 3, 3)`` of rotation vectors ``(..., 3)`` in radians."""
     rotvec = np.asarray(rotvec, dtype=np.float64)
     flat = Rotation.from_rotvec(rotvec.reshape(-1, 3)).as_matrix()
     return np.asarray(flat.reshape(*rotvec.shape[:-1], 3, 3))
 
 
 def so3_log(R: ArrayLike) -> Array:
-    """Rotation vectors ``(..., 3)`` in radians, of length at most π, of rotation matrices ``(..., 3, 3)``."""
+    """Return the rotation vectors ``(..., 3)`` (rad, length at most π) of rotation matrices ``(..., 3, 3)``."""
     R = np.asarray(R, dtype=np.float64)
     flat = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec()
     return np.asarray(flat.reshape(*R.shape[:-2], 3))
 
 
 def so3_left_jacobian(rotvec: ArrayLike) -> Array:
-    """Left Jacobian ``(..., 3, 3)`` of SO(3) at rotation vectors ``(..., 3)`` (Solà et al., eq. 145)."""
+    """Return the left Jacobians ``(..., 3, 3)`` of SO(3) at rotation vectors ``(..., 3)`` (Solà et al., eq. 145)."""
     rotvec = np.asarray(rotvec, dtype=np.float64)
     angle = np.linalg.norm(rotvec, axis=-1)[..., None, None]
     small = angle < _SMALL_ANGLE_RAD
@@ -55,7 +55,7 @@ def so3_left_jacobian(rotvec: ArrayLike) -> Array:
 
 
 def make(R: ArrayLike, t: ArrayLike) -> Array:
-    """Poses ``(..., 4, 4)`` from rotations ``(..., 3, 3)`` and translations ``(..., 3)`` in metres."""
+    """Return poses ``(..., 4, 4)`` with rotations ``(..., 3, 3)`` and translations ``(..., 3)`` in metres."""
     R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
     T = np.zeros((*np.broadcast_shapes(R.shape[:-2], t.shape[:-1]), 4, 4))
     T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
@@ -63,14 +63,14 @@ def make(R: ArrayLike, t: ArrayLike) -> Array:
 
 
 def exp(xi: ArrayLike) -> Array:
-    """Poses ``(..., 4, 4)`` of tangent vectors ``(..., 6)`` (rad, m); inverse of :func:`log`."""
+    """Return the poses ``(..., 4, 4)`` of tangent vectors ``(..., 6)`` (rad, m); inverse of :func:`log`."""
     xi = np.asarray(xi, dtype=np.float64)
     t = (so3_left_jacobian(xi[..., :3]) @ xi[..., 3:, None])[..., 0]
     return make(so3_exp(xi[..., :3]), t)
 
 
 def log(T: ArrayLike) -> Array:
-    """Tangent vectors ``(..., 6)`` (rad, m) of poses ``(..., 4, 4)``; the angle is at most π."""
+    """Return the tangent vectors ``(..., 6)`` (rad, m) of poses ``(..., 4, 4)``; the angle is at most π."""
     T = np.asarray(T, dtype=np.float64)
     rotvec = so3_log(T[..., :3, :3])
     v = np.linalg.solve(so3_left_jacobian(rotvec), T[..., :3, 3, None])[..., 0]
@@ -78,19 +78,19 @@ def log(T: ArrayLike) -> Array:
 
 
 def inverse(T: ArrayLike) -> Array:
-    """Inverse poses: of ``T_a_b``, ``T_b_a``. Shape ``(..., 4, 4)``."""
+    """Return the inverse poses ``T_b_a`` of ``T_a_b``. Shape ``(..., 4, 4)``."""
     T = np.asarray(T, dtype=np.float64)
     R_inv = np.swapaxes(T[..., :3, :3], -1, -2)
     return make(R_inv, -(R_inv @ T[..., :3, 3, None])[..., 0])
 
 
 def between(T_w_a: ArrayLike, T_w_b: ArrayLike) -> Array:
-    """Relative poses ``T_a_b = T_w_a⁻¹ T_w_b``. Shape ``(..., 4, 4)``."""
+    """Return the relative poses ``T_a_b = T_w_a⁻¹ T_w_b``. Shape ``(..., 4, 4)``."""
     return np.asarray(inverse(T_w_a) @ np.asarray(T_w_b, dtype=np.float64))
 
 
 def adjoint(T: ArrayLike) -> Array:
-    """Adjoint ``(..., 6, 6)``, rotation first: ``T·Exp(ξ) == Exp(Ad(T)·ξ)·T`` (Solà et al., eq. 175, reordered)."""
+    """Return the adjoints ``(..., 6, 6)`` with ``T·Exp(ξ) == Exp(Ad(T)·ξ)·T`` (Solà et al., eq. 175, reordered)."""
     T = np.asarray(T, dtype=np.float64)
     R = T[..., :3, :3]
     out = np.zeros((*T.shape[:-2], 6, 6))
@@ -100,20 +100,20 @@ def adjoint(T: ArrayLike) -> Array:
 
 
 def transform(T_a_b: ArrayLike, points_b: ArrayLike) -> Array:
-    """Points ``(..., N, 3)`` of frame b, in frame a, in metres."""
+    """Return points ``(..., N, 3)`` that are given in frame b, in frame a."""
     T, p = np.asarray(T_a_b, dtype=np.float64), np.asarray(points_b)
     return np.asarray(p @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3])
 
 
 def interpolate(T_a: ArrayLike, T_b: ArrayLike, fraction: ArrayLike) -> Array:
-    """Poses ``(..., 4, 4)`` on the geodesic from ``T_a`` (fraction 0) to ``T_b`` (fraction 1)."""
+    """Return the poses ``(..., 4, 4)`` on the geodesic from ``T_a`` (fraction 0) to ``T_b`` (fraction 1)."""
     T_a = np.asarray(T_a, dtype=np.float64)
     step = log(between(T_a, T_b))
     return np.asarray(T_a @ exp(np.asarray(fraction, dtype=np.float64)[..., None] * step))
 
 
 def orthonormalise(T: ArrayLike) -> Array:
-    """Poses with the nearest rotation (Frobenius norm) in place of a rounded one. Shape ``(..., 4, 4)``."""
+    """Return the poses ``(..., 4, 4)`` with their rotations replaced by the nearest ones (Frobenius norm)."""
     T = np.asarray(T, dtype=np.float64)
     U, _, Vt = np.linalg.svd(T[..., :3, :3])
     U = U * np.stack([np.ones_like(d := np.linalg.det(U @ Vt)), np.ones_like(d), d], axis=-1)[..., None, :]
@@ -121,19 +121,19 @@ def orthonormalise(T: ArrayLike) -> Array:
 
 
 def compose_covariance(cov_a: ArrayLike, T_b: ArrayLike, cov_b: ArrayLike) -> Array:
-    """Covariance ``(..., 6, 6)`` of ``A·B`` for independent ``A`` and ``B``, to first order, right perturbations."""
+    """Return the covariance ``(..., 6, 6)`` of ``A·B`` for independent ``A`` and ``B``, to first order."""
     Ad = adjoint(inverse(T_b))
     return np.asarray(Ad @ np.asarray(cov_a) @ np.swapaxes(Ad, -1, -2) + np.asarray(cov_b))
 
 
 def rotate_covariance(cov_b: ArrayLike, T_a_b: ArrayLike) -> Array:
-    """Covariance ``(..., 6, 6)`` of ``T_a_b·X·T_a_b⁻¹``: a relative pose ``X`` seen from another rigid frame."""
+    """Return the covariance ``(..., 6, 6)`` of ``T_a_b·X·T_a_b⁻¹``: the relative pose ``X`` seen from another frame."""
     Ad = adjoint(T_a_b)
     return np.asarray(Ad @ np.asarray(cov_b) @ np.swapaxes(Ad, -1, -2))
 
 
 def check_pose(T: ArrayLike, name: str) -> Array:
-    """The pose as float64 ``(4, 4)``, orthonormalised when it is off by rounding only.
+    """Return the pose as float64 ``(4, 4)``; a rotation that is off by rounding is made orthonormal.
 
     Raises:
         DataError: the shape is not ``(4, 4)``, a value is not finite, or the rotation is off by more than 1e-3.
@@ -142,7 +142,7 @@ def check_pose(T: ArrayLike, name: str) -> Array:
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise DataError(f"{name}: expected a finite (4, 4) pose, got shape {T.shape}")
     if np.abs(T[:3, :3].T @ T[:3, :3] - _EYE).max() < 1e-12 and np.linalg.det(T[:3, :3]) > 0 and T[3].tolist() == _LAST:
-        return T.copy()  # as most are; finding the nearest rotation takes three times as long
+        return T.copy()  # almost always; the singular value decomposition below takes three times as long
     clean = orthonormalise(T)
     if np.abs(clean[:3, :3] - T[:3, :3]).max() > 1e-3 or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-9:
         raise DataError(f"{name}: not a rigid transform (rotation not orthonormal, or last row not 0 0 0 1)")

@@ -1,6 +1,6 @@
-"""What sensors deliver: scans, IMU samples, GPS fixes, and the frame that joins them.
+"""Sensor data: scans, IMU samples and GPS fixes, and the frame that combines those of one step.
 
-Time is int64 nanoseconds. All arrays are checked where they enter, here, and trusted afterwards.
+Time is in int64 nanoseconds. Arrays are checked here, when the objects are made, and not again later.
 """
 
 from __future__ import annotations
@@ -8,17 +8,19 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array, Floats, Stamps
 from hybridlio.core.covariance import check_covariance
 from hybridlio.core.errors import DataError
 from hybridlio.core.geodesy import GeodeticPoint
 from hybridlio.core.setting_checks import check_setting
 
 NS_PER_S = 1_000_000_000
-FARTHEST_M = 1e4  # no lidar sees farther; what is there is broken data
-LONGEST_INTERPOLATION_NS = 250_000_000  # inertial samples farther apart say nothing of what lies between them
+MAX_RANGE_M = 1e4  # several times the range of any lidar; points beyond it are corrupt
+# Longest gap between IMU samples to interpolate over: 2.5 scans at 10 Hz. Between samples farther apart a vehicle's
+# acceleration and rate can be anything.
+LONGEST_INTERPOLATION_NS = 250_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,38 +28,41 @@ class Scan:
     """One lidar sweep in the lidar frame (x forward, y left, z up).
 
     Attributes:
-        stamp_ns: the time the points refer to once compensated.
-        points: ``(N, 3)`` float32, metres; rows that are not finite, or 10 km away or more, are dropped on entry.
-        intensity: ``(N,)`` float32 reflectance 0..1, or None.
-        time_offsets_ns: ``(N,)`` int64, each point's time minus ``stamp_ns``; None where the scan needs no motion
-            compensation (KITTI ships scans already compensated).
+        stamp_ns: the time to which motion compensation moves the points.
+        points: ``(N, 3)`` float32, metres; rows that are not finite, or 10 km away or more, are dropped.
+        intensity: ``(N,)`` float32 reflectance from 0 to 1, or None.
+        time_offsets_ns: ``(N,)`` int64, each point's time minus ``stamp_ns``; None if the scan needs no motion
+            compensation (KITTI's scans are compensated already).
+
+    Raises:
+        DataError: an array has the wrong shape, or times are not integers.
     """
 
     stamp_ns: int
-    points: NDArray[np.float32]
-    intensity: NDArray[np.float32] | None = None
-    time_offsets_ns: NDArray[np.int64] | None = None
+    points: Floats
+    intensity: Floats | None = None
+    time_offsets_ns: Stamps | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.stamp_ns, int | np.integer):
-            raise DataError(f"scan at {self.stamp_ns!r}: its stamp must be a whole number of nanoseconds")
+            raise DataError(f"scan at {self.stamp_ns!r}: stamp_ns must be an integer number of nanoseconds")
         points = np.ascontiguousarray(self.points, dtype=np.float32)
         if points.ndim != 2 or points.shape[1] != 3:
             raise DataError(f"scan at {self.stamp_ns} ns: points must be (N, 3), got {points.shape}")
         columns = {"intensity": (self.intensity, np.float32), "time_offsets_ns": (self.time_offsets_ns, np.int64)}
-        measurable = np.abs(points) < FARTHEST_M  # false for NaN too
-        whole = bool(measurable.all())
-        kept = np.ones(len(points), dtype=bool) if whole else measurable.all(axis=1)
+        valid = np.abs(points) < MAX_RANGE_M  # False for NaN
+        all_valid = bool(valid.all())  # almost always; then no array is copied
+        kept = np.ones(len(points), dtype=bool) if all_valid else valid.all(axis=1)
         for name, (values, dtype) in columns.items():
             if values is None:
                 continue
             if dtype == np.int64 and np.asarray(values).dtype.kind not in "iu":
-                raise DataError(f"scan at {self.stamp_ns} ns: {name} must be whole nanoseconds, not of seconds")
+                raise DataError(f"scan at {self.stamp_ns} ns: {name} must be integer nanoseconds, not float seconds")
             values = np.asarray(values, dtype=dtype)
             if values.shape != points.shape[:1]:
                 raise DataError(f"scan at {self.stamp_ns} ns: {name} must be ({len(points)},), got {values.shape}")
-            object.__setattr__(self, name, values if whole else values[kept])
-        object.__setattr__(self, "points", points if whole else points[kept])
+            object.__setattr__(self, name, values if all_valid else values[kept])
+        object.__setattr__(self, "points", points if all_valid else points[kept])
 
     def __len__(self) -> int:
         return len(self.points)
@@ -65,17 +70,20 @@ class Scan:
 
 @dataclass(frozen=True, eq=False)
 class ImuSamples:
-    """Inertial samples in the IMU frame, strictly increasing in time.
+    """IMU samples in the IMU frame, strictly increasing in time.
 
     Attributes:
         stamps_ns: ``(S,)`` int64.
         gyro_rad_s: ``(S, 3)`` angular velocity.
-        accel_m_s2: ``(S, 3)`` specific force: at rest it reads +9.81 on the axis that points up.
+        accel_m_s2: ``(S, 3)`` specific force; at rest +9.81 on the axis that points up.
+
+    Raises:
+        DataError: the arrays differ in length, a value is not finite, or time does not increase.
     """
 
-    stamps_ns: NDArray[np.int64]
-    gyro_rad_s: NDArray[np.float64]
-    accel_m_s2: NDArray[np.float64]
+    stamps_ns: Stamps
+    gyro_rad_s: Array
+    accel_m_s2: Array
 
     def __post_init__(self) -> None:
         stamps = np.asarray(self.stamps_ns, dtype=np.int64)
@@ -85,7 +93,7 @@ class ImuSamples:
             raise DataError(f"IMU: {len(stamps)} stamps, {len(gyro)} gyro rows, {len(accel)} accelerometer rows")
         bad = ~(np.isfinite(gyro).all(axis=1) & np.isfinite(accel).all(axis=1))
         if bad.any():
-            raise DataError(f"IMU: row {int(bad.argmax())} is not finite; drop or repair it before")
+            raise DataError(f"IMU: row {int(bad.argmax())} is not finite; drop or repair it first")
         backwards = np.diff(stamps) <= 0
         if backwards.any():
             raise DataError(f"IMU: time does not increase at row {int(backwards.argmax()) + 1}; sort and deduplicate")
@@ -98,15 +106,15 @@ class ImuSamples:
 
     @classmethod
     def empty(cls) -> ImuSamples:
-        """No samples at all."""
+        """Return an object without samples."""
         return cls(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)))
 
     def between(self, start_ns: int, end_ns: int) -> ImuSamples:
-        """Samples from ``start_ns`` to ``end_ns``, with linearly interpolated ones at both ends.
+        """Return the samples from ``start_ns`` to ``end_ns``, with linearly interpolated ones at both ends.
 
-        An end outside the recording, or inside a gap of more than :data:`LONGEST_INTERPOLATION_NS`, is left out: the
-        result then starts or stops where the samples do. It is empty where ``end_ns`` lies before ``start_ns``. Takes
-        logarithmic time in the recording's length.
+        No sample is interpolated at an end outside the recording or in a gap of more than
+        :data:`LONGEST_INTERPOLATION_NS`; the result then starts or stops at a recorded sample. It is empty if
+        ``end_ns`` is before ``start_ns``. The search takes logarithmic time in the recording's length.
         """
         if end_ns < start_ns or not len(self):
             return ImuSamples.empty()
@@ -116,15 +124,15 @@ class ImuSamples:
         stamps = np.unique(np.concatenate([self.stamps_ns[first:last], np.array(ends, np.int64)]))
         if not len(stamps):
             return ImuSamples.empty()
-        near = slice(max(first - 1, 0), last + 1)  # with one known sample beyond each end to interpolate from
-        # relative times: nanoseconds since 1970 do not fit a float64's 53 bits
+        near = slice(max(first - 1, 0), last + 1)  # one sample beyond each end, to interpolate from
+        # times relative to the first: nanoseconds since 1970 exceed the 53 bits of a float64
         at, known = (stamps - stamps[0]) / NS_PER_S, (self.stamps_ns[near] - stamps[0]) / NS_PER_S
         columns = np.hstack([self.gyro_rad_s[near], self.accel_m_s2[near]])
         values = np.column_stack([np.interp(at, known, columns[:, i]) for i in range(6)])
         return ImuSamples(stamps, values[:, :3], values[:, 3:])
 
     def _near_samples(self, stamp_ns: int) -> bool:
-        """Whether samples before and after the stamp are near enough to interpolate between."""
+        """Return whether the samples around the stamp are close enough to interpolate between."""
         after = int(np.searchsorted(self.stamps_ns, stamp_ns, side="left"))
         if after == len(self) or (after == 0 and self.stamps_ns[0] != stamp_ns):
             return False
@@ -139,9 +147,9 @@ class ImuSamples:
 class ImuNoise:
     """Continuous-time noise densities of an IMU; the defaults fit an industrial MEMS unit.
 
-    The accelerometer and gyroscope densities are white noise per root hertz, the bias walks random walks, and the two
-    ``*_bias_sigma`` say how far the biases may be from zero at power-up. Those of a simulated IMU may be 0; to estimate
-    with, all must be above.
+    Names follow the units: ``*_sqrt_hz`` of the measurements is white noise, ``*_walk`` the random walk of the biases,
+    and ``*_bias_sigma`` the standard deviation of the biases at power-up. A simulated IMU may have values of 0;
+    odometry needs all above 0.
 
     Raises:
         SettingError: a value is negative or not finite.
@@ -158,49 +166,49 @@ class ImuNoise:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            check_setting(self, name, 0 <= value < np.inf, "finite and 0 or more")
+            check_setting(self, name, 0 <= value < np.inf, "finite and not negative")
 
 
 @dataclass(frozen=True, eq=False)
 class GpsFix:
-    """One GPS position.
+    """One GPS position fix.
 
     Attributes:
         stamp_ns: time of the fix.
-        position_m: ``(3,)`` in a local east-north-up frame, the same for all fixes of a recording.
+        position_m: ``(3,)`` of the antenna in a local east-north-up frame, common to all fixes of a recording.
         covariance_m2: ``(3, 3)``.
-        origin: where on Earth that frame has its origin; None where it is not known.
+        origin: geodetic position of that frame's origin; None if unknown.
 
     Raises:
         DataError: the position is not finite, or the covariance not positive definite.
     """
 
     stamp_ns: int
-    position_m: NDArray[np.float64]
-    covariance_m2: NDArray[np.float64]
+    position_m: Array
+    covariance_m2: Array
     origin: GeodeticPoint | None = None
 
     def __post_init__(self) -> None:
         name = f"GPS fix at {self.stamp_ns} ns"
         position = np.asarray(self.position_m, dtype=np.float64)
         if position.shape != (3,) or not np.isfinite(position).all():
-            raise DataError(f"{name}: expected three finite metres, got {position.tolist()}")
+            raise DataError(f"{name}: expected three finite coordinates, got {position.tolist()}")
         object.__setattr__(self, "position_m", position)
         object.__setattr__(self, "covariance_m2", check_covariance(self.covariance_m2, name, 3))
 
 
 @dataclass(frozen=True)
 class LidarModel:
-    """What a spinning lidar sees.
+    """Beams, ranges and noise of a spinning lidar.
 
     Attributes:
-        name: the preset's name, such as ``hdl-64e``.
+        name: name of the preset, such as ``hdl-64e``.
         elevations_deg: one per beam, from the top.
-        columns: azimuth steps in a turn.
-        min_range_m, max_range_m: outside them there is no return.
+        columns: azimuth steps per revolution.
+        min_range_m, max_range_m: no returns outside this range.
         range_sigma_m: standard deviation of a range.
-        dropout: share of beams that return nothing though they hit.
-        rate_hz: turns a second.
+        dropout: fraction of beams that hit something but return nothing.
+        rate_hz: revolutions per second.
     """
 
     name: str
@@ -219,12 +227,14 @@ class LidarModel:
 
 
 def _hdl_64e_elevations() -> tuple[float, ...]:
-    # Velodyne HDL-64E S2 manual: 32 upper lasers every 1/3° from +2°, 32 lower every 1/2° from -8.83° to -24.33°
+    # Velodyne HDL-64E S2 user's manual: 32 upper lasers every 1/3° from +2°, 32 lower every 1/2° from -8.83° to -24.33°
     upper = np.linspace(2.0, -8.33, 32)
     lower = np.linspace(-8.83, -24.33, 32)
     return tuple(float(e) for e in np.concatenate([upper, lower]))
 
 
+# hdl-64e: KITTI's sensor. 16-beam: the VLP-16's data sheet (±15°, 100 m, 3 cm). 32-beam: the VLP-32C's field of view
+# with evenly spaced beams.
 LIDAR_MODELS: dict[str, LidarModel] = {
     "hdl-64e": LidarModel("hdl-64e", _hdl_64e_elevations(), 1875, 1.5, 120.0, 0.02, 0.03),
     "32-beam": LidarModel("32-beam", tuple(np.linspace(15.0, -25.0, 32).tolist()), 1800, 1.0, 100.0, 0.02, 0.03),
@@ -234,17 +244,20 @@ LIDAR_MODELS: dict[str, LidarModel] = {
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Where the sensors sit.
+    """The extrinsics: where the sensors are mounted.
 
     Attributes:
         T_imu_lidar: ``(4, 4)``; maps lidar points into the IMU (body) frame.
-        T_camera_lidar: ``(4, 4)`` or None; KITTI pose files are in this camera's frame.
-        antenna_imu_m: ``(3,)`` the GPS antenna in the IMU frame; None where it is not known, and taken to be there.
+        T_camera_lidar: ``(4, 4)`` or None; pose files of KITTI odometry are in this camera's frame.
+        antenna_imu_m: ``(3,)`` position of the GPS antenna in the IMU frame; None if unknown, and then taken as zero.
+
+    Raises:
+        DataError: a transform is not rigid, or the antenna's position not finite.
     """
 
-    T_imu_lidar: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
-    T_camera_lidar: NDArray[np.float64] | None = None
-    antenna_imu_m: NDArray[np.float64] | None = None
+    T_imu_lidar: Array = field(default_factory=lambda: np.eye(4))
+    T_camera_lidar: Array | None = None
+    antenna_imu_m: Array | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_imu_lidar", se3.check_pose(self.T_imu_lidar, "T_imu_lidar"))
@@ -259,18 +272,18 @@ class Calibration:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One step's input: a scan, with what the IMU and GPS delivered since the scan before.
+    """Input of one step: a scan, and the data of IMU and GPS since the scan before.
 
     Attributes:
         index: position in the recording, from 0.
         scan: the sweep.
-        imu: samples from the previous scan's stamp to this one's, interpolated at both; for the first frame those
-            before it, possibly none.
+        imu: samples from the previous scan's stamp to this one's, interpolated at both; in the first frame those
+            before its scan, possibly none.
         gps: fixes in that time.
-        sweep_imu: samples during the sweep, for motion compensation; it may end after the scan's stamp. Empty where
-            the scan's points carry no times.
-        calibration: the extrinsics; needed where there are IMU samples.
-        imu_noise: the IMU's noise, where the recording says it.
+        sweep_imu: samples during the sweep, for motion compensation; the sweep may end after the scan's stamp. Empty
+            if the points of the scan carry no times.
+        calibration: the extrinsics; required if there are IMU samples.
+        imu_noise: the IMU's noise densities if the recording states them.
     """
 
     index: int

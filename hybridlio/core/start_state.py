@@ -1,7 +1,8 @@
-"""Start-up: what can be said of tilt, speed and biases before the first step, and how little that is.
+"""The state at the first scan: tilt from the accelerometer, speed and biases unknown.
 
-Nothing is assumed at rest: the specific force averaged over the first samples points up but for the vehicle's own
-acceleration, and the speed is unknown. Both go into the graph as wide priors, which the first relative poses narrow.
+The vehicle need not stand still. The specific force averaged over the first samples points up, apart from the
+vehicle's own acceleration. Wide priors on gravity and speed go into the graph, where the first relative poses narrow
+them.
 """
 
 from __future__ import annotations
@@ -13,37 +14,39 @@ from hybridlio.core.estimates import State
 from hybridlio.core.motion_limits import GRAVITY_M_S2, MEAN_ACCELERATION_SIGMA_M_S2, UNKNOWN_SPEED_SIGMA_M_S
 from hybridlio.core.sensors import ImuNoise, ImuSamples
 
-_LEAST_FORCE_M_S2 = 1e-3  # less than any accelerometer's own error: there is none
+_MIN_FORCE_M_S2 = 1e-3  # below any accelerometer's error: such data are placeholders
+_ORIGIN_SIGMAS = np.full(6, 1e-6)  # the pose defines the origin; GTSAM needs a positive definite prior
 
 
 def start_state(stamp_ns: int, imu: ImuSamples, noise: ImuNoise) -> State:
-    """The first scan's state from the samples around it; without samples, one that has no IMU.
+    """Return the state at the first scan, from the IMU samples around it.
 
     Args:
-        stamp_ns: the first scan's stamp.
-        imu: samples before or just after it, in the IMU frame (which is world's, at this stamp).
-        noise: how far the biases may be from zero.
-
-    Raises:
-        DataError: the specific force is zero, and does not say where down is.
+        stamp_ns: stamp of the first scan.
+        imu: samples before or just after it, in the IMU frame. World is that frame at this stamp.
+        noise: standard deviations of the biases.
 
     Returns:
-        The state, at the origin, with speed and biases zero and gravity opposite to the mean specific force, as unsure
-        every way as the vehicle's own acceleration; that its magnitude is known is for the graph to add.
+        The state at the origin, with velocity and biases zero. Gravity is opposite to the mean specific force, with
+        the uncertainty of the vehicle's own acceleration in every direction; the graph adds that its magnitude is
+        known. Without samples the state has no IMU.
+
+    Raises:
+        DataError: the mean specific force is zero, so that the vertical is undefined.
     """
-    speed = np.full(3, UNKNOWN_SPEED_SIGMA_M_S)
+    velocity = np.full(3, UNKNOWN_SPEED_SIGMA_M_S)
     biases = np.r_[np.full(3, noise.accel_bias_sigma_m_s2), np.full(3, noise.gyro_bias_sigma_rad_s)]
-    covariance = np.diag(np.r_[np.full(6, 1e-6), speed, biases] ** 2)
+    covariance = np.diag(np.r_[_ORIGIN_SIGMAS, velocity, biases] ** 2)
     zero = np.zeros(3)
     if not len(imu):
         down = np.array([0.0, 0.0, -GRAVITY_M_S2])
         return State(stamp_ns, np.eye(4), zero, zero, zero, down, covariance, np.eye(3), has_imu=False)
     mean_force = imu.accel_m_s2.mean(axis=0)
     magnitude = float(np.linalg.norm(mean_force))
-    if magnitude < _LEAST_FORCE_M_S2:
+    if magnitude < _MIN_FORCE_M_S2:
         raise DataError(
             f"the specific force of the first {len(imu)} IMU samples averages to {magnitude:.2g} m/s²; at rest it "
-            "would be 9.81: leave out an IMU that has no accelerometer"
+            "is 9.81. Leave the IMU out if it has no accelerometer"
         )
     gravity = -GRAVITY_M_S2 * mean_force / magnitude
     standard_error = imu.accel_m_s2.std(axis=0).max() / np.sqrt(len(imu))

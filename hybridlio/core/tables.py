@@ -1,4 +1,4 @@
-"""Rows of words under headings, as Markdown and for the terminal."""
+"""Tables of text, as Markdown and for the terminal."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ Row = Mapping[str, str]
 
 
 def number(value: float | None, decimals: int) -> str:
-    """A number with so many decimals; a dash for none."""
+    """Format a number with this many decimals; a dash for None."""
     return NOTHING if value is None else f"{value:.{decimals}f}"
 
 
 def counted(count: int, what: str) -> str:
-    """A number of things in words: ``1 scan``, ``2 scans``."""
+    """Return a count with its noun in singular or plural: ``1 scan``, ``2 scans``."""
     return f"{count} {what}{'s' * (count != 1)}"
 
 
 def headings(rows: Items[Row]) -> list[str]:
-    """The headings of all rows, in the order in which they first come, without those under which nothing is said."""
+    """Return the headings of all rows in order of appearance, without columns of dashes only."""
     names = dict.fromkeys(name for row in rows for name in row)
     return [name for name in names if any(row.get(name, NOTHING) != NOTHING for row in rows)]
 
 
 def to_markdown(rows: Items[Row], words: Container[str] = ()) -> str:
-    """The rows as a Markdown table; columns in ``words`` are flush left, all others, numbers, flush right."""
+    """Format rows as a Markdown table. Columns named in ``words`` are aligned left, the others, numbers, right."""
     names = headings(rows)
     lines = [names, ["---" if name in words else "---:" for name in names]]
     lines += [[row.get(name, NOTHING).replace("|", "\\|").replace("\n", " ") for name in names] for row in rows]
@@ -39,7 +39,7 @@ def to_markdown(rows: Items[Row], words: Container[str] = ()) -> str:
 
 
 def for_terminal(rows: Items[Row], words: Container[str] = (), title: str = "", caption: str = "") -> Table:
-    """The rows as a table for the terminal; the last word of a number's heading stands below the others."""
+    """Format rows as a table for the terminal. A heading of numbers breaks before its last word, the unit."""
     from rich import box
     from rich.table import Table
     from rich.text import Text  # plain text: in markup "[m]" would be a style

@@ -1,14 +1,13 @@
-"""A trajectory: stamped lidar poses with covariances. Its text formats are in `trajectory_files`."""
+"""A trajectory: stamped lidar poses with covariances. :mod:`hybridlio.core.trajectory_files` reads and writes it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridlio.core import se3
-from hybridlio.core.arrays import Array
+from hybridlio.core.arrays import Array, Stamps
 from hybridlio.core.errors import DataError
 
 
@@ -18,11 +17,14 @@ class Trajectory:
 
     Attributes:
         stamps_ns: ``(N,)`` int64, strictly increasing.
-        poses: ``(N, 4, 4)`` ``T_world_lidar``, where world is the first scan's lidar frame unless said otherwise.
-        covariances: ``(N, 6, 6)`` of right perturbations, rad² and m², rotation first, or None where unknown.
+        poses: ``(N, 4, 4)`` ``T_world_lidar``; world is the lidar frame of the first scan unless stated otherwise.
+        covariances: ``(N, 6, 6)`` of right perturbations, rad² and m², rotation first; None if unknown.
+
+    Raises:
+        DataError: a shape is wrong, a pose is not finite, or time does not increase.
     """
 
-    stamps_ns: NDArray[np.int64]
+    stamps_ns: Stamps
     poses: Array
     covariances: Array | None = None
 
@@ -39,12 +41,18 @@ class Trajectory:
         object.__setattr__(self, "stamps_ns", stamps)
         object.__setattr__(self, "poses", se3.orthonormalise(poses))
 
+    def __repr__(self) -> str:
+        if not len(self):
+            return "Trajectory(0 poses)"
+        covariances = "" if self.covariances is None else ", with covariances"
+        return f"Trajectory({len(self)} poses, {self.times_s[-1]:.1f} s, {self.length_m:.1f} m{covariances})"
+
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
     @property
     def times_s(self) -> Array:
-        """``(N,)`` seconds since the first pose."""
+        """Seconds ``(N,)`` since the first pose."""
         return np.asarray((self.stamps_ns - self.stamps_ns[0]) / 1e9)
 
     @property
@@ -53,5 +61,5 @@ class Trajectory:
         return float(np.linalg.norm(np.diff(self.poses[:, :3, 3], axis=0), axis=1).sum())
 
     def from_first(self) -> Trajectory:
-        """The same poses in the frame of the first."""
+        """Return the same poses in the frame of the first one."""
         return Trajectory(self.stamps_ns, se3.between(self.poses[0], self.poses), self.covariances)

@@ -1,7 +1,7 @@
-"""Trajectories as text: TUM's format (stamp, position, quaternion) and KITTI's (the upper three rows of a pose).
+"""Trajectory files: TUM's format (stamp, position, quaternion) and KITTI's (the upper three rows of each pose).
 
-TUM: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. KITTI: the odometry benchmark's pose files.
-Every complaint names the file and its row, counted from 1 as editors do.
+TUM: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. KITTI: pose files of the odometry benchmark.
+Errors name the file and the row, counted from 1.
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from hybridlio.core import se3
-from hybridlio.core.arrays import Array
+from hybridlio.core.arrays import Array, Mask, Stamps
 from hybridlio.core.errors import DataError
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.trajectory import Trajectory
 
 PathLike = str | os.PathLike[str]
 
-KITTI_PERIOD_NS = NS_PER_S // 10
+KITTI_PERIOD_NS = NS_PER_S // 10  # nominal: the HDL-64E turns at 10 Hz
 _COLUMNS = {8: "TUM (stamp x y z qx qy qz qw)", 12: "KITTI (three rows of a pose)"}
-_ROTATION_TOLERANCE = 1e-2  # files of four decimals pass, anything that is no rotation does not
+_ROTATION_TOLERANCE = 1e-2  # passes files with two or more decimals, rejects anything that is no rotation
 
 
 def write_tum(path: PathLike, trajectory: Trajectory) -> None:
@@ -38,75 +38,73 @@ def write_tum(path: PathLike, trajectory: Trajectory) -> None:
     quaternions = Rotation.from_matrix(trajectory.poses[:, :3, :3]).as_quat()
     values = np.hstack([trajectory.poses[:, :3, 3], quaternions])
     stamps = trajectory.stamps_ns.tolist()
-    rows = (f"{_seconds(t)} {' '.join(f'{v:.12f}' for v in row)}\n" for t, row in zip(stamps, values, strict=True))
-    write_whole(path, "# stamp_s x_m y_m z_m qx qy qz qw\n" + "".join(rows))
+    rows = (f"{_format_stamp(t)} {' '.join(f'{v:.12f}' for v in row)}\n" for t, row in zip(stamps, values, strict=True))
+    write_atomically(path, "# stamp_s x_m y_m z_m qx qy qz qw\n" + "".join(rows))
 
 
 def read_tum(path: PathLike) -> Trajectory:
-    """Read a TUM file; its stamps are taken to the nanosecond.
+    """Read a TUM file; stamps keep every nanosecond.
 
     Raises:
-        DataError: unreadable, a row without eight finite numbers, no unit quaternion, or time that does not increase.
+        DataError: unreadable, a row without eight finite numbers, a quaternion not of length 1, or time not increasing.
     """
-    return _tum(Path(path), list(_rows(path)))
+    return _parse_tum(Path(path), list(_rows(path)))
 
 
 def write_kitti(path: PathLike, trajectory: Trajectory, T_camera_lidar: ArrayLike | None = None) -> None:
-    """Write twelve numbers a row, the upper three rows of each pose; KITTI keeps the stamps elsewhere.
+    """Write the upper three rows of each pose, twelve numbers a line. The format has no stamps.
 
     Args:
         path: the file.
         trajectory: lidar poses.
-        T_camera_lidar: ``(4, 4)``; with it the poses written are the camera's, ``T_camera_lidar·T·T_camera_lidar⁻¹``.
+        T_camera_lidar: ``(4, 4)``; if given, camera poses ``T_camera_lidar·T·T_camera_lidar⁻¹`` are written.
 
     Raises:
         DataError: the place cannot be written to.
     """
-    poses = trajectory.poses if T_camera_lidar is None else _seen_from(T_camera_lidar, trajectory.poses)
-    write_whole(path, "".join(" ".join(f"{v:.12f}" for v in row) + "\n" for row in poses[:, :3].reshape(-1, 12)))
+    poses = trajectory.poses if T_camera_lidar is None else _to_frame(T_camera_lidar, trajectory.poses)
+    write_atomically(path, "".join(" ".join(f"{v:.12f}" for v in row) + "\n" for row in poses[:, :3].reshape(-1, 12)))
 
 
-def read_kitti(
-    path: PathLike, stamps_ns: NDArray[np.int64] | None = None, T_camera_lidar: ArrayLike | None = None
-) -> Trajectory:
+def read_kitti(path: PathLike, stamps_ns: Stamps | None = None, T_camera_lidar: ArrayLike | None = None) -> Trajectory:
     """Read a KITTI pose file.
 
     Args:
         path: the file.
-        stamps_ns: ``(N,)``, one a row; without them rows are taken to be 0.1 s apart from 0, KITTI's nominal rate.
-        T_camera_lidar: ``(4, 4)``; with it the file's poses are the camera's and the result is the lidar's.
+        stamps_ns: ``(N,)``, one per row; by default 0, 0.1 s, 0.2 s … at KITTI's nominal rate.
+        T_camera_lidar: ``(4, 4)``; if given, the file holds camera poses, and lidar poses are returned.
 
     Raises:
-        DataError: unreadable, a row without twelve finite numbers, no rotation, or not as many rows as stamps.
+        DataError: unreadable, a row without twelve finite numbers, no rotation, or not one stamp per row.
     """
-    return _kitti(Path(path), list(_rows(path)), stamps_ns, T_camera_lidar)
+    return _parse_kitti(Path(path), list(_rows(path)), stamps_ns, T_camera_lidar)
 
 
 def read_trajectory(
-    path: PathLike, stamps_ns: NDArray[np.int64] | None = None, T_camera_lidar: ArrayLike | None = None
+    path: PathLike, stamps_ns: Stamps | None = None, T_camera_lidar: ArrayLike | None = None
 ) -> Trajectory:
-    """Read a TUM or KITTI file, told apart by the first row's columns; the arguments are :func:`read_kitti`'s.
+    """Read a TUM or a KITTI file, distinguished by the number of columns.
 
-    A TUM file keeps its own stamps and frame.
+    The arguments are those of :func:`read_kitti`. A TUM file keeps its own stamps and frame.
 
     Raises:
-        DataError: what :func:`read_tum` and :func:`read_kitti` raise, or neither format's column count.
+        DataError: as :func:`read_tum` and :func:`read_kitti`, or the first row has neither 8 nor 12 columns.
     """
     rows = list(_rows(path))
     if len(rows[0][1]) == 8:
-        return _tum(Path(path), rows)
+        return _parse_tum(Path(path), rows)
     if len(rows[0][1]) == 12:
-        return _kitti(Path(path), rows, stamps_ns, T_camera_lidar)
+        return _parse_kitti(Path(path), rows, stamps_ns, T_camera_lidar)
     raise DataError(
         f"{path}: row {rows[0][0]} has {len(rows[0][1])} columns; expected one of {', '.join(_COLUMNS.values())}"
     )
 
 
 def read_pair(reference_path: PathLike, estimate_path: PathLike) -> tuple[Trajectory, Trajectory]:
-    """Reference and estimate to compare: where one file has no stamps (KITTI) its rows get the other's.
+    """Read reference and estimate for a comparison. If one file has no stamps (KITTI), it gets those of the other.
 
     Raises:
-        DataError: what :func:`read_trajectory` raises, such as row counts that differ where stamps are lent.
+        DataError: as :func:`read_trajectory`, such as another number of rows than of the stamps taken over.
     """
     reference, estimate = read_trajectory(reference_path), read_trajectory(estimate_path)
     stamped = [is_tum_file(path) for path in (reference_path, estimate_path)]
@@ -118,26 +116,26 @@ def read_pair(reference_path: PathLike, estimate_path: PathLike) -> tuple[Trajec
 
 
 def is_tum_file(path: PathLike) -> bool:
-    """Whether the first row has TUM's eight columns.
+    """Return whether the first row has the eight columns of TUM's format.
 
     Raises:
-        DataError: unreadable, or no row in it.
+        DataError: unreadable or empty.
     """
     return len(next(_rows(path))[1]) == 8
 
 
-def _seconds(stamp_ns: int) -> str:
+def _format_stamp(stamp_ns: int) -> str:
     sign, stamp_ns = "-" * (stamp_ns < 0), abs(stamp_ns)
     return f"{sign}{stamp_ns // NS_PER_S}.{stamp_ns % NS_PER_S:09d}"
 
 
-def _seen_from(T_a_b: ArrayLike, poses_b: Array) -> Array:
+def _to_frame(T_a_b: ArrayLike, poses_b: Array) -> Array:
     T = se3.check_pose(T_a_b, "T_camera_lidar")
     return np.asarray(T @ poses_b @ se3.inverse(T))
 
 
 def _rows(path: PathLike) -> Iterator[tuple[int, list[str]]]:
-    """Row numbers and fields of the lines that are neither empty nor comments; at least one."""
+    """Yield number and fields of each line that is neither empty nor a comment; at least one."""
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError:
@@ -148,12 +146,12 @@ def _rows(path: PathLike) -> Iterator[tuple[int, list[str]]]:
         (n, line.split()) for n, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")
     ]
     if not content:
-        raise DataError(f"{path}: no poses in it")
+        raise DataError(f"{path}: contains no poses")
     yield from content
 
 
-def _numbers(path: Path, rows: list[tuple[int, list[str]]], columns: int) -> Array:
-    """The rows as finite ``(N, columns)`` numbers."""
+def _parse_numbers(path: Path, rows: list[tuple[int, list[str]]], columns: int) -> Array:
+    """Convert the rows to finite numbers ``(N, columns)``."""
     out = np.empty((len(rows), columns))
     for values, (n, fields) in zip(out, rows, strict=True):
         if len(fields) != columns:
@@ -163,46 +161,46 @@ def _numbers(path: Path, rows: list[tuple[int, list[str]]], columns: int) -> Arr
         except ValueError as error:
             raise DataError(f"{path}: row {n}: {error}") from None
         if not np.isfinite(values).all():
-            raise DataError(f"{path}: row {n} holds a value that is not finite; drop or repair the row")
+            raise DataError(f"{path}: row {n} contains a value that is not finite; remove or repair the row")
     return out
 
 
-def _tum(path: Path, rows: list[tuple[int, list[str]]]) -> Trajectory:
-    values = _numbers(path, rows, 8)
+def _parse_tum(path: Path, rows: list[tuple[int, list[str]]]) -> Trajectory:
+    values = _parse_numbers(path, rows, 8)
     norms = np.linalg.norm(values[:, 4:], axis=1)
-    _complain_at(np.abs(norms - 1) > _ROTATION_TOLERANCE, path, rows, "its quaternion (qx qy qz qw) has not length 1")
-    stamps = np.array([_nanoseconds(path, n, fields[0]) for n, fields in rows], np.int64)
+    _raise_at(np.abs(norms - 1) > _ROTATION_TOLERANCE, path, rows, "the length of the quaternion qx qy qz qw is not 1")
+    stamps = np.array([_parse_stamp(path, n, fields[0]) for n, fields in rows], np.int64)
     backwards = np.append(False, np.diff(stamps) <= 0)
-    _complain_at(backwards, path, rows, "its stamp is not after the row before; sort the rows and drop repeated ones")
+    _raise_at(backwards, path, rows, "the stamp is not after the row before; sort the rows and remove duplicates")
     return Trajectory(stamps, se3.make(Rotation.from_quat(values[:, 4:]).as_matrix(), values[:, 1:4]))
 
 
-def _nanoseconds(path: Path, row: int, seconds: str) -> int:
-    # not float: nanoseconds since 1970 do not fit its 53 bits
+def _parse_stamp(path: Path, row: int, seconds: str) -> int:
+    # not via float, whose 53 bits do not hold nanoseconds since 1970
     try:
         ns = int((Decimal(seconds) * NS_PER_S).to_integral_value())
     except InvalidOperation:
-        raise DataError(f"{path}: row {row}: stamp {seconds!r} is no number of seconds") from None
+        raise DataError(f"{path}: row {row}: stamp {seconds!r} is not a number of seconds") from None
     if abs(ns) >= 2**63:
-        raise DataError(f"{path}: row {row}: stamp {seconds} is beyond 292 years; TUM stamps are seconds")
+        raise DataError(f"{path}: row {row}: stamp {seconds} is beyond 292 years; stamps in TUM files are seconds")
     return ns
 
 
-def _kitti(
-    path: Path, rows: list[tuple[int, list[str]]], stamps_ns: NDArray[np.int64] | None, T_camera_lidar: ArrayLike | None
+def _parse_kitti(
+    path: Path, rows: list[tuple[int, list[str]]], stamps_ns: Stamps | None, T_camera_lidar: ArrayLike | None
 ) -> Trajectory:
-    upper = _numbers(path, rows, 12).reshape(-1, 3, 4)
+    upper = _parse_numbers(path, rows, 12).reshape(-1, 3, 4)
     poses = se3.make(upper[:, :, :3], upper[:, :, 3])
     off = np.abs(se3.orthonormalise(poses) - poses).max(axis=(1, 2))
-    _complain_at(off > _ROTATION_TOLERANCE, path, rows, "its first three columns are not a rotation")
+    _raise_at(off > _ROTATION_TOLERANCE, path, rows, "the first three columns of the pose are not a rotation")
     stamps = np.arange(len(rows), dtype=np.int64) * KITTI_PERIOD_NS if stamps_ns is None else stamps_ns
     if len(stamps) != len(rows):
-        raise DataError(f"{path}: {len(rows)} poses, but {len(stamps)} stamps; each pose needs the stamp of its scan")
+        raise DataError(f"{path}: {len(rows)} poses, but {len(stamps)} stamps; there must be one for each pose")
     if T_camera_lidar is not None:
-        poses = _seen_from(se3.inverse(se3.check_pose(T_camera_lidar, "T_camera_lidar")), poses)
+        poses = _to_frame(se3.inverse(se3.check_pose(T_camera_lidar, "T_camera_lidar")), poses)
     return Trajectory(stamps, poses)
 
 
-def _complain_at(bad: NDArray[np.bool_], path: Path, rows: list[tuple[int, list[str]]], what: str) -> None:
+def _raise_at(bad: Mask, path: Path, rows: list[tuple[int, list[str]]], what: str) -> None:
     if bad.any():
         raise DataError(f"{path}: row {rows[int(bad.argmax())][0]}: {what}")

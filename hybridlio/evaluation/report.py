@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 from hybridlio.core.version import __version__
 from hybridlio.evaluation.consistency import Anees
 from hybridlio.evaluation.drift import Drift
@@ -53,7 +53,7 @@ def write_report(
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    write_whole(path, environment.from_string(text).render(_page(data, findings, drawn)))
+    write_atomically(path, environment.from_string(text).render(_page(data, findings, drawn)))
 
 
 def draw(data: ReportData, findings: Findings) -> dict[str, bytes]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hybridlio.cloud.voxel import voxel_average
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
-from hybridlio.core.files import UNREADABLE_NPZ, writing_whole
+from hybridlio.core.files import UNREADABLE_NPZ, atomic_path
 from hybridlio.core.packed_arrays import PackedCloud
 from hybridlio.core.sensors import Scan
 from hybridlio.core.setting_checks import check_positive, check_setting
@@ -106,7 +106,7 @@ class LoopKeyframes:
         """Write the keyframes to one ``.npz`` file of plain arrays."""
         counts = np.array([len(cloud) for cloud in self.clouds], dtype=np.int64)
         points = np.concatenate([np.empty((0, 3), np.int16), *self.clouds])
-        with writing_whole(path) as part, part.open("wb") as file:
+        with atomic_path(path) as part, part.open("wb") as file:
             np.savez_compressed(
                 file, allow_pickle=False, version=np.int64(FORMAT_VERSION), resolution_m=np.float64(RESOLUTION_M),
                 rows=self.rows, stamps_ns=self.stamps_ns, counts=counts, points=points,

@@ -18,7 +18,7 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.estimates import RelativePose, State
-from hybridlio.core.files import UNREADABLE_NPZ, writing_whole
+from hybridlio.core.files import UNREADABLE_NPZ, atomic_path
 from hybridlio.core.geodesy import GeodeticPoint
 from hybridlio.core.sensors import NS_PER_S, Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.core.start_state import start_state
@@ -128,7 +128,7 @@ class Record:
 
     def save(self, path: Path) -> None:
         """Write everything except ``keyframes`` to one ``.npz`` file of plain arrays."""
-        with writing_whole(path) as part, part.open("wb") as file:
+        with atomic_path(path) as part, part.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **_to_arrays(self))
 
     @classmethod

@@ -9,7 +9,7 @@ import numpy as np
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose, State
-from hybridlio.core.packed_arrays import PackedArray, packed, unpacked
+from hybridlio.core.packed_arrays import PackedArray, pack_arrays, unpack_arrays
 from hybridlio.core.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.record.loop_keyframes import LoopKeyframes
@@ -57,7 +57,7 @@ class Recorder:
             imu, gps: samples and fixes since the previous scan.
         """
         if len(self._recent) > _PACKED_TOGETHER:
-            together = packed(_arrays(self._recent[:-1]))
+            together = pack_arrays(_arrays(self._recent[:-1]))
             self._packed, self._recent = [*self._packed, together], self._recent[-1:]
         self._imu.append(imu or ImuSamples.empty())
         self._gps.extend(gps)
@@ -72,7 +72,7 @@ class Recorder:
         scans: int | None = None,
     ) -> Record:
         """Return the record of all scans so far, or of the first ``scans``."""
-        parts = [*map(unpacked, self._packed), *([_arrays(self._recent)] if self._recent else [])]
+        parts = [*map(unpack_arrays, self._packed), *([_arrays(self._recent)] if self._recent else [])]
         steps = [step for arrays in parts for step in _steps(arrays)]
         stamps, poses, covariances = (
             np.concatenate([arrays[f"online_{name}"] for arrays in parts])[:scans]

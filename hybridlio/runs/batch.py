@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from hybridlio.core.errors import ConfigError, DataError, HybridLioError
-from hybridlio.core.files import make_folder, write_whole
+from hybridlio.core.files import make_folder, write_atomically
 from hybridlio.core.progress import Progress
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.registry import check_implementations, check_names
@@ -232,7 +232,7 @@ def run_job(job: Job) -> tuple[Recording, str | None]:
     """
     try:
         job.folder.mkdir(parents=True, exist_ok=True)
-        write_whole(job.folder / JOB, json.dumps(job.description, indent=2) + "\n")
+        write_atomically(job.folder / JOB, json.dumps(job.description, indent=2) + "\n")
         with _logged_to(job.folder / LOG):
             try:
                 _run(job)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hybridlio.core import tables
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 from hybridlio.runs.recordings import Recording
 
 if TYPE_CHECKING:
@@ -115,6 +115,6 @@ def write_batch(batch: Batch) -> None:
         DataError: they cannot be written.
     """
     values = {"summary": batch.summary, "recordings": [row.to_json_dict() for row in batch.rows]}
-    write_whole(batch.out / "batch.json", json.dumps(values, indent=2, ensure_ascii=False) + "\n")
+    write_atomically(batch.out / "batch.json", json.dumps(values, indent=2, ensure_ascii=False) + "\n")
     body = tables.to_markdown([_cells(row) for row in batch.rows], _TEXT_COLUMNS)
-    write_whole(batch.out / "batch.md", f"{batch.summary}\n\n{body}\n")
+    write_atomically(batch.out / "batch.md", f"{batch.summary}\n\n{body}\n")

@@ -15,7 +15,7 @@ import numpy as np
 from hybridlio.core import tables
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 from hybridlio.core.progress import Progress
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.evaluation.evaluate import Evaluation, associate, associated_step_errors, evaluate
@@ -250,5 +250,5 @@ def write_comparison(folder: Path, comparison: Comparison) -> None:
     """
     values = vars(comparison) | {"rows": [row.to_json_dict() for row in comparison.rows]}
     values["stopped"] = comparison.stopped is not None
-    write_whole(folder / "compare.json", json.dumps(values, indent=2, ensure_ascii=False) + "\n")
-    write_whole(folder / "compare.md", to_markdown(comparison))
+    write_atomically(folder / "compare.json", json.dumps(values, indent=2, ensure_ascii=False) + "\n")
+    write_atomically(folder / "compare.md", to_markdown(comparison))

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.estimates import RelativePose
-from hybridlio.core.files import UNREADABLE_NPZ, write_whole, writing_whole
+from hybridlio.core.files import UNREADABLE_NPZ, atomic_path, write_atomically
 from hybridlio.core.motion_limits import unknown_motion_covariance
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.trajectory import Trajectory
@@ -165,7 +165,7 @@ def write_trajectory(
     arrays: dict[str, Any] = {"stamps_ns": whole.stamps_ns, "absolute": whole.covariances, "estimated": estimated}
     if steps is not None:
         arrays |= {"relative_poses": steps.poses, "relative": steps.covariances}
-    with writing_whole(folder / COVARIANCES) as part, part.open("wb") as file:
+    with atomic_path(folder / COVARIANCES) as part, part.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
@@ -190,7 +190,7 @@ def write_graph(
 
 def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
     """Write ``metrics.json``, which marks the folder as complete."""
-    write_whole(folder / METRICS, json.dumps(metrics, indent=2, ensure_ascii=False) + "\n")
+    write_atomically(folder / METRICS, json.dumps(metrics, indent=2, ensure_ascii=False) + "\n")
 
 
 def is_run_folder(path: Path) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.errors import EstimationError
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.tables import counted
 from hybridlio.core.trajectory_files import write_tum
@@ -56,7 +56,7 @@ def write_run(folder: Path, run: Run, config: Config) -> Findings:
     if sequence.reference is not None:
         write_tum(folder / run_folder.REFERENCE, sequence.reference)
     text = config_to_yaml(config)
-    write_whole(folder / run_folder.CONFIG, text)
+    write_atomically(folder / run_folder.CONFIG, text)
     data = report_data(run, config, text)
     findings = analyse(data)
     write_pages(folder, data, findings)
@@ -68,7 +68,7 @@ def write_pages(folder: Path, data: ReportData, findings: Findings) -> None:
     """Write ``report.html``, and the plot of the trajectory as ``trajectory.png``."""
     drawn = draw(data, findings)
     write_report(folder / run_folder.REPORT, data, findings, drawn)
-    write_whole(folder / run_folder.PICTURE, drawn["trajectory"])
+    write_atomically(folder / run_folder.PICTURE, drawn["trajectory"])
 
 
 def T_pose_files(run: Run) -> Any:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 from hybridlio.core.geodesy import EARTH_RADIUS_M, GeodeticPoint
 from hybridlio.core.sensors import Scan
 from hybridlio.simulation.drive.path import Motion
@@ -60,11 +60,11 @@ def stamps_text(stamps_ns: NDArray[np.int64]) -> str:
 
 def write_calibration(date: Path) -> None:
     """``calib_imu_to_velo.txt``, ``calib_velo_to_cam.txt`` and ``calib_cam_to_cam.txt`` of the simulated car."""
-    write_whole(date / "calib_imu_to_velo.txt", _rigid_text(T_LIDAR_IMU))
-    write_whole(date / "calib_velo_to_cam.txt", _rigid_text(T_CAMERA_LIDAR))
+    write_atomically(date / "calib_imu_to_velo.txt", _rigid_text(T_LIDAR_IMU))
+    write_atomically(date / "calib_velo_to_cam.txt", _rigid_text(T_CAMERA_LIDAR))
     rows = {"R_rect_00": np.eye(3), "P_rect_00": np.array([[720.0, 0, 610, 0], [0, 720, 173, 0], [0, 0, 1, 0]])}
     text = "".join(f"{name}: {' '.join(f'{v:.12e}' for v in value.ravel())}\n" for name, value in rows.items())
-    write_whole(date / "calib_cam_to_cam.txt", "calib_time: 01-Jan-2026 12:00:00\n" + text)
+    write_atomically(date / "calib_cam_to_cam.txt", "calib_time: 01-Jan-2026 12:00:00\n" + text)
 
 
 def _rigid_text(T: Array) -> str:
@@ -102,7 +102,7 @@ def write_oxts(folder: Path, stamps_ns: NDArray[np.int64], rows: Array) -> None:
     for k, row in enumerate(rows):
         measured, status = (f"{v:.13g}" for v in row[:25]), (str(round(v)) for v in row[25:])
         (data / f"{k:010d}.txt").write_text(" ".join([*measured, *status]) + "\n")
-    write_whole(folder / "timestamps.txt", stamps_text(stamps_ns))
+    write_atomically(folder / "timestamps.txt", stamps_text(stamps_ns))
 
 
 def write_scan(velodyne: Path, index: int, scan: Scan) -> None:
@@ -113,10 +113,10 @@ def write_scan(velodyne: Path, index: int, scan: Scan) -> None:
     if scan.time_offsets_ns is not None:
         buffer = io.BytesIO()
         np.save(buffer, scan.time_offsets_ns)
-        write_whole(velodyne / "offsets" / f"{index:010d}.npy", buffer.getvalue())
+        write_atomically(velodyne / "offsets" / f"{index:010d}.npy", buffer.getvalue())
     intensity = np.zeros(len(scan), np.float32) if scan.intensity is None else scan.intensity
     rows = np.column_stack([scan.points, intensity]).astype("<f4")
-    write_whole(velodyne / "data" / f"{index:010d}.bin", rows.tobytes())
+    write_atomically(velodyne / "data" / f"{index:010d}.bin", rows.tobytes())
 
 
 def pose_rows(poses: Array) -> str:

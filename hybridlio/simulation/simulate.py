@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.core.errors import DataError
-from hybridlio.core.files import locked, write_whole
+from hybridlio.core.files import locked, write_atomically
 from hybridlio.core.geodesy import origin_of
 from hybridlio.core.progress import Progress
 from hybridlio.core.sensors import NS_PER_S, LidarModel, Scan
@@ -70,7 +70,7 @@ def simulate(out: Path, config: SimulationConfig, progress: Progress | None = No
         if not done.sync.exists():  # another process may have made it meanwhile
             _write_measurements(partial, drive, config)
             _write_scans(partial, drive, config, progress)
-            write_whole(partial.sync / "simulation.json", json.dumps(description, indent=2) + "\n")
+            write_atomically(partial.sync / "simulation.json", json.dumps(description, indent=2) + "\n")
             _move(partial, done)
         shutil.rmtree(partial.root, ignore_errors=True)
     return done.sync
@@ -134,14 +134,14 @@ def _write_measurements(folders: DriveFolders, drive: Drive, config: SimulationC
     write_oxts(folders.sync / "oxts", scan_stamps, rows[lead : len(rows) - lead : per_scan])
     half_turn = round(NS_PER_S / config.lidar_model.rate_hz / 2) if config.motion_distortion else 0
     for name, shift in (("timestamps", 0), ("timestamps_start", -half_turn), ("timestamps_end", half_turn)):
-        write_whole(folders.velodyne / f"{name}.txt", stamps_text(scan_stamps + shift))
-    write_whole(folders.sync / "poses.txt", pose_rows(drive.path.poses(drive.scan_times_s) @ T_IMU_LIDAR))
+        write_atomically(folders.velodyne / f"{name}.txt", stamps_text(scan_stamps + shift))
+    write_atomically(folders.sync / "poses.txt", pose_rows(drive.path.poses(drive.scan_times_s) @ T_IMU_LIDAR))
     if config.gps:
         fix_times = np.arange(0.0, drive.scan_times_s[-1] + 1e-9, 1.0 / config.gps_rate_hz)
         noise = np.random.default_rng([config.seed, 8])
         place = origin_of(origin, FIRST_PLACE)
         fixes = gps_fixes(drive.path, fix_times, START_NS, config.gps_sigma_m, noise, place)
-        write_whole(folders.sync / "gps.csv", gps_csv(fixes))
+        write_atomically(folders.sync / "gps.csv", gps_csv(fixes))
 
 
 def _write_scans(folders: DriveFolders, drive: Drive, config: SimulationConfig, progress: Progress | None) -> None:

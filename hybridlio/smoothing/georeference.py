@@ -14,7 +14,7 @@ import numpy as np
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 from hybridlio.core.geodesy import GeodeticPoint, geodetic_from_enu
 from hybridlio.core.pose_interpolation import PosePath
 from hybridlio.core.sensors import NS_PER_S
@@ -117,8 +117,8 @@ def write_georeferenced(folder: Path, placed: Georeferenced) -> list[Path]:
     if placed.origin is None:
         return [folder / POSES_ENU]
     geodetic = placed.geodetic
-    write_whole(folder / TABLE, _table(placed.trajectory, geodetic))
-    write_whole(folder / MAP, _geojson(placed, geodetic))
+    write_atomically(folder / TABLE, _table(placed.trajectory, geodetic))
+    write_atomically(folder / MAP, _geojson(placed, geodetic))
     return [folder / name for name in (POSES_ENU, TABLE, MAP)]
 
 

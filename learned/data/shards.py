@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from hybridlio.cloud.projection import MapGeometry
 from hybridlio.core.errors import ConfigError, DataError
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 
 FORMAT = 1
 _STEP_M = 0.004
@@ -96,7 +96,7 @@ def write_shard(
     try:
         count = _write_arrays(temporary, scans, geometry, imu_samples)
         info = ShardInfo(name, count, geometry, imu_samples, made_by)
-        write_whole(temporary / "shard.json", json.dumps(asdict(info), indent=2) + "\n")
+        write_atomically(temporary / "shard.json", json.dumps(asdict(info), indent=2) + "\n")
         if folder.exists():
             shutil.rmtree(folder)
         os.replace(temporary, folder)

@@ -15,7 +15,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from hybridlio.core.errors import ConfigError, DataError
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 from hybridlio.core.version import __version__
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
 from hybridlio.learned.settings import NetworkSettings, Recipe, from_dict, to_dict
@@ -111,7 +111,7 @@ def save_weights(
         **about,
     }
     tensors = {name: tensor.cpu().contiguous() for name, tensor in own_tensors(network).items()}
-    write_whole(path, save(tensors, metadata))
+    write_atomically(path, save(tensors, metadata))
 
 
 def weights_path(name: str | os.PathLike[str]) -> Path:

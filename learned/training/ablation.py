@@ -12,7 +12,7 @@ from pathlib import Path
 
 from hybridlio.cloud.projection import MapGeometry
 from hybridlio.core.errors import ConfigError
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 from hybridlio.learned.data.pairs import Pairs
 from hybridlio.learned.data.shards import Shard
 from hybridlio.learned.settings import Recipe, from_dict, to_dict
@@ -118,7 +118,7 @@ def _row(
     drifts = [{s.info.name: drive(network, s).drift for s in part} for part in (shards.train, shards.test)]
     seen = sum(min(recipe.optimiser.batch, len(pairs) - k % an_epoch * recipe.optimiser.batch) for k in range(steps))
     result = RowResult(recipe.name, steps, seen, round(seconds, 1), *drifts)
-    write_whole(folder / RESULT, json.dumps({**asdict(result), "recipe": to_dict(recipe)}, indent=2) + "\n")
+    write_atomically(folder / RESULT, json.dumps({**asdict(result), "recipe": to_dict(recipe)}, indent=2) + "\n")
     return result
 
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from hybridlio.core.errors import ConfigError, DataError
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 from hybridlio.learned.settings import Recipe, from_dict, to_dict
 
 FORMAT = 1
@@ -71,7 +71,7 @@ def save(path: str | os.PathLike[str], checkpoint: Checkpoint) -> None:
         "random": checkpoint.random,
     }
     torch.save(values, buffer)
-    write_whole(path, buffer.getvalue())
+    write_atomically(path, buffer.getvalue())
 
 
 def load(path: str | os.PathLike[str]) -> Checkpoint:

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from hybridlio.core.errors import ConfigError, EstimationError
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 from hybridlio.learned.data.pairs import PairBatch, Pairs
 from hybridlio.learned.losses.loss import LossValue
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
@@ -177,7 +177,7 @@ class _Run:
         if self.place.leads:
             self.log = TrainingLog(self.out, self.step)
             self.best.forget_after(self.step)
-            write_whole(self.out / "recipe.json", json.dumps(to_dict(self.recipe), indent=2) + "\n")
+            write_atomically(self.out / "recipe.json", json.dumps(to_dict(self.recipe), indent=2) + "\n")
         self.objective = self.place.joined(Objective(self.network, self.recipe.loss))
 
     def train(self, validation: Pairs | None) -> None:

@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 
 
 class TrainingLog:
@@ -25,7 +25,7 @@ class TrainingLog:
     def __init__(self, folder: str | os.PathLike[str], step: int) -> None:
         self.path = Path(folder) / "log.jsonl"
         rows = read_log(self.path) if self.path.is_file() else []
-        write_whole(self.path, "".join(json.dumps(row) + "\n" for row in rows if row["step"] <= step))
+        write_atomically(self.path, "".join(json.dumps(row) + "\n" for row in rows if row["step"] <= step))
         self._board = _tensorboard(Path(folder) / "tensorboard", step)
 
     def write(self, step: int, **values: float | None) -> None:

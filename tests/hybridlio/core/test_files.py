@@ -5,19 +5,19 @@ import numpy as np
 import pytest
 
 from hybridlio.core.errors import ConfigError, DataError
-from hybridlio.core.files import read_yaml, write_whole, writing_whole
+from hybridlio.core.files import atomic_path, read_yaml, write_atomically
 
 
 def test_text_and_bytes_are_written_as_given_and_folders_are_made(tmp_path: Path) -> None:
-    write_whole(tmp_path / "a" / "b" / "text.txt", "σ\r\n1\n")
-    write_whole(tmp_path / "raw.bin", b"\x00\xff")
+    write_atomically(tmp_path / "a" / "b" / "text.txt", "σ\r\n1\n")
+    write_atomically(tmp_path / "raw.bin", b"\x00\xff")
     assert (tmp_path / "a" / "b" / "text.txt").read_bytes() == "σ\r\n1\n".encode()
     assert (tmp_path / "raw.bin").read_bytes() == b"\x00\xff"
 
 
 def test_nothing_but_the_file_is_left_in_the_folder(tmp_path: Path) -> None:
-    write_whole(tmp_path / "a.txt", "1")
-    write_whole(tmp_path / "a.txt", "2")
+    write_atomically(tmp_path / "a.txt", "1")
+    write_atomically(tmp_path / "a.txt", "2")
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
     assert (tmp_path / "a.txt").read_text() == "2"
 
@@ -27,10 +27,10 @@ def test_a_failed_or_interrupted_write_keeps_the_old_file_and_leaves_no_rest(
     tmp_path: Path, error: type[BaseException]
 ) -> None:
     path = tmp_path / "a.txt"
-    write_whole(path, "old")
+    write_atomically(path, "old")
 
     def write_half() -> None:
-        with writing_whole(path) as temporary:
+        with atomic_path(path) as temporary:
             temporary.write_text("half")
             raise error
 
@@ -41,7 +41,7 @@ def test_a_failed_or_interrupted_write_keeps_the_old_file_and_leaves_no_rest(
 
 
 def test_the_temporary_name_keeps_folder_and_suffix_so_that_savez_writes_where_asked(tmp_path: Path) -> None:
-    with writing_whole(tmp_path / "a.npz") as temporary:
+    with atomic_path(tmp_path / "a.npz") as temporary:
         assert (temporary.parent, temporary.suffix) == (tmp_path, ".npz")
         np.savez(temporary, x=np.arange(3))
         assert not (tmp_path / "a.npz").exists()
@@ -50,21 +50,21 @@ def test_the_temporary_name_keeps_folder_and_suffix_so_that_savez_writes_where_a
 
 def test_the_file_has_the_rights_that_a_plain_write_gives(tmp_path: Path) -> None:
     (tmp_path / "plain").write_text("")
-    write_whole(tmp_path / "whole", "")
+    write_atomically(tmp_path / "whole", "")
     assert stat.S_IMODE((tmp_path / "whole").stat().st_mode) == stat.S_IMODE((tmp_path / "plain").stat().st_mode)
 
 
 def test_a_place_that_cannot_be_written_is_named_with_the_reason(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match=r"file/a\.txt.*(Not a directory|exists)"):
-        write_whole(tmp_path / "file" / "a.txt", "1")
+        write_atomically(tmp_path / "file" / "a.txt", "1")
     (tmp_path / "folder" / "x").mkdir(parents=True)
     with pytest.raises(DataError, match="folder"):
-        write_whole(tmp_path / "folder", "1")
+        write_atomically(tmp_path / "folder", "1")
 
 
 def test_trouble_with_another_file_inside_the_block_keeps_its_own_error(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="elsewhere"), writing_whole(tmp_path / "a.txt"):
+    with pytest.raises(FileNotFoundError, match="elsewhere"), atomic_path(tmp_path / "a.txt"):
         (tmp_path / "elsewhere").read_text()
 
 

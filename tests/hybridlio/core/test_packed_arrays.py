@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from hybridlio.core.packed_arrays import PackedArray, PackedCloud, PackedList, packed, unpacked
+from hybridlio.core.packed_arrays import PackedArray, PackedCloud, PackedList, pack_arrays, unpack_arrays
 from hybridlio.record.loop_keyframes import LoopKeyframeSettings, compress
 
 
@@ -18,7 +18,7 @@ from hybridlio.record.loop_keyframes import LoopKeyframeSettings, compress
     ids=lambda array: f"{array.dtype.kind}{array.shape}",
 )
 def test_an_array_comes_back_as_it_was(array: np.ndarray):
-    back = unpacked(packed({"a": array}))["a"]
+    back = unpack_arrays(pack_arrays({"a": array}))["a"]
     assert back.dtype == array.dtype
     np.testing.assert_array_equal(back, array)
 

@@ -139,8 +139,8 @@ def test_calibration_takes_rounded_extrinsics_and_refuses_what_is_not_rigid() ->
 @pytest.mark.parametrize(
     ("position", "covariance", "says"),
     [
-        ([0.0, np.nan, 0.0], np.eye(3), "three finite metres"),
-        ([0.0, 0.0], np.eye(3), "three finite metres"),
+        ([0.0, np.nan, 0.0], np.eye(3), "three finite coordinates"),
+        ([0.0, 0.0], np.eye(3), "three finite coordinates"),
         ([0.0, 0.0, 0.0], np.eye(2), "covariance"),
         ([0.0, 0.0, 0.0], np.diag([1.0, 1.0, 0.0]), "covariance"),
         ([0.0, 0.0, 0.0], np.full((3, 3), np.inf), "covariance"),
@@ -161,7 +161,11 @@ def test_beams_of_each_lidar_go_from_the_top_down(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("stamp", "offsets", "says"),
-    [(1.5, None, "whole number of nanoseconds"), ("1", None, "whole number"), (1, [0.0, 0.05], "whole nanoseconds")],
+    [
+        (1.5, None, "integer number of nano"),
+        ("1", None, "integer number"),
+        (1, [0.0, 0.05], "integer nanoseconds"),
+    ],
 )
 def test_times_in_seconds_are_refused_where_nanoseconds_are_meant(stamp, offsets, says) -> None:
     with pytest.raises(DataError, match=says):

@@ -10,7 +10,7 @@ from hybridlio.core import se3
 from hybridlio.core.errors import DataError
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.core.trajectory_files import (
-    _seconds,
+    _format_stamp,
     read_kitti,
     read_pair,
     read_trajectory,
@@ -39,7 +39,7 @@ def test_tum_files_give_stamps_back_exactly_and_poses_to_a_nanometre(tmp_path: P
 
 @given(st.integers(-(2**62), 2**62))
 def test_a_stamp_survives_its_text_whatever_its_size(stamp_ns: int) -> None:
-    seconds, decimals = _seconds(stamp_ns).split(".")
+    seconds, decimals = _format_stamp(stamp_ns).split(".")
     assert len(decimals) == 9
     assert int(seconds + decimals) == stamp_ns
 
@@ -106,17 +106,17 @@ GOOD_KITTI = "1 0 0 0 0 1 0 0 0 0 1 0\n"
     ("text", "complaint"),
     [
         (GOOD_TUM + "0.2 0 0 0 0 0 1\n", "row 2 has 7 columns"),
-        ("# note\n\n" + GOOD_TUM + "0.2 0 0 nan 0 0 0 1\n", "row 4 holds a value that is not finite"),
+        ("# note\n\n" + GOOD_TUM + "0.2 0 0 nan 0 0 0 1\n", "row 4 contains a value that is not finite"),
         (GOOD_TUM + "0.2 0 0 zero 0 0 0 1\n", "row 2: could not convert .*zero"),
-        (GOOD_TUM + "0.1 0 0 0 0 0 0 1\n", "row 2: its stamp is not after"),
-        (GOOD_TUM + "0.2 0 0 0 0 0 0 0.9\n", "row 2: its quaternion"),
+        (GOOD_TUM + "0.1 0 0 0 0 0 0 1\n", "row 2: the stamp is not after"),
+        (GOOD_TUM + "0.2 0 0 0 0 0 0 0.9\n", "row 2: the length of the quaternion"),
         ("1e30 0 0 0 0 0 0 1\n", "row 1: stamp 1e30 is beyond"),
         (GOOD_KITTI + GOOD_KITTI.strip() + " 1\n", "row 2 has 13 columns"),
         (GOOD_KITTI + "1 0 0 0 0 1 0 0 0 0 -1 0\n", "row 2: .*not a rotation"),
         (GOOD_KITTI + "2 0 0 0 0 2 0 0 0 0 2 0\n", "row 2: .*not a rotation"),
-        (GOOD_KITTI + "1 0 0 inf 0 1 0 0 0 0 1 0\n", "row 2 holds a value that is not finite"),
+        (GOOD_KITTI + "1 0 0 inf 0 1 0 0 0 0 1 0\n", "row 2 contains a value that is not finite"),
         ("1 2 3\n", "row 1 has 3 columns; expected one of TUM .* KITTI"),
-        ("# only a comment\n", "no poses"),
+        ("# only a comment\n", "contains no poses"),
     ],
 )
 def test_a_malformed_file_is_named_with_the_row_and_the_reason(tmp_path: Path, text: str, complaint: str) -> None:

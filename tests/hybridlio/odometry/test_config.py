@@ -219,7 +219,10 @@ def test_numbers_out_of_range_are_refused_and_all_of_them_named(changed: dict, w
         (lambda: CandidateSettings(compared=0), "CandidateSettings.compared: must be above 0, got 0"),
         (lambda: ConsistencySettings(inlier_share=1.0), "ConsistencySettings.inlier_share: must be above 0 and below"),
         (lambda: DescriptorSettings(beside_m=()), "DescriptorSettings.beside_m: must be one position at least"),
-        (lambda: ImuNoise(gyro_rad_s_sqrt_hz=-1), "ImuNoise.gyro_rad_s_sqrt_hz: must be finite and 0 or more, got -1"),
+        (
+            lambda: ImuNoise(gyro_rad_s_sqrt_hz=-1),
+            "ImuNoise.gyro_rad_s_sqrt_hz: must be finite and not negative",
+        ),
     ],
 )
 def test_settings_made_in_python_are_checked_alike(make: Callable[[], object], wanted: str):
