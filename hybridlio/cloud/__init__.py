@@ -1,1 +1,1 @@
-"""One point cloud before it is compared with another: motion compensation, voxels, k-d tree, ground, normals, maps."""
+"""Processing of single point clouds: motion compensation, voxels, k-d tree, ground, normals, planes, vertex maps."""

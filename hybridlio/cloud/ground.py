@@ -1,8 +1,8 @@
-"""Ground: the plane under the sensor by RANSAC, and the points that lie on it.
+"""Ground segmentation: find the plane under the sensor by RANSAC, and the points on it.
 
 Source: UnDeepLIO, "Loss Function": ground points are removed by RANSAC (Fischler and Bolles, 1981) before voxel
-averaging. Planes are drawn from points below the sensor; those steeper than a slope a vehicle stands on are dropped
-before anything is counted, which leaves few to score; drawing stops once a better plane is unlikely.
+averaging. Candidate planes go through three points below the sensor. Those too steep for a vehicle to stand on are
+dropped before inliers are counted, which leaves few to score, and scoring stops once a better plane is unlikely.
 """
 
 from __future__ import annotations
@@ -15,18 +15,28 @@ from numpy.typing import ArrayLike, NDArray
 from hybridlio.core.arrays import Array, Mask
 from hybridlio.core.errors import ConfigError, DataError
 
+_NORMAL_MARGIN_DEG = 15.0  # on the slope, for single points: their normals are noisier than a plane through many
+_MAX_LEVEL_DEG = 89.0  # keeps the cosine positive for steep slopes
+_BATCH = 64  # planes scored between two checks for stopping; one matrix product each
+_REFINEMENTS = 3  # least-squares fits to the inliers; the inliers hardly change after the second
+# Ground points gather in the middle of the slab of ±threshold, those of something tall fill it evenly, with a standard
+# deviation of threshold/√3 = 0.58 thresholds.
+_MAX_SPREAD_RATIO = 0.5
+_MIN_WIDTH_RATIO = 4.0  # variance across a line of points over that along its normal; below it they make no plane
+_MIN_DOUBLE_AREA_M2 = 1e-6  # of the triangle of three points; with less they are on a line
+
 
 @dataclass(frozen=True)
 class GroundOptions:
-    """How ground is looked for.
+    """Settings of the ground segmentation.
 
     Attributes:
         threshold_m: points nearer than this to the plane are ground.
-        max_slope_deg: the plane's largest tilt against the sensor's x-y plane; 10° of road and the pitch of a vehicle.
-        min_share: ground is found when the plane holds at least this share of all points.
-        samples: so many points score a plane, and at most so many planes are drawn.
-        confidence: probability that the best plane has been drawn when drawing stops.
-        seed: of the draws; the same cloud gives the same ground.
+        max_slope_deg: largest tilt of the plane against the sensor's x-y plane: 10° of road, and the vehicle's pitch.
+        min_share: ground is found only if at least this share of all points lies on the plane.
+        samples: largest number of points that score a plane, and of planes that are drawn.
+        confidence: probability at which the best plane has been drawn when drawing stops.
+        seed: of the random draws; the same cloud always gives the same ground.
     """
 
     threshold_m: float = 0.2
@@ -47,12 +57,12 @@ class GroundOptions:
 
 @dataclass(frozen=True, eq=False)
 class GroundPlane:
-    """The ground found in a cloud: ``normal · p + offset_m = 0``.
+    """The ground plane ``normal · p + offset_m = 0`` of a cloud.
 
     Attributes:
-        normal: ``(3,)`` unit, pointing up; zero where no ground was found.
-        offset_m: height of the sensor above the plane; 0 where no ground was found.
-        mask: ``(N,)`` bool, the points that are ground; all False where none was found.
+        normal: ``(3,)`` unit vector pointing up; zero if no ground was found.
+        offset_m: height of the sensor above the plane; 0 if no ground was found.
+        mask: ``(N,)`` bool, True for ground points.
     """
 
     normal: Array
@@ -61,22 +71,22 @@ class GroundPlane:
 
     @property
     def found(self) -> bool:
-        """Whether there is ground."""
+        """Whether ground was found."""
         return bool(self.normal.any())
 
 
 def find_ground(
     points: ArrayLike, normals: ArrayLike | None = None, options: GroundOptions | None = None
 ) -> GroundPlane:
-    """The ground plane under the sensor, and the points on it.
+    """Find the ground plane under the sensor, and the points on it.
 
-    Where the cloud shows no ground (too few points on any plane, points spread evenly through the slab instead of
-    lying on its middle, or all in one line) the mask is all False.
+    No ground is found if too few points lie on any plane, if they fill the slab around the plane evenly instead of
+    gathering in its middle, or if they lie on one line.
 
     Args:
         points: ``(N, 3)`` metres, lidar frame with z up, the sensor in the origin above the ground.
-        normals: ``(N, 3)`` or None. With them only points whose surface is level enough propose a plane, which finds
-            the ground where there is little of it among walls.
+        normals: ``(N, 3)`` or None. If given, planes are drawn from points with a level surface only, which helps where
+            little ground is visible between walls.
         options: limits, and the seed.
 
     Raises:
@@ -107,20 +117,22 @@ def find_ground(
 def remove_ground(
     points: ArrayLike, normals: ArrayLike | None = None, options: GroundOptions | None = None
 ) -> NDArray[np.float32]:
-    """The points ``(M, 3)`` that are not ground; arguments and errors as :func:`find_ground`."""
+    """Return the points ``(M, 3)`` that are not ground; arguments and errors are those of :func:`find_ground`."""
     points = np.asarray(points, dtype=np.float32)
     return points[~find_ground(points, normals, options).mask]
 
 
 def _candidates(points: NDArray[np.float32], normals: ArrayLike | None, options: GroundOptions) -> Mask:
-    """Finite points below the sensor, on level surfaces where normals tell."""
+    """Return which points are finite, below the sensor, and on a level surface if normals are given."""
     below = np.isfinite(points).all(axis=1) & (points[:, 2] < 0)
     if normals is None:
         return below
     normals = np.asarray(normals, dtype=np.float32)
     if normals.shape != points.shape:
-        raise DataError(f"ground: normals {normals.shape} do not go with points {points.shape}; give one a point")
-    level = np.cos(np.radians(min(options.max_slope_deg + 15.0, 89.0)))  # normals are noisier than the plane
+        raise DataError(
+            f"ground: normals have shape {normals.shape} and points {points.shape}; give one normal per point"
+        )
+    level = np.cos(np.radians(min(options.max_slope_deg + _NORMAL_MARGIN_DEG, _MAX_LEVEL_DEG)))
     return np.asarray(below & (np.abs(normals[:, 2]) > level))
 
 
@@ -129,38 +141,38 @@ def _heights(plane: Array, points: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _draw_plane(points: NDArray[np.float32], rng: np.random.Generator, options: GroundOptions) -> Array | None:
-    """The plane through three of the points that most of them lie near; None where all are too steep."""
+    """Return the plane through three points with the most inliers; None if all planes are too steep."""
     planes = _planes_through(points[rng.integers(0, len(points), (options.samples, 3))], options)
-    best, most, batch = None, 0, 64
-    for start in range(0, len(planes), batch):
-        some = planes[start : start + batch].astype(np.float32)
+    best, most = None, 0
+    for start in range(0, len(planes), _BATCH):
+        some = planes[start : start + _BATCH].astype(np.float32)
         near = np.count_nonzero(np.abs(some[:, :3] @ points.T + some[:, 3:]) < options.threshold_m, axis=1)
         if near.max() > most:
             most, best = int(near.max()), planes[start + int(near.argmax())]
-        # probability that no draw so far had three points of the best plane; dropped draws count as draws too
+        # RANSAC's stopping rule: probability that no draw so far had three inliers; steep planes were draws, too
         share = (most / len(points)) ** 3
-        drawn = options.samples * min(start + batch, len(planes)) / len(planes)
+        drawn = options.samples * min(start + _BATCH, len(planes)) / len(planes)
         if drawn * np.log1p(-min(share, 1 - 1e-12)) < np.log(1 - options.confidence):
             break
     return best
 
 
 def _planes_through(corners: NDArray[np.float32], options: GroundOptions) -> Array:
-    """Planes ``(M, 4)`` through triples of points that are level enough and below the sensor; normals point up."""
+    """Return the planes ``(M, 4)`` through triples of points that are level and below the sensor; normals point up."""
     a, b, c = np.moveaxis(corners.astype(np.float64), 1, 0)
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1)
     steep = np.abs(normal[:, 2]) < np.cos(np.radians(options.max_slope_deg)) * length
-    normal, a = normal[~steep & (length > 1e-6)], a[~steep & (length > 1e-6)]
+    normal, a = normal[~steep & (length > _MIN_DOUBLE_AREA_M2)], a[~steep & (length > _MIN_DOUBLE_AREA_M2)]
     normal *= np.sign(normal[:, 2:]) / np.linalg.norm(normal, axis=1, keepdims=True)
     offset = -np.einsum("ij,ij->i", normal, a)
     return np.asarray(np.column_stack([normal, offset])[offset > 0])
 
 
 def _refine(plane: Array, points: NDArray[np.float32], options: GroundOptions) -> Array | None:
-    """The plane of least squares through the points near it, or None where they do not look like ground."""
+    """Return the least-squares plane through the inliers, or None if they do not look like ground."""
     near = points[np.abs(_heights(plane, points)) < options.threshold_m].astype(np.float64)
-    for _ in range(3):
+    for _ in range(_REFINEMENTS):
         if len(near) < 3:
             return None
         centre = near.mean(axis=0)
@@ -168,8 +180,7 @@ def _refine(plane: Array, points: NDArray[np.float32], options: GroundOptions) -
         normal = axes[:, 0] * np.sign(axes[2, 0] or 1.0)
         plane = np.append(normal, -normal @ centre)
         near = points[np.abs(_heights(plane, points)) < options.threshold_m].astype(np.float64)
-    line = spread[1] < max(4 * spread[0], options.threshold_m**2)
-    # a slab cut out of something tall is filled evenly (standard deviation t/√3); ground gathers in its middle
-    even = spread[0] > (0.5 * options.threshold_m) ** 2
-    steep = plane[2] < np.cos(np.radians(options.max_slope_deg))
-    return None if line or even or steep or plane[3] <= 0 else plane
+    is_line = spread[1] < max(_MIN_WIDTH_RATIO * spread[0], options.threshold_m**2)
+    is_even = spread[0] > (_MAX_SPREAD_RATIO * options.threshold_m) ** 2
+    is_steep = plane[2] < np.cos(np.radians(options.max_slope_deg))
+    return None if is_line or is_even or is_steep or plane[3] <= 0 else plane

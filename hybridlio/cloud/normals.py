@@ -1,11 +1,12 @@
-"""Normals of a whole cloud by fitting a plane to each point's neighbours.
+"""Normals of a whole cloud, by fitting a plane to each point's neighbours.
 
-Source: UnDeepLIO, "Loss Function": the normals of the whole cloud come from plane fitting, before anything is removed
-or averaged. The fits are small_gicp's: the direction of least spread among the nearest neighbours.
+Source: UnDeepLIO, "Loss Function": the normals of the whole cloud come from plane fitting, before ground is removed and
+points are averaged. small_gicp fits the planes: the normal is the direction of least variance of the nearest
+neighbours.
 
-A spinning lidar sees the road nearby so densely that a point's twenty neighbours all lie within the noise of a range:
-on an HDL-64E, normals of the road within 10 m are then off by 9° in the median. Fitted to the means of small voxels
-they are off by 2°, in half the time, so that is the default; ``thin_m=0`` fits to the points themselves.
+A spinning lidar samples the road nearby so densely that twenty neighbours lie no farther apart than the noise of a
+range: on an HDL-64E the median error of road normals within 10 m is 9°. Fitted to the means of small voxels it is 2°,
+in half the time. That is the default; ``thin_m=0`` fits to the points themselves.
 """
 
 from __future__ import annotations
@@ -18,21 +19,21 @@ from hybridlio.cloud.voxel import label_means, voxel_labels
 from hybridlio.core.arrays import Floats
 from hybridlio.core.errors import ConfigError
 
-_TABLE_CELLS = 1 << 24
+_MAX_TABLE_CELLS = 1 << 24  # 128 MiB of counts; a cloud with a larger extent is counted in coarser cells
 
 
 def estimate_normals(
     points: ArrayLike, neighbours: int = 20, threads: int = 2, thin_m: float = 0.2, support_m: float = 1.0
 ) -> Floats:
-    """Unit normals ``(N, 3)`` float32 that point towards the sensor in the origin; zero where a point has no support.
+    """Return unit normals ``(N, 3)`` float32 that point towards the sensor in the origin; zero for unsupported points.
 
-    A point has no support, and gets no normal, when it is not finite, or when fewer than five places lie in the block
-    of 3 × 3 × 3 cubes around it (a lone return: its nearest neighbours say nothing about its surface). Nor has any
-    point of a cloud that is all in one place. The result does not depend on the number of threads.
+    A point is unsupported if it is not finite, or if fewer than five places lie in the block of 3 × 3 × 3 cubes around
+    it: the nearest neighbours of a lone return do not belong to its surface. All points of a cloud in one place are
+    unsupported. The result does not depend on the number of threads.
 
     Args:
         points: ``(N, 3)`` metres, lidar frame.
-        neighbours: how many make the plane.
+        neighbours: number of points that a plane is fitted to.
         threads: for the search.
         thin_m: side of the voxels whose means are the neighbours; points of a voxel share a normal up to its sign.
         support_m: side of the cubes in which support is counted.
@@ -46,7 +47,7 @@ def estimate_normals(
             f"0, got {neighbours}, {threads}, {thin_m}, {support_m}"
         )
     points = np.asarray(points, dtype=np.float32).reshape(-1, 3)
-    if np.isfinite(points).all():  # by far the common case, and cheaper than a flag a row
+    if np.isfinite(points).all():  # the usual case, and cheaper than a flag per row
         return _of_finite(points, neighbours, threads, thin_m, support_m)
     normals, finite = np.zeros_like(points), np.isfinite(points).all(axis=1)
     normals[finite] = _of_finite(points[finite], neighbours, threads, thin_m, support_m)
@@ -85,19 +86,19 @@ def _towards_origin(normals: Floats, points: Floats) -> Floats:
 
 
 def _has_support(places: Floats, side_m: float) -> NDArray[np.bool_]:
-    """Whether five places lie in the 3 × 3 × 3 cubes around each, and not all in one place."""
+    """Return which places have five of them in the 3 × 3 × 3 cubes around; none if all are the same place."""
     columns = np.ascontiguousarray(places.T)
     low, extent = columns.min(axis=1), np.ptp(columns, axis=1).astype(np.float64)
     if len(places) < MIN_NEIGHBOURS or not extent.any():
         return np.zeros(len(places), bool)
-    # a point far outside would make the table huge: coarser cubes then
-    while np.prod(np.floor(extent / side_m) + 3) > _TABLE_CELLS:
+    # a single point far away would make the table huge, so cubes become coarser
+    while np.prod(np.floor(extent / side_m) + 3) > _MAX_TABLE_CELLS:
         side_m *= 2
     cells = ((columns - low[:, None]) / np.float32(side_m)).astype(np.int64) + 1
     nx, ny, nz = (int(n) + 2 for n in cells.max(axis=1))
     key = (cells[2] * ny + cells[1]) * nx + cells[0]
     count = np.bincount(key, minlength=nx * ny * nz)
-    for step in (1, nx, nx * ny):  # the table has an empty rim: neighbours in a flat table do not wrap
+    for step in (1, nx, nx * ny):  # the table has an empty rim, so that neighbours in the flat table do not wrap
         around = count.copy()
         around[step:] += count[:-step]
         around[:-step] += count[step:]

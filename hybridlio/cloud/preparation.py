@@ -1,7 +1,7 @@
-"""A scan made ready: compensated, cropped, and whatever of maps, normals and thinned clouds is asked for.
+"""Preparation of a scan: motion compensation, cropping, and derived maps, normals and thinned clouds on demand.
 
-The scan matcher needs a thinned cloud soon; the network needs maps; the loss needs normals, ground and an averaged
-cloud. Each is computed when first read and kept, so nobody pays for what only others need.
+The network needs vertex and normal maps; the training loss needs normals, ground and an averaged cloud. Each is
+computed when it is first read, and cached.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from hybridlio.core.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class PreparationOptions:
-    """How scans are prepared.
+    """Settings of the preparation.
 
     Attributes:
         min_range_m, max_range_m: points outside are dropped (the vehicle itself, stray returns).
-        min_points: a scan with fewer points left is not usable.
-        geometry: cells of the vertex and normal map.
+        min_points: a scan with fewer points after cropping is not usable.
+        geometry: cells of the vertex and normal maps.
         thinned_voxel_m: side of the voxels of the thinned cloud.
         normal_neighbours, normal_thin_m: of :func:`hybridlio.cloud.normals.estimate_normals`.
-        remove_ground: whether the loss cloud leaves ground out, as the paper does.
-        ground: how ground is looked for.
-        loss_points, loss_tolerance: the paper's K = 10,240 ± 100.
-        loss_voxel_m: first side tried for so many; the paper's 0.3 m.
+        remove_ground: whether ground is removed from the loss cloud, as in the paper.
+        ground: settings of the ground segmentation.
+        loss_points, loss_tolerance: size of the loss cloud; the paper's K = 10,240 ± 100.
+        loss_voxel_m: voxel side tried first for that size; the paper's 0.3 m.
         threads: for the neighbour search of the normals.
     """
 
@@ -64,11 +64,11 @@ class PreparationOptions:
 
 @dataclass(frozen=True, eq=False)
 class PreparedScan:
-    """A scan in the lidar frame at its stamp, and what is derived from it; each part is computed once, if read.
+    """A scan in the lidar frame at its stamp, and parts derived from it, each computed when it is first read.
 
     Attributes:
-        scan: compensated and cropped; ``scan.time_offsets_ns`` is left only where no motion was known.
-        options: how it was prepared.
+        scan: compensated and cropped; ``scan.time_offsets_ns`` is not None only if no motion was given.
+        options: settings of the preparation.
     """
 
     scan: Scan
@@ -81,43 +81,43 @@ class PreparedScan:
 
     @property
     def points(self) -> Floats:
-        """``(N, 3)`` metres, those within range."""
+        """``(N, 3)`` metres, the points within range."""
         return self.scan.points
 
     @property
     def usable(self) -> bool:
-        """Whether enough points are left to estimate a pose from; else bridge the scan."""
+        """Whether enough points are left to estimate a pose; otherwise the scan has to be bridged."""
         return len(self.scan) >= self.options.min_points
 
     @cached_property
     def thinned(self) -> Floats:
-        """``(M, 3)`` one mean point a voxel of ``thinned_voxel_m``."""
+        """``(M, 3)`` the mean point of each voxel of ``thinned_voxel_m``."""
         return voxel_average(self.points, None, self.options.thinned_voxel_m)[0]
 
     @cached_property
     def vertex_map(self) -> Floats:
-        """``(3, H, W)``; 0 in empty cells."""
+        """``(3, H, W)`` metres; 0 in empty cells."""
         return vertex_map(self.points, self.options.geometry)
 
     @cached_property
     def normal_map(self) -> Floats:
-        """``(3, H, W)`` of the vertex map; 0 where there is none."""
+        """``(3, H, W)`` unit normals of the vertex map; 0 in cells without a normal."""
         return normal_map(self.vertex_map)
 
     @cached_property
     def normals(self) -> Floats:
-        """``(N, 3)`` by plane fitting, towards the sensor; zero rows where a point has no support."""
+        """``(N, 3)`` unit normals by plane fitting, towards the sensor; zero for unsupported points."""
         options = self.options
         return estimate_normals(self.points, options.normal_neighbours, options.threads, options.normal_thin_m)
 
     @cached_property
     def ground(self) -> GroundPlane:
-        """The ground plane and the points on it; ``ground.found`` says whether there is any."""
+        """The ground plane and the points on it; check ``ground.found``."""
         return find_ground(self.points, self.normals, self.options.ground)
 
     @cached_property
     def loss_cloud(self) -> VoxelCloud:
-        """Points and normals for the loss: ground removed, averaged to ``loss_points`` ± ``loss_tolerance``."""
+        """Points and normals for the loss, without ground, averaged to ``loss_points`` ± ``loss_tolerance`` points."""
         keep = ~self.ground.mask if self.options.remove_ground else slice(None)
         options = self.options
         return voxel_to_count(
@@ -126,13 +126,13 @@ class PreparedScan:
 
 
 def prepare(scan: Scan, options: PreparationOptions | None = None, motion: Trajectory | None = None) -> PreparedScan:
-    """Compensate the sweep's motion, drop points out of range, and hand out the rest on demand.
+    """Compensate the sweep's motion and drop points out of range.
 
     Args:
-        scan: as the sensor delivered it. A scan without points is prepared as well; it is not ``usable``.
-        options: ranges, cells and sizes.
-        motion: lidar poses around the sweep, see :func:`hybridlio.cloud.deskew.deskew`; only looked at where
-            points carry times. Without it such a scan stays as measured.
+        scan: as the sensor delivered it. A scan without points is accepted; it is not ``usable``.
+        options: settings of the preparation.
+        motion: lidar poses around the sweep, see :func:`hybridlio.cloud.deskew.deskew`; used only if points have times.
+            Without it such a scan stays as measured.
 
     Raises:
         DataError: the motion has fewer than two poses.

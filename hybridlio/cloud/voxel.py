@@ -1,8 +1,8 @@
-"""Voxel averages: a cloud thinned to one point a cubic cell, or to a wanted number of points.
+"""Voxel averages: thin a cloud to one point per cubic cell, or to a given number of points.
 
-Source: UnDeepLIO, "Loss Function": the arithmetic average of all points in a voxel stands for them, normals likewise
-and normalised afterwards; the side is adjusted until K ± 100 points are left. The grid is anchored at the origin,
-results are ordered by cell, and nothing depends on threads, so the same cloud always gives the same result.
+Source: UnDeepLIO, "Loss Function": the points of a voxel are replaced by their mean, and so are the normals, normalised
+afterwards; the side is adjusted until K ± 100 points are left. The grid is anchored at the origin, results are ordered
+by cell and do not depend on threads, so the same cloud always gives the same result.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from hybridlio.core.arrays import Floats
 from hybridlio.core.errors import ConfigError, DataError
 
-_DENSE_CELLS = 1 << 23  # up to so many, a table of all cells beats sorting the occupied ones
-_FINEST_M, _COARSEST_M = 1e-3, 1e5
-_NARROW = 1e-5  # relative width at which a bracket is at its end
+_DENSE_CELLS = 1 << 23  # 8 MiB of flags: up to this number of cells a table of all is faster than sorting
+_FINEST_M, _COARSEST_M = 1e-3, 1e5  # limits of the side: below the noise of any lidar, above the extent of any cloud
+_BRACKET_CLOSED = 1e-5  # relative width at which the search for a side ends; 1e-5 of a side moves hardly any point
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +40,11 @@ class VoxelCloud:
 
 
 def voxel_average(points: ArrayLike, normals: ArrayLike | None, voxel_size_m: float) -> tuple[Floats, Floats | None]:
-    """Mean point ``(M, 3)`` and mean normal ``(M, 3)``, normalised, of every voxel that holds points.
+    """Return mean point ``(M, 3)`` and normalised mean normal ``(M, 3)`` of every occupied voxel.
 
     Args:
-        points: ``(N, 3)`` metres; rows that are not finite are left out.
-        normals: ``(N, 3)`` or None; zero rows (no normal) count for nothing, and a voxel of nothing else gets zero.
+        points: ``(N, 3)`` metres; rows that are not finite are ignored.
+        normals: ``(N, 3)`` or None; zero rows (no normal) are ignored, and a voxel with no other rows gets zero.
         voxel_size_m: side of the cubes.
 
     Raises:
@@ -58,36 +58,36 @@ def voxel_average(points: ArrayLike, normals: ArrayLike | None, voxel_size_m: fl
 
 
 def voxel_pick(points: ArrayLike, voxel_size_m: float) -> NDArray[np.intp]:
-    """Numbers ``(M,)`` of the points ``(N, 3)`` that lie nearest to the mean of their voxel's, one a voxel.
+    """Return indices ``(M,)`` of the points ``(N, 3)`` that are nearest to the mean of their voxel, one per voxel.
 
-    In a corner the mean lies off both surfaces: means of large voxels, held against those of small ones, seem to lie
-    farther from the walls than they do. A point that was there before lies where the others do.
+    In a corner the mean lies off both surfaces: means of large voxels, compared with those of small ones, seem farther
+    from the walls than they are. A measured point has no such bias.
 
     Raises:
         ConfigError, DataError: as :func:`voxel_average`; here points must all be finite.
     """
     points = _checked(points, None)[0]
     labels, count = voxel_labels(points, voxel_size_m)
-    off = points - label_means(points, labels, count).take(labels, axis=0)
-    off2, least = np.einsum("ij,ij->i", off, off), np.full(count, np.inf, np.float32)
-    np.minimum.at(least, labels, off2)
-    nearest = np.flatnonzero(off2 <= least.take(labels))[::-1]
+    offset = points - label_means(points, labels, count).take(labels, axis=0)
+    distance2, least = np.einsum("ij,ij->i", offset, offset), np.full(count, np.inf, np.float32)
+    np.minimum.at(least, labels, distance2)
+    nearest = np.flatnonzero(distance2 <= least.take(labels))[::-1]
     picked = np.empty(count, np.intp)
-    picked[labels[nearest]] = nearest  # of several as near, the first: the last that is written
+    picked[labels[nearest]] = nearest  # reversed, so that of equally near points the first is written last and stays
     return picked
 
 
 def voxel_labels(points: Floats, voxel_size_m: float) -> tuple[NDArray[np.intp], int]:
-    """Which voxel each of the finite points ``(N, 3)`` lies in: numbers from 0, in the order of :func:`voxel_average`.
+    """Label the finite points ``(N, 3)`` by their voxel, from 0 in the order of :func:`voxel_average`.
 
     Returns:
-        the labels ``(N,)``, and how many voxels hold points.
+        the labels ``(N,)``, and the number of occupied voxels.
     """
     return _labels(*_keys(np.ascontiguousarray(points.T), voxel_size_m))
 
 
 def label_means(values: Floats, labels: NDArray[np.intp], count: int) -> Floats:
-    """Mean ``(M, C)`` of the values ``(N, C)`` that share a label, of ``count`` labels that all occur."""
+    """Return the mean ``(M, C)`` of the values ``(N, C)`` of each of ``count`` labels, which must all occur."""
     return (_sums(values, labels, count) / np.bincount(labels, minlength=count)[:, None]).astype(np.float32)
 
 
@@ -98,24 +98,23 @@ def voxel_to_count(
     tolerance: int = 100,
     start_size_m: float = 0.3,
 ) -> VoxelCloud:
-    """Average the cloud over voxels of that side which leaves ``count`` ± ``tolerance`` points.
+    """Average the cloud over voxels of such a side that ``count`` ± ``tolerance`` points are left.
 
-    The paper steps the side by 0.01 m; bracketing and interpolating in logarithms gets there in about four passes,
-    which only count. A cloud of fewer points than wanted comes back as it is, with a voxel size of 0. Where no side is
-    found (a cloud of few distinct places; a tolerance below the jumps that the count makes), the nearest count found
-    stands: look at ``len`` of the result.
+    The paper changes the side in steps of 0.01 m; bracketing and interpolation in logarithms need about four passes,
+    which only count voxels. A cloud with fewer points is returned as it is, with a voxel size of 0. If no side is found
+    (few distinct places, or a tolerance below the jumps of the count), the nearest count found is used: check ``len``.
 
     Args:
-        points, normals: as :func:`voxel_average`.
-        count, tolerance: the paper's K = 10,240 ± 100.
-        start_size_m: first side tried; the paper's 0.3 m. The last scan's saves passes.
+        points, normals: as in :func:`voxel_average`.
+        count, tolerance: number of points; by default the paper's K = 10,240 ± 100.
+        start_size_m: side tried first, by default the paper's 0.3 m; the previous scan's side saves passes.
 
     Raises:
         ConfigError: count or side is not positive, or the tolerance is negative.
         DataError: points and normals differ in shape.
     """
     if count < 1 or tolerance < 0:
-        raise ConfigError(f"voxel count must be at least 1 and its tolerance at least 0, got {count} and {tolerance}")
+        raise ConfigError(f"voxels: count must be at least 1 and tolerance at least 0, got {count} and {tolerance}")
     points, normals = _checked(points, normals)
     if len(points) <= count + tolerance:
         return VoxelCloud(points, None if normals is None else _unit(normals), 0.0)
@@ -124,11 +123,11 @@ def voxel_to_count(
 
 
 def _size_for(columns: Floats, count: int, tolerance: int, start_size_m: float) -> float:
-    """The side that leaves ``count`` ± ``tolerance`` voxels, or the best that was met."""
+    """Return a side that leaves ``count`` ± ``tolerance`` voxels, or the nearest found (regula falsi in logarithms)."""
     size, best, best_miss = start_size_m, start_size_m, math.inf
-    fine: tuple[float, float] | None = None  # (log side, log of count over wanted) where too many are left
-    coarse: tuple[float, float] | None = None  # and where too few are
-    while not (fine and coarse and coarse[0] - fine[0] < _NARROW):
+    fine: tuple[float, float] | None = None  # (log side, log of found / wanted) with too many voxels
+    coarse: tuple[float, float] | None = None  # the same with too few
+    while not (fine and coarse and coarse[0] - fine[0] < _BRACKET_CLOSED):
         found = _count(columns, size)
         if abs(found - count) < best_miss:
             best, best_miss = size, abs(found - count)
@@ -137,11 +136,11 @@ def _size_for(columns: Floats, count: int, tolerance: int, start_size_m: float) 
         here = (math.log(size), math.log(found / count))
         fine, coarse = (here, coarse) if found > count else (fine, here)
         if fine and coarse:
-            # the zero of the line between them, kept off the ends so that the bracket shrinks
+            # zero of the line through both, away from the ends so that the bracket shrinks on both sides
             share = min(max(fine[1] / (fine[1] - coarse[1]), 0.1), 0.9)
             size = math.exp(fine[0] + share * (coarse[0] - fine[0]))
         else:
-            # on surfaces the count falls with the square of the side, less where voxels hold one point each
+            # the count falls with the square of the side on surfaces, and less where voxels hold single points
             size = max(size * math.exp(min(max(here[1] / 1.5, -1.0), 1.0)), _FINEST_M)
     return best
 
@@ -153,15 +152,17 @@ def _checked(points: ArrayLike, normals: ArrayLike | None) -> tuple[Floats, Floa
     if normals is not None:
         normals = np.asarray(normals, dtype=np.float32)
         if normals.shape != points.shape:
-            raise DataError(f"voxels: normals {normals.shape} do not go with points {points.shape}; give one a point")
-    if np.isfinite(points).all():  # by far the common case, and cheaper than a flag a row
+            raise DataError(
+                f"voxels: normals have shape {normals.shape} and points {points.shape}; give one normal per point"
+            )
+    if np.isfinite(points).all():  # the usual case, and cheaper than a flag per row
         return points, normals
     finite = np.isfinite(points).all(axis=1)
     return points[finite], None if normals is None else normals[finite]
 
 
 def _keys(columns: Floats, voxel_size_m: float) -> tuple[NDArray[np.int32] | NDArray[np.int64], int]:
-    """One integer a point that tells its voxel, and how many voxels the cloud's box has; of points ``(3, N)``."""
+    """Return an integer for the voxel of each of the points ``(3, N)``, and the number of voxels in the cloud's box."""
     if not (math.isfinite(voxel_size_m) and voxel_size_m > 0):
         raise ConfigError(f"voxel size must be positive, got {voxel_size_m}")
     if not columns.shape[1]:
@@ -171,7 +172,7 @@ def _keys(columns: Floats, voxel_size_m: float) -> tuple[NDArray[np.int32] | NDA
     low = cells.min(axis=1)
     nx, ny, nz = (int(n) + 1 for n in cells.max(axis=1).astype(np.float64) - low)
     if nx * ny * nz >= 1 << 62:
-        raise ConfigError(f"voxels of {voxel_size_m} m are too small for a cloud of {nx} x {ny} x {nz} of them")
+        raise ConfigError(f"voxels of {voxel_size_m} m are too small: the cloud's box holds {nx} x {ny} x {nz} of them")
     x, y, z = (cells - low[:, None]).astype(np.int32 if nx * ny * nz < 1 << 31 else np.int64)
     return (z * ny + y) * nx + x, nx * ny * nz
 
@@ -198,8 +199,8 @@ def _labels(keys: NDArray[np.int32] | NDArray[np.int64], cells: int) -> tuple[ND
 
 
 def _sums(values: Floats, labels: NDArray[np.intp], count: int) -> NDArray[np.float64]:
-    """By a sparse matrix of ones, which takes half as long as a bincount for each column and adds in the same order."""
-    from scipy.sparse import csc_array  # late: it takes a while to load
+    """Return sums per label by a sparse matrix: twice as fast as a bincount per column, and in the same order."""
+    from scipy.sparse import csc_array  # late: slow to import
 
     ones = csc_array((np.ones(len(values)), labels, np.arange(len(values) + 1)), shape=(count, len(values)))
     return np.asarray(ones @ values.astype(np.float64))
