@@ -1,4 +1,4 @@
-"""Frames with other scans than they had."""
+"""Frames with replaced scans."""
 
 from __future__ import annotations
 
@@ -10,5 +10,5 @@ from hybridlio.core.sensors import Frame, Scan
 
 
 def blind(frame: Frame) -> Frame:
-    """The frame with a scan of no points."""
+    """Return the frame with an empty scan."""
     return replace(frame, scan=Scan(frame.scan.stamp_ns, np.empty((0, 3), np.float32)))

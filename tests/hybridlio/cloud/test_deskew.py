@@ -18,7 +18,7 @@ def world(seed: int, count: int = 2000) -> np.ndarray:
 
 
 def measured(still: np.ndarray, T_stamp_point: np.ndarray, offsets_ns: np.ndarray) -> Scan:
-    """What a moving sensor measures of points that lie still in its frame of the stamp."""
+    """Return what a moving sensor measures of static points, which are given in its frame at the stamp."""
     return Scan(STAMP_NS, se3.transform(se3.inverse(T_stamp_point), still[:, None])[:, 0], None, offsets_ns)
 
 
@@ -83,12 +83,12 @@ def test_a_sweep_of_no_points_stays_empty():
     assert len(deskew(scan, constant_twist(np.eye(4), 0, 1))) == 0
 
 
-def test_a_single_pose_tells_no_motion():
+def test_a_motion_of_a_single_pose_is_an_error():
     scan = Scan(STAMP_NS, world(0, 5), None, np.arange(5))
     with pytest.raises(DataError, match="two poses"):
         deskew(scan, Trajectory(np.array([STAMP_NS]), np.eye(4)[None]))
 
 
-def test_a_twist_over_no_time_is_refused():
+def test_a_twist_over_no_time_is_an_error():
     with pytest.raises(DataError, match="time"):
         constant_twist(np.eye(4), STAMP_NS, STAMP_NS)

@@ -36,7 +36,7 @@ def test_the_plane_under_the_sensor_is_found_on_slopes(rng, tilt_deg):
     assert found.mask[6000:].mean() < 0.01
 
 
-def test_a_slope_steeper_than_allowed_is_no_ground(rng):
+def test_a_slope_steeper_than_the_limit_is_not_ground(rng):
     R = se3.so3_exp([np.radians(25), 0, 0])
     assert not find_ground(road(rng, 5000) @ R.T).found
     assert find_ground(road(rng, 5000) @ R.T, options=GroundOptions(max_slope_deg=30)).found
@@ -49,7 +49,7 @@ def test_little_ground_between_walls_is_found(rng):
     assert found.mask[:1500].all()
 
 
-def test_with_normals_a_twentieth_of_ground_is_enough(rng):
+def test_with_normals_five_percent_of_ground_is_found(rng):
     points = np.vstack([road(rng, 1000), four_walls(rng, 19_000, foot_m=-4.0)])
     normals = np.vstack([np.tile([0.0, 0.0, 1.0], (1000, 1)), np.tile([-1.0, 0.0, 0.0], (19_000, 1))])
     found = find_ground(points, normals)
@@ -58,7 +58,7 @@ def test_with_normals_a_twentieth_of_ground_is_enough(rng):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_walls_a_volume_of_scatter_and_a_ceiling_are_no_ground(seed):
+def test_walls_scattered_points_and_a_ceiling_are_not_ground(seed):
     rng = np.random.default_rng(seed)
     ceiling = road(rng, 5000) * [1, 1, -1]
     scatter = rng.uniform([-20, -20, -3], [20, 20, 3], (20_000, 3))
@@ -73,12 +73,12 @@ def test_walls_a_volume_of_scatter_and_a_ceiling_are_no_ground(seed):
     "cloud",
     [np.empty((0, 3)), *(np.full((n, 3), value) for n, value in [(2, -1.0), (500, -1.0), (9, np.nan), (50, 0.0)])],
 )
-def test_clouds_that_show_nothing_have_no_ground(cloud):
+def test_clouds_without_a_plane_have_no_ground(cloud):
     assert find_ground(cloud).mask.tolist() == [False] * len(cloud)
     assert find_ground(cloud, np.zeros_like(cloud)).mask.tolist() == [False] * len(cloud)
 
 
-def test_one_ring_of_points_is_a_line_not_ground():
+def test_a_single_ring_of_points_is_not_ground():
     y = np.linspace(-5, 5, 1000)
     assert not find_ground(np.column_stack([np.full(1000, 8.0), y, np.full(1000, -1.7)])).found
 
@@ -98,18 +98,18 @@ def test_the_same_cloud_gives_the_same_ground(rng):
     assert np.array_equal(first.normal, second.normal)
 
 
-def test_removing_ground_leaves_what_is_not(rng):
+def test_removing_ground_keeps_all_other_points(rng):
     ground, town = road(rng, 3000), four_walls(rng, 3000, foot_m=0.0)
     assert np.allclose(remove_ground(np.vstack([ground, town])), town, atol=1e-5)
 
 
 @pytest.mark.parametrize("wrong", [{"threshold_m": 0}, {"max_slope_deg": 90}, {"min_share": 2}, {"samples": 2}])
-def test_options_out_of_range_are_refused(wrong):
+def test_options_out_of_range_are_errors(wrong):
     with pytest.raises(ConfigError, match="ground"):
         GroundOptions(**wrong)
 
 
-def test_normals_and_points_of_other_shapes_are_refused():
+def test_normals_and_points_of_wrong_shapes_are_errors():
     with pytest.raises(DataError, match="normals"):
         find_ground(np.ones((5, 3)), np.ones((4, 3)))
     with pytest.raises(DataError, match="points"):

@@ -21,7 +21,7 @@ def grown_by_steps(points: np.ndarray, sizes: list[int]) -> GrowingKdTree:
 
 @pytest.mark.parametrize("sizes", [[400], [399, 400], [300, 350, 400], [1, 2], [1], [2, 3], [40, 400]], ids=str)
 @pytest.mark.parametrize(("threads", "half_m"), [(1, 10.0), (2, 3.0), (1, 1e4)])
-def test_points_that_come_later_are_found_as_if_they_had_been_there(
+def test_an_extended_tree_finds_what_one_tree_over_all_points_finds(
     rng: np.random.Generator, sizes: list[int], threads: int, half_m: float
 ):
     points, queries = rng.uniform(-half_m, half_m, (sizes[-1], 3)), 1.1 * rng.uniform(-half_m, half_m, (4500, 3))
@@ -38,7 +38,7 @@ def test_points_that_come_later_are_found_as_if_they_had_been_there(
     assert (second2 <= others2 * (1 + 1e-9)).all()
 
 
-def test_a_tree_stays_as_it_was_when_another_grows_from_it(rng: np.random.Generator):
+def test_extending_a_tree_leaves_it_unchanged(rng: np.random.Generator):
     points, queries = rng.uniform(-10, 10, (300, 3)), rng.uniform(-10, 10, (50, 3))
     first = GrowingKdTree(points[:200], 1)
     once = first.extended(points[:250], 1)
@@ -51,7 +51,7 @@ def test_a_tree_stays_as_it_was_when_another_grows_from_it(rng: np.random.Genera
     assert [tree.appended_ratio for tree in (first, once)] == [0.0, 0.25]
 
 
-def test_a_surface_that_grew_is_the_one_made_of_all(rng: np.random.Generator):
+def test_an_extended_surface_equals_one_built_from_all_points(rng: np.random.Generator):
     points, normals = rng.uniform(-5, 5, (500, 3)), rng.standard_normal((500, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     whole, grown = Surface(points, normals), Surface(points[:400], normals[:400])

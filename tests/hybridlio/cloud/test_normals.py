@@ -11,7 +11,7 @@ def worst_angle_deg(normals: np.ndarray, expected: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("thin_m", [0.0, 0.2])
-def test_normals_of_a_plane_are_the_planes_and_face_the_sensor(rng, thin_m):
+def test_normals_of_a_plane_are_its_normal_and_face_the_sensor(rng, thin_m):
     R = se3.so3_exp([0.3, -0.5, 0.2])
     flat = np.column_stack([rng.uniform(-5, 5, (4000, 2)), np.full(4000, 3.0)])
     normals = estimate_normals(flat @ R.T, thin_m=thin_m)
@@ -21,11 +21,11 @@ def test_normals_of_a_plane_are_the_planes_and_face_the_sensor(rng, thin_m):
 def test_normals_inside_a_cylinder_point_to_its_axis(rng):
     angle, height = rng.uniform(0, 2 * np.pi, 20_000), rng.uniform(-2, 2, 20_000)
     normals = estimate_normals(np.column_stack([10 * np.cos(angle), 10 * np.sin(angle), height]))
-    inside = np.abs(height) < 1.7  # at the rim the neighbours lie on one side
+    inside = np.abs(height) < 1.7  # at the rim neighbours are on one side only
     assert worst_angle_deg(normals[inside], -np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])[inside]) < 2.0
 
 
-def test_normals_of_a_ball_ahead_point_outwards_on_the_side_that_is_seen(rng):
+def test_normals_of_a_ball_ahead_point_outwards_on_its_visible_side(rng):
     outwards = rng.normal(size=(20_000, 3))
     outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
     centre = np.array([20.0, 5.0, 1.0])
@@ -40,7 +40,7 @@ def test_turning_the_cloud_turns_the_normals(rng):
     R = se3.so3_exp([0.0, 0.0, 1.1])
     turned, still = (estimate_normals(cloud, thin_m=0.0) for cloud in (points @ R.T, points))
     same = np.abs(np.einsum("ij,ij->i", turned, still @ R.T)) > 0.999
-    assert same.mean() > 0.9  # ties among neighbours may break otherwise
+    assert same.mean() > 0.9  # ties between neighbours may be broken differently
 
 
 def test_threads_do_not_change_the_result(rng):
@@ -70,7 +70,7 @@ def test_a_cloud_without_a_surface_has_no_normals(points):
 
 
 @pytest.mark.parametrize("wrong", [{"neighbours": 4}, {"threads": 0}, {"support_m": 0.0}, {"thin_m": -1.0}])
-def test_settings_that_fit_no_plane_are_refused(wrong):
+def test_settings_that_cannot_fit_a_plane_are_errors(wrong):
     with pytest.raises(ConfigError, match="normals"):
         estimate_normals(np.ones((10, 3)), **wrong)
 
@@ -82,5 +82,5 @@ def test_most_points_of_a_real_scan_lie_on_surfaces(kitti_raw_root):
     assert (np.einsum("ij,ij->i", normals, points) <= 1e-4).all()
     road = (np.linalg.norm(points[:, :2], axis=1) < 10) & (points[:, 2] < -1.6)
     assert np.degrees(np.arccos(np.median(normals[road, 2]))) < 3.0
-    literal = estimate_normals(points, thin_m=0.0)  # what the module's introduction says of fits to the points
+    literal = estimate_normals(points, thin_m=0.0)  # the module docstring's claim about fits to the points themselves
     assert np.degrees(np.arccos(np.median(literal[road, 2]))) > 7.0

@@ -27,28 +27,28 @@ def test_points_out_of_range_are_dropped_with_their_intensity():
     assert prepared.stamp_ns == 7
 
 
-def test_maps_are_those_of_the_cropped_scan_in_the_wanted_cells(town):
+def test_maps_are_of_the_cropped_scan_with_the_given_geometry(town):
     geometry = MAP_GEOMETRIES["32-beam"]
     prepared = prepare(town, PreparationOptions(geometry=geometry))
     assert np.array_equal(prepared.vertex_map, vertex_map(prepared.points, geometry))
     assert np.array_equal(prepared.normal_map, normal_map(prepared.vertex_map))
 
 
-def test_the_loss_cloud_has_the_wanted_count_and_no_ground(town):
+def test_the_loss_cloud_has_the_requested_count_and_no_ground(town):
     prepared = prepare(town, PreparationOptions(loss_points=2000, loss_tolerance=40))
     assert prepared.ground.offset_m == pytest.approx(1.7, abs=0.02)
     cloud = prepared.loss_cloud
     assert abs(len(cloud) - 2000) <= 40
     assert (cloud.points[:, 2] > -1.7 + 0.1).all()
-    assert np.median(np.abs(cloud.normals[:, 1])) > 0.99  # the walls'
+    assert np.median(np.abs(cloud.normals[:, 1])) > 0.99  # the normals of the walls
 
 
-def test_ground_stays_in_the_loss_cloud_where_it_is_wanted(town):
+def test_ground_stays_in_the_loss_cloud_on_request(town):
     cloud = prepare(town, PreparationOptions(remove_ground=False, loss_points=3000)).loss_cloud
     assert (cloud.points[:, 2] < -1.6).mean() > 0.2
 
 
-def test_only_what_is_read_is_computed(town, monkeypatch):
+def test_parts_are_computed_only_when_read(town, monkeypatch):
     def never(*args):
         raise AssertionError("computed though nobody asked")
 
@@ -56,7 +56,7 @@ def test_only_what_is_read_is_computed(town, monkeypatch):
         monkeypatch.setattr(preparation, name, never)
     prepared = prepare(town)
     assert 0 < len(prepared.thinned) < len(prepared.points)
-    assert prepared.thinned is prepared.thinned  # and only once
+    assert prepared.thinned is prepared.thinned  # computed only once
 
 
 def test_a_moving_sweep_is_compensated_and_one_without_times_is_not(town):
@@ -68,7 +68,7 @@ def test_a_moving_sweep_is_compensated_and_one_without_times_is_not(town):
 
 
 @pytest.mark.parametrize("points", [np.empty((0, 3)), np.zeros((500, 3)), np.full((500, 3), np.nan)])
-def test_a_scan_of_nothing_is_not_usable_and_gives_empty_parts(points):
+def test_an_empty_scan_is_not_usable_and_has_empty_parts(points):
     prepared = prepare(Scan(0, points))
     assert not prepared.usable
     assert not prepared.vertex_map.any()
@@ -84,12 +84,12 @@ def test_a_scan_all_in_one_place_gives_one_point_without_a_normal():
 
 
 @pytest.mark.parametrize("wrong", [{"min_range_m": 5.0, "max_range_m": 4.0}, {"thinned_voxel_m": 0.0}])
-def test_options_that_leave_nothing_are_refused(wrong):
+def test_options_that_leave_no_points_are_errors(wrong):
     with pytest.raises(ConfigError, match="preparation"):
         PreparationOptions(**wrong)
 
 
-def test_a_real_scan_gives_every_part_in_its_wanted_size(kitti_raw_root):
+def test_a_real_scan_gives_every_part_in_the_requested_size(kitti_raw_root):
     scan = kitti_raw_root / "2011_09_26/2011_09_26_drive_0005_sync/velodyne_points/data/0000000050.bin"
     columns = np.fromfile(scan, np.float32).reshape(-1, 4)
     prepared = prepare(Scan(0, columns[:, :3], columns[:, 3]))

@@ -22,7 +22,7 @@ PAPER = MAP_GEOMETRIES["hdl-64e"]
 
 
 def rays(geometry: MapGeometry) -> np.ndarray:
-    """Unit directions (H, W, 3) through the middles of the cells."""
+    """Return unit directions (H, W, 3) through the centres of the cells."""
     elevation = np.radians(geometry.fov_up_deg - (np.arange(geometry.rows) + 0.5) * geometry.row_deg)[:, None]
     azimuth = np.radians(180.0 - (np.arange(geometry.columns) + 0.5) * geometry.column_deg)[None, :]
     return np.stack(
@@ -44,19 +44,19 @@ def test_the_papers_map_has_52_rows_of_720_cells_of_half_a_degree_from_plus_3_to
 
 
 @pytest.mark.parametrize("name", ["32-beam", "16-beam"])
-def test_every_beam_of_an_evenly_spread_lidar_has_a_row_of_its_own(name):
+def test_every_beam_of_an_evenly_spaced_lidar_has_its_own_row(name):
     geometry, elevations = MAP_GEOMETRIES[name], np.array(LIDAR_MODELS[name].elevations_deg)
     row = (geometry.fov_up_deg - elevations) / geometry.row_deg
     assert np.allclose(row, np.arange(len(elevations)) + 0.5)
 
 
-def test_an_unknown_lidar_names_those_there_are():
+def test_an_unknown_lidar_is_an_error_that_lists_the_known_ones():
     with pytest.raises(ConfigError, match="hdl-64e"):
         map_geometry("hdl-46e")
 
 
 @pytest.mark.parametrize("limits", [(-3.0, 3.0, 52, 720), (3.0, 3.0, 52, 720), (3.0, -23.0, 0, 720), (95.0, 0.0, 9, 9)])
-def test_limits_that_make_no_map_are_refused(limits):
+def test_invalid_limits_are_errors(limits):
     with pytest.raises(ConfigError):
         MapGeometry(*limits)
 
@@ -67,12 +67,12 @@ def test_limits_that_make_no_map_are_refused(limits):
         (0.0, 0.0, 6, 360),  # straight ahead: (180-0)/0.5, (3-0)/0.5
         (90.1, 0.1, 5, 179),  # left
         (-89.9, -0.1, 6, 539),  # right
-        (179.9, 2.9, 0, 0),  # behind, over the left: first column
-        (-179.9, -22.9, 51, 719),  # behind, over the right: last column
+        (179.9, 2.9, 0, 0),  # behind on the left: first column
+        (-179.9, -22.9, 51, 719),  # behind on the right: last column
         (45.1, -10.1, 26, 269),
     ],
 )
-def test_a_point_falls_into_the_cell_worked_out_by_hand(azimuth_deg, elevation_deg, row, column):
+def test_a_point_falls_into_the_cell_computed_by_hand(azimuth_deg, elevation_deg, row, column):
     a, e = np.radians([azimuth_deg, elevation_deg])
     point = 12.0 * np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     assert np.argwhere(winner_map(point[None], PAPER) == 0).tolist() == [[row, column]]
@@ -92,7 +92,7 @@ def test_the_nearest_point_wins_a_cell_and_the_first_of_equals():
     assert np.allclose(vertex_map(points, PAPER)[:, winners == 1][:, 0], 10 * ahead)
 
 
-def test_cells_in_the_middle_of_whose_rays_a_point_lies_get_that_point():
+def test_a_point_at_the_centre_of_a_cell_falls_into_that_cell():
     points = (rays(PAPER) * 15.0).reshape(-1, 3)
     assert (winner_map(points, PAPER).ravel() == np.arange(PAPER.rows * PAPER.columns)).all()
 
@@ -116,7 +116,7 @@ def test_turning_the_cloud_by_whole_columns_rolls_both_maps(columns):
     assert np.abs(normal_map(after) - rolled).max() < 1e-3
 
 
-def test_gathered_values_stand_where_their_points_stand():
+def test_gathered_values_are_in_the_cells_of_their_points():
     points = cloud(0)
     winners = winner_map(points, PAPER)
     intensity = gather(np.arange(1, len(points) + 1, dtype=np.float32)[:, None], winners)
@@ -138,7 +138,7 @@ def test_all_points_in_one_place_fill_one_cell_and_give_no_normal():
 
 
 def test_normals_of_a_flat_road_point_straight_up_to_the_sensor():
-    directions = rays(PAPER)[8:]  # those that look down by more than a degree
+    directions = rays(PAPER)[8:]  # more than a degree below the horizon
     road = directions * (-1.7 / directions[..., 2:])
     vertices = np.zeros((3, 52, 720), np.float32)
     vertices[:, 8:] = np.moveaxis(road, -1, 0)

@@ -9,7 +9,7 @@ from hybridlio.core.errors import ConfigError, DataError
 
 
 def street(seed: int, count: int = 110_000) -> np.ndarray:
-    """A cloud dense near the sensor and thin far off, of a road, two house fronts and scatter."""
+    """A cloud, dense near the sensor and sparse far away, of a road, two facades and scattered points."""
     rng = np.random.default_rng(seed)
     reach = np.exp(rng.uniform(np.log(3), np.log(80), count)) * rng.choice([-1, 1], count)
     road = np.column_stack([reach, rng.uniform(-8, 8, count), rng.normal(-1.7, 0.02, count)])
@@ -21,7 +21,7 @@ def street(seed: int, count: int = 110_000) -> np.ndarray:
 
 
 def by_dictionary(points, normals, size):
-    """The same averages, one point at a time."""
+    """Return the same averages by a dictionary, one point at a time."""
     cells: dict[tuple, list[int]] = {}
     for i, cell in enumerate(np.floor(points / np.float32(size)).astype(int)):
         cells.setdefault(tuple(cell), []).append(i)
@@ -33,8 +33,8 @@ def by_dictionary(points, normals, size):
 
 @pytest.mark.parametrize("dense_cells", [voxel._DENSE_CELLS, 0])
 @pytest.mark.parametrize("size", [0.3, 1.0, 7.0])
-def test_averages_are_those_worked_out_one_point_at_a_time(size, dense_cells, monkeypatch):
-    monkeypatch.setattr(voxel, "_DENSE_CELLS", dense_cells)  # by a table of all cells, and by sorting
+def test_averages_equal_those_of_a_dictionary(size, dense_cells, monkeypatch):
+    monkeypatch.setattr(voxel, "_DENSE_CELLS", dense_cells)  # both by a table of all cells and by sorting
     points = street(0, 3000)
     normals = np.random.default_rng(1).normal(size=points.shape).astype(np.float32)
     means, units = by_dictionary(points, normals, size)
@@ -64,7 +64,7 @@ def test_averaging_twice_over_the_same_grid_changes_nothing():
     assert np.allclose(twice, once)
 
 
-def test_points_without_a_normal_count_for_nothing_in_the_average_normal():
+def test_points_without_a_normal_are_ignored_in_the_mean_normal():
     points = np.array([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [5.5, 0.1, 0.1]])
     normals = np.array([[0.0, 0.6, 0.8], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     means, averaged = voxel_average(points, normals, 1.0)
@@ -81,7 +81,7 @@ def test_the_count_is_met_within_its_tolerance(seed, count, tolerance):
     assert len(cloud) == len(cloud.normals) == len(voxel_average(points, None, cloud.voxel_size_m)[0])
 
 
-def test_the_search_takes_few_passes(monkeypatch):
+def test_the_search_for_a_side_takes_few_passes(monkeypatch):
     passes = []
     counted = voxel._count
     monkeypatch.setattr(voxel, "_count", lambda *a: passes.append(1) or counted(*a))
@@ -90,7 +90,7 @@ def test_the_search_takes_few_passes(monkeypatch):
 
 
 @pytest.mark.parametrize("start", [1e-3, 0.05, 3.0, 500.0])
-def test_a_poor_first_side_still_leads_to_the_count(start):
+def test_a_poor_first_side_still_reaches_the_count(start):
     assert abs(len(voxel_to_count(street(1), start_size_m=start)) - 10240) <= 100
 
 
@@ -102,18 +102,18 @@ def test_a_small_cloud_comes_back_as_it_is_with_unit_normals():
     assert cloud.voxel_size_m == 0.0
 
 
-def test_a_cloud_of_fewer_places_than_wanted_gives_the_places_there_are():
+def test_a_cloud_with_too_few_distinct_places_gives_all_of_them():
     places = street(0, 50)
     cloud = voxel_to_count(np.repeat(places, 400, axis=0), count=10_000)
     assert len(cloud) == len(np.unique(places, axis=0))
 
 
-def test_all_points_in_one_place_leave_that_place():
+def test_points_in_one_place_average_to_that_place():
     cloud = voxel_to_count(np.full((20_000, 3), 4.2, np.float32), count=100, tolerance=0)
     assert cloud.points == pytest.approx(np.full((1, 3), 4.2))
 
 
-def test_asking_for_fewer_points_than_octants_gives_one_an_octant():
+def test_a_count_below_the_number_of_octants_gives_one_point_per_octant():
     assert len(voxel_to_count(street(0, 1000), count=1, tolerance=0)) == 8
 
 
@@ -123,7 +123,7 @@ def test_a_cloud_of_no_points_stays_empty():
     assert voxel_average(np.empty((0, 3)), None, 0.3)[0].shape == (0, 3)
 
 
-def test_what_is_picked_are_points_that_were_there_the_nearest_to_each_voxels_mean():
+def test_picked_points_are_the_nearest_to_the_mean_of_each_voxel():
     points = street(3, 2000)
     means, _ = voxel_average(points, None, 1.0)
     picked = points[voxel_pick(points, 1.0)]
@@ -135,7 +135,7 @@ def test_what_is_picked_are_points_that_were_there_the_nearest_to_each_voxels_me
         assert off2[own, k].min() == pytest.approx(((picked[k] - means[k]) ** 2).sum(), abs=1e-6)
 
 
-def test_what_is_picked_in_a_corner_lies_on_one_of_its_walls():
+def test_picked_points_in_a_corner_lie_on_a_wall():
     t = np.linspace(0.01, 0.99, 50)
     corner = np.concatenate([np.column_stack([t, 0 * t, 0 * t]), np.column_stack([0 * t, t, 0 * t])])
     (mean,), (picked,) = voxel_average(corner, None, 1.0)[0], corner[voxel_pick(corner, 1.0)]
@@ -143,7 +143,7 @@ def test_what_is_picked_in_a_corner_lies_on_one_of_its_walls():
     assert picked[:2].min() == 0
 
 
-def test_of_no_points_none_is_picked():
+def test_nothing_is_picked_of_an_empty_cloud():
     assert voxel_pick(np.empty((0, 3)), 1.0).shape == (0,)
 
 
@@ -155,22 +155,22 @@ def test_points_that_are_not_finite_are_left_out():
 
 
 @pytest.mark.parametrize("size", [0.0, -1.0, np.nan, np.inf])
-def test_a_side_that_is_no_length_is_refused(size):
+def test_an_invalid_voxel_side_is_an_error(size):
     with pytest.raises(ConfigError, match="positive"):
         voxel_average(np.ones((2, 3)), None, size)
 
 
-def test_a_side_too_small_for_the_clouds_extent_is_refused():
+def test_a_voxel_side_too_small_for_the_extent_is_an_error():
     with pytest.raises(ConfigError, match="too small"):
         voxel_average(np.array([[-1e5] * 3, [1e5] * 3]), None, 1e-9)
 
 
-def test_normals_that_do_not_go_with_the_points_are_refused():
+def test_normals_of_another_shape_than_the_points_are_an_error():
     with pytest.raises(DataError, match="normals"):
         voxel_to_count(np.ones((4, 3)), np.ones((3, 3)))
 
 
-def test_real_scans_are_thinned_to_the_papers_count(kitti_raw_root):
+def test_real_scans_are_thinned_to_the_count_of_the_paper(kitti_raw_root):
     scans = sorted(kitti_raw_root.glob("*/*/velodyne_points/data/*.bin"))[::60]
     for scan in scans:
         points = np.fromfile(scan, np.float32).reshape(-1, 4)[:, :3]

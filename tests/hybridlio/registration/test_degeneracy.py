@@ -1,4 +1,4 @@
-"""Weak directions: what smooth walls pretend is not believed, what a few bushes tell is."""
+"""Weak directions: smooth walls with noisy normals do not observe them, a few bushes do."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def bushes(rng: np.random.Generator, where: np.ndarray, points: int) -> Cloud:
 
 
 def bend(rng: np.random.Generator, radius_m: float, count: int) -> Cloud:
-    """Two walls, four metres to either side of a circle that leaves the origin ahead, and the ground between."""
+    """Two walls 4 m to either side of a circle that starts ahead at the origin, and the ground between."""
     angle = rng.uniform(-25, 25, count) / radius_m
     side = rng.choice([-1.0, 0.0, 1.0], count)
     left = np.where(side == 0, rng.uniform(-4, 4, count), 4 * side)
@@ -56,7 +56,7 @@ def joined(*clouds: Cloud) -> Cloud:
 
 
 def leaning(rng: np.random.Generator, cloud: Cloud, by: float) -> Surface:
-    """A surface whose normals are estimates: each leans by some hundredths of a radian, one in twenty by far more."""
+    """A surface with noisy normals: a tilt of ``by`` radians, eight times that for one in twenty."""
     points, normals = cloud
     lean = by * np.where(rng.random(len(points)) < 0.05, 8.0, 1.0)
     normals = normals + lean[:, None] * rng.standard_normal(points.shape)
@@ -83,7 +83,7 @@ def in_a_field(rng: np.random.Generator, ahead_m: float, left_m: float = 0.0) ->
     return observe(surface, source, off_by(ahead_m, left_m), 0.3)
 
 
-def test_between_bushes_all_around_nothing_is_weak(rng: np.random.Generator):
+def test_bushes_all_around_leave_no_weak_direction(rng: np.random.Generator):
     where = rng.uniform(-25, 25, (200, 2))
     cloud = joined(ground(rng, 2000), bushes(rng, where, 12))
     observed = observe(leaning(rng, cloud, 0.03), scan(rng, cloud), TRUTH)
@@ -92,27 +92,29 @@ def test_between_bushes_all_around_nothing_is_weak(rng: np.random.Generator):
 
 
 @pytest.mark.parametrize("ahead_m", [0.0, 0.4, -0.4], ids="{} m off".format)
-def test_walls_whose_normals_lean_tell_nothing_of_the_way_along_them(rng: np.random.Generator, ahead_m: float):
+def test_noisy_normals_of_smooth_walls_do_not_observe_the_direction_along_them(
+    rng: np.random.Generator, ahead_m: float
+):
     surface = leaning(rng, bend(rng, 1e6, 4000), 0.03)
     observed = observe(surface, scan(rng, bend(rng, 1e6, 2000)), off_by(ahead_m))
     (direction,) = observed.degenerate
     assert abs(direction[3]) > 0.99
-    assert error(observed)[3] == pytest.approx(ahead_m, abs=0.02)  # where it was guessed
-    sigmas = np.sqrt(np.diag(se3.rotate_covariance(observed.covariance(1.0), TRUTH)))  # as the walls run
+    assert error(observed)[3] == pytest.approx(ahead_m, abs=0.02)  # as initially
+    sigmas = np.sqrt(np.diag(se3.rotate_covariance(observed.covariance(1.0), TRUTH)))  # in the frame of the walls
     assert sigmas[3] == pytest.approx(10.0, rel=0.02)
     assert (sigmas[[4, 5]] < 0.03).all()
 
 
 @pytest.mark.parametrize("off", [(0.3, -0.2), (-0.2, 0.25)], ids=str)
-def test_a_few_bushes_in_a_field_are_enough(rng: np.random.Generator, off: tuple[float, float]):
+def test_a_few_bushes_in_a_field_observe_all_directions(rng: np.random.Generator, off: tuple[float, float]):
     observed = in_a_field(rng, *off)
-    assert observed.weak_basis.shape == (6, 3)  # ahead, sideways, the turn
+    assert observed.weak_basis.shape == (6, 3)  # ahead, sideways, yaw
     assert observed.is_observed.all()
     assert np.abs(error(observed)[3:5]).max() < 0.15
     assert (np.sqrt(np.diag(observed.covariance(6.0)))[3:5] < 0.3).all()
 
 
-def test_their_errors_are_what_is_said_of_them(rng: np.random.Generator):
+def test_errors_in_a_field_match_their_covariance(rng: np.random.Generator):
     nees = []
     for _ in range(25):
         observed = in_a_field(rng, *rng.uniform(-0.2, 0.2, 2))
@@ -121,13 +123,13 @@ def test_their_errors_are_what_is_said_of_them(rng: np.random.Generator):
     assert 0.05 < np.mean(nees) < 1.5
 
 
-def test_a_guess_beyond_the_basin_is_led_into_it(rng: np.random.Generator):
+def test_a_start_outside_the_basin_of_attraction_still_converges(rng: np.random.Generator):
     assert np.abs(error(in_a_field(rng, 0.6))[3:5]).max() < 0.15
 
 
 @pytest.mark.parametrize("radius_m", [60.0, -150.0])
-def test_the_way_along_a_bend_is_a_turn(rng: np.random.Generator, radius_m: float):
-    """An unknown way along it is an unknown turn: by 10 m on a radius of 60 m, a sixth of a radian."""
+def test_the_weak_direction_along_a_bend_includes_a_rotation(rng: np.random.Generator, radius_m: float):
+    """An unknown arc length is an unknown yaw: 10 m on a radius of 60 m are a sixth of a radian."""
     surface = leaning(rng, bend(rng, radius_m, 6000), 0.02)
     observed = observe(surface, se3.transform(TRUTH, scan(rng, bend(rng, radius_m, 3000))), np.eye(4))
     assert not observed.is_observed.any()
@@ -138,7 +140,7 @@ def test_the_way_along_a_bend_is_a_turn(rng: np.random.Generator, radius_m: floa
     assert np.linalg.eigvalsh(covariance)[0] > 0
 
 
-def test_who_starts_metres_off_is_told_what_the_costs_farther_off_make_likely(rng: np.random.Generator):
+def test_a_vague_start_metres_away_is_corrected_by_distant_costs(rng: np.random.Generator):
     where = rng.uniform(-25, 25, (20, 2))
     surface = leaning(rng, joined(ground(rng, 8000), bushes(rng, where, 60)), 0.03)
     source = scan(rng, joined(ground(rng, 7000), bushes(rng, where, 16)))
@@ -150,8 +152,8 @@ def test_who_starts_metres_off_is_told_what_the_costs_farther_off_make_likely(rn
         assert abs(error(far)[3]) < 3 * sigma_m < 10
 
 
-def test_where_there_is_nothing_to_be_told_far_off_is_no_better(rng: np.random.Generator):
-    """Level ground without an end: every place on it is like any other."""
+def test_distant_costs_of_an_endless_plane_observe_nothing(rng: np.random.Generator):
+    """All positions on endless level ground are equally likely."""
     surface = leaning(rng, ground(rng, 12000), 0.01)
     source = scan(rng, ground(rng, 3000))
     inside = source[np.abs(source).max(axis=1) < 20]
@@ -161,11 +163,11 @@ def test_where_there_is_nothing_to_be_told_far_off_is_no_better(rng: np.random.G
 
 
 def rings(rng: np.random.Generator, cloud: Cloud) -> np.ndarray:
-    """A scan of them whose every point carries the same error as in any other: a lidar's own pattern."""
+    """A scan with the same range errors as every other scan of the cloud: a lidar's own pattern."""
     return cloud[0] + 0.04 * np.sin(3 * cloud[0][:, :1]) * cloud[1] + 0.005 * rng.standard_normal(cloud[0].shape)
 
 
-def test_a_lidars_own_pattern_is_no_sign_that_it_stood_still_beside_the_only_other_scan(rng: np.random.Generator):
+def test_a_lidars_own_pattern_is_ignored_next_to_the_only_other_scan(rng: np.random.Generator):
     walls = bend(rng, 1e6, 6000)
     surface, source = Surface(rings(rng, walls), walls[1], 1), rings(rng, walls)
     start = se3.exp(np.array([0.0, 0.0, 0.0, 0.2, 0.0, 0.0]))
@@ -177,7 +179,7 @@ def test_a_lidars_own_pattern_is_no_sign_that_it_stood_still_beside_the_only_oth
     assert np.sqrt(observed.covariance(1.0)[3, 3]) > 1.0
 
 
-def test_where_it_moved_far_from_the_only_other_scan_it_is_seen_by_bushes(rng: np.random.Generator):
+def test_bushes_are_observed_far_from_the_only_other_scan(rng: np.random.Generator):
     where = rng.uniform(-25, 25, (20, 2))
     surface = leaning(rng, joined(ground(rng, 8000), bushes(rng, where, 60)), 0.03)
     source = scan(rng, joined(ground(rng, 7000), bushes(rng, where, 16)))
@@ -186,14 +188,14 @@ def test_where_it_moved_far_from_the_only_other_scan_it_is_seen_by_bushes(rng: n
 
 
 def tree_points(rng: np.random.Generator, where: np.ndarray, points: int) -> np.ndarray:
-    """On trunks of 20 cm, three metres high: too thick for planes of ten points."""
+    """Points on trunks 20 cm thick and three metres high, which make no planes."""
     angle, height = rng.uniform(-np.pi, np.pi, (2, len(where), points))
     around = 0.1 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return np.concatenate([where[:, None] + around, height[..., None] / 2], axis=-1).reshape(-1, 3)
 
 
 def between_trunks(rng: np.random.Generator) -> tuple[Surface, np.ndarray, np.ndarray]:
-    """Ground and trunks whose planes lean anywhere, and of a scan what is registered and all its points."""
+    """Ground and trunks with arbitrary normals; the points of a scan that are registered, and all its points."""
     where, (flat, upright) = rng.uniform(-25, 25, (20, 2)), ground(rng, 8000)
     trunks = tree_points(rng, where, 100)
     lean = rng.standard_normal(trunks.shape)
@@ -205,7 +207,7 @@ def between_trunks(rng: np.random.Generator) -> tuple[Surface, np.ndarray, np.nd
     return surface, np.concatenate([points[:7000], points[7000::2]]), points
 
 
-def test_between_trunks_points_know_the_place_to_two_centimetres(rng: np.random.Generator):
+def test_points_of_trunks_determine_the_position_to_two_centimetres(rng: np.random.Generator):
     surface, source, points = between_trunks(rng)
     observed = observe(surface, source, off_by(0.1, -0.1), 0.1, dense=points)
     assert observed.weak_basis.shape == (6, 3)
@@ -214,8 +216,8 @@ def test_between_trunks_points_know_the_place_to_two_centimetres(rng: np.random.
     assert np.abs(error(observed)[2]) < 1e-3
 
 
-def test_points_that_lead_nowhere_in_particular_change_nothing(rng: np.random.Generator):
-    """From either side they come to rest elsewhere: what was seen half a metre off stands, as unsure as that is."""
+def test_ambiguous_point_matches_leave_the_result_of_the_parabola(rng: np.random.Generator):
+    """Two starts end at different poses, so the parabola's minimum and its larger sigma are kept."""
     surface, source, points = between_trunks(rng)
     start, kernel_m = off_by(0.1, -0.1), 0.1
     anywhere = np.concatenate([points[:7000], rng.uniform([-25, -25, -1], [25, 25, 1], (600, 3))])

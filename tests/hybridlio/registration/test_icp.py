@@ -22,22 +22,22 @@ def off(found: np.ndarray, truth: np.ndarray = MOTION) -> np.ndarray:
 def test_a_known_motion_in_a_room_is_recovered(rng: np.random.Generator, angles_deg: tuple[float, ...]):
     truth = se3.exp(np.r_[np.radians(angles_deg), 0.3, -0.2, 0.1])
     surface = Surface(*scene(rng, ROOM, 4000))
-    other_points, _ = scene(rng, ROOM, 300)  # of the same walls, not the same points
+    other_points, _ = scene(rng, ROOM, 300)  # on the same walls, but other points
     found = register(surface, seen_from(truth, other_points), np.eye(4), EXACT, kernel_start_m=1.0)
     error = off(found.pose, truth)
     assert found.converged
-    # where neighbours lie around a corner from each other the other wall's normal is the wrong one; few do
+    # a few points near corners have a neighbour on the other wall, with the wrong normal
     assert np.abs(error[:3]).max() < 2e-4
     assert np.abs(error[3:]).max() < 2e-3
     assert found.matched == pytest.approx(1.0, abs=0.02)
 
 
-def test_the_very_same_points_are_laid_on_themselves_exactly(rng: np.random.Generator):
+def test_identical_points_are_registered_exactly(rng: np.random.Generator):
     points, normals = scene(rng, ROOM)
     small = se3.exp(np.array([1e-3, -1e-3, 2e-3, 0.02, 0.01, -0.02]))
     found = register(Surface(points, normals), seen_from(small, points), np.eye(4), EXACT)
     np.testing.assert_allclose(off(found.pose, small), 0.0, atol=1e-6)
-    assert found.sigma_m < 1e-4  # as it was before the last step
+    assert found.sigma_m < 1e-4  # evaluated before the last step
     assert found.cost < 1e-6
 
 
@@ -51,7 +51,7 @@ def test_noise_of_the_points_averages_out(rng: np.random.Generator):
     assert found.sigma_m == pytest.approx(0.02, rel=0.2)
 
 
-def test_one_point_in_five_being_something_else_does_no_harm(rng: np.random.Generator):
+def test_twenty_percent_outliers_do_no_harm(rng: np.random.Generator):
     surface = Surface(*scene(rng, ROOM, 4000))
     points, _ = scene(rng, ROOM, 400)
     wrong = rng.random(len(points)) < 0.2
@@ -63,7 +63,7 @@ def test_one_point_in_five_being_something_else_does_no_harm(rng: np.random.Gene
     assert np.abs(error[3:]).max() < 0.01
 
 
-def test_the_answer_does_not_depend_on_where_near_by_it_starts(rng: np.random.Generator):
+def test_the_result_does_not_depend_on_a_start_nearby(rng: np.random.Generator):
     surface = Surface(*scene(rng, ROOM, 4000))
     source = seen_from(MOTION, scene(rng, ROOM, 400)[0])
     answers = [
@@ -78,7 +78,7 @@ def test_the_answer_does_not_depend_on_where_near_by_it_starts(rng: np.random.Ge
 
 
 @pytest.mark.parametrize("count", [0, 1, 5])
-def test_too_few_points_leave_the_pose_as_it_was(rng: np.random.Generator, count: int):
+def test_too_few_points_leave_the_pose_unchanged(rng: np.random.Generator, count: int):
     points, normals = scene(rng, ROOM)
     found = register(Surface(points, normals), points[:count] + 0.1, MOTION, EXACT)
     np.testing.assert_allclose(found.pose, MOTION, atol=1e-12)
@@ -86,7 +86,7 @@ def test_too_few_points_leave_the_pose_as_it_was(rng: np.random.Generator, count
     assert np.linalg.eigvalsh(covariance_of(found.hessian, found.sigma_m, 1.0))[0] > 0
 
 
-def test_points_far_from_everything_match_nothing_and_cost_all(rng: np.random.Generator):
+def test_points_far_from_the_surface_match_nothing_and_cost_1(rng: np.random.Generator):
     points, normals = scene(rng, ROOM)
     found = register(Surface(points, normals), points + 1000.0, np.eye(4), EXACT)
     assert found.matched == 0.0

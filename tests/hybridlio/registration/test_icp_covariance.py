@@ -34,27 +34,27 @@ def test_a_corridors_degenerate_direction_is_its_axis(rng: np.random.Generator):
     assert abs(direction[3]) > 0.99
 
 
-def test_a_plains_degenerate_directions_are_two_shifts_and_the_turn_about_its_normal(rng: np.random.Generator):
+def test_a_planes_degenerate_directions_are_two_translations_and_yaw(rng: np.random.Generator):
     directions = degenerate_directions(hessian_of(rng, PLAIN))
     assert directions.shape == (3, 6)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0)
-    # they span the turn about z and the shifts along x and y: nothing of the other three
+    # they span the rotation about z and the translations along x and y, and nothing else
     assert np.abs(directions[:, [0, 1, 5]]).max() < 0.1
     assert np.linalg.matrix_rank(directions[:, [2, 3, 4]], tol=0.1) == 3
 
 
-def test_a_pose_stays_where_it_is_along_what_the_points_do_not_say(rng: np.random.Generator):
+def test_a_pose_stays_at_the_initial_one_along_unconstrained_directions(rng: np.random.Generator):
     points, normals = scene(rng, CORRIDOR, 2000)
     truth = se3.exp(np.array([0.0, 0.0, 0.02, 0.0, 0.15, -0.1]))
     guess = se3.exp(np.array([0.0, 0.0, 0.0, 0.7, 0.0, 0.0]))
     inside = points[np.abs(points[:, 0]) < 7][::5]
     found = register(Surface(points, normals), seen_from(truth, inside), guess, EXACT, kernel_start_m=0.5).pose
-    assert found[0, 3] == pytest.approx(0.7, abs=0.05)  # along: as it was given
+    assert found[0, 3] == pytest.approx(0.7, abs=0.05)  # along the corridor: as initially
     np.testing.assert_allclose(off(found, truth)[[0, 1, 2, 5]], 0.0, atol=2e-3)
     assert abs(off(found, truth)[4]) < 0.03
 
 
-def test_the_spectrum_puts_turns_and_shifts_in_one_unit(rng: np.random.Generator):
+def test_the_spectrum_has_rotations_and_translations_in_one_unit(rng: np.random.Generator):
     hessian = hessian_of(rng, ROOM)
     values, vectors, scale = scaled_spectrum(hessian)
     np.testing.assert_allclose(
@@ -62,7 +62,7 @@ def test_the_spectrum_puts_turns_and_shifts_in_one_unit(rng: np.random.Generator
     )
     scaled = np.diag(hessian * np.outer(scale, scale))
     assert scaled[:3].sum() == pytest.approx(scaled[3:].sum())
-    # metres in place of kilometres, or a scan of twice the size, change no direction's share
+    # the spectrum does not depend on the unit of length
     metres = np.diag(np.r_[np.full(3, 1e-3), np.ones(3)])
     np.testing.assert_allclose(scaled_spectrum(metres @ hessian @ metres)[0], values, rtol=1e-6)
 
@@ -71,9 +71,7 @@ def test_the_spectrum_puts_turns_and_shifts_in_one_unit(rng: np.random.Generator
 
 
 @pytest.mark.parametrize("walls", [ROOM, CORRIDOR, PLAIN], ids=["room", "corridor", "plain"])
-def test_the_covariance_is_symmetric_positive_definite_and_loose_only_where_degenerate(
-    rng: np.random.Generator, walls: tuple
-):
+def test_the_covariance_is_positive_definite_and_large_only_where_degenerate(rng: np.random.Generator, walls: tuple):
     points, normals = scene(rng, walls, 2000)
     normals = normals + 0.01 * rng.standard_normal(normals.shape)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -92,18 +90,18 @@ def test_the_covariance_is_symmetric_positive_definite_and_loose_only_where_dege
 
 
 def test_the_covariance_is_of_a_right_perturbation(rng: np.random.Generator):
-    """Turning the world leaves it; turning the scan turns it."""
+    """Rotating the world does not change it; rotating the scan rotates it."""
     points, normals = scene(rng, CORRIDOR, 2000)
     source = points[::5] + 0.02 * rng.standard_normal(points[::5].shape)
     turn = se3.exp(np.array([0.0, 0.0, np.pi / 2, 0.0, 0.0, 0.0]))
     world = register(Surface(se3.transform(turn, points), normals @ turn[:3, :3].T), source, turn, EXACT)
     scan = register(Surface(points, normals), seen_from(turn, source), turn, EXACT)
-    # in the first the corridor still runs along the scan's x; in the second along its y
+    # the corridor runs along the scan's x in the first, and along its y in the second
     assert np.argmax(np.diag(covariance_of(world.hessian, world.sigma_m, 1.0))) == 3
     assert np.argmax(np.diag(covariance_of(scan.hessian, scan.sigma_m, 1.0))) == 4
 
 
-def test_twice_the_residuals_are_four_times_the_covariance(rng: np.random.Generator):
+def test_twice_the_noise_gives_four_times_the_covariance(rng: np.random.Generator):
     points, normals = scene(rng, ROOM)
     surface, noise, traces = Surface(points, normals), rng.standard_normal(points.shape), []
     for sigma in (0.01, 0.02):
@@ -112,13 +110,13 @@ def test_twice_the_residuals_are_four_times_the_covariance(rng: np.random.Genera
     assert traces[1] / traces[0] == pytest.approx(4.0, rel=0.1)
 
 
-def test_the_errors_of_many_registrations_scatter_as_their_covariance_says(rng: np.random.Generator):
-    """Of independent residuals on exact planes, scale 1 is the truth."""
+def test_errors_of_many_registrations_match_their_covariance(rng: np.random.Generator):
+    """With independent residuals on exact planes, scale 1 is exact."""
     surface = Surface(*scene(rng, ROOM, 4000))
     nees = []
     for _ in range(60):
         points, _ = scene(rng, ROOM, 60)
-        inside = points * 0.95  # away from corners, where a neighbour may lie on another wall
+        inside = points * 0.95  # away from corners, where the neighbour may be on another wall
         inside[:, 2] = points[:, 2]
         source = seen_from(MOTION, points + 0.02 * rng.standard_normal(points.shape))
         found = register(surface, source, MOTION, EXACT)

@@ -18,7 +18,7 @@ def floor(rng: np.random.Generator, half_m: float = 10.0, height_m: float = -1.7
     return np.column_stack([rng.uniform(-half_m, half_m, (count, 2)), np.full(count, height_m)])
 
 
-def test_an_empty_map_has_no_surface_and_wants_any_scan():
+def test_an_empty_map_has_no_surface_and_needs_a_keyframe():
     local_map = LocalMap(SETTINGS)
     assert local_map.surface is None
     assert local_map.needs_keyframe(at(0.0))
@@ -46,7 +46,7 @@ def test_the_surface_lies_where_the_scans_were_taken(rng: np.random.Generator):
     np.testing.assert_allclose(np.abs(surface.normals[:, 2]), 1.0, atol=1e-6)
 
 
-def test_normals_are_unit_vectors_and_none_is_missing(rng: np.random.Generator):
+def test_all_normals_are_unit_vectors(rng: np.random.Generator):
     local_map = LocalMap(SETTINGS)
     lonely = np.array([[50.0, 50.0, 20.0], [-60.0, 10.0, 5.0]])
     local_map.insert(np.concatenate([floor(rng), lonely]), at(0.0))
@@ -54,7 +54,7 @@ def test_normals_are_unit_vectors_and_none_is_missing(rng: np.random.Generator):
     np.testing.assert_allclose(np.linalg.norm(local_map.surface.normals, axis=1), 1.0, atol=1e-6)
 
 
-def test_keyframes_add_up(rng: np.random.Generator):
+def test_the_map_covers_all_keyframes(rng: np.random.Generator):
     local_map = LocalMap(SETTINGS)
     for x in range(0, 30, 5):
         local_map.insert(floor(rng), at(float(x)))
@@ -64,7 +64,7 @@ def test_keyframes_add_up(rng: np.random.Generator):
     assert x.max() > 34
 
 
-def test_more_scans_of_the_same_place_do_not_make_the_map_larger_for_ever(rng: np.random.Generator):
+def test_scans_of_the_same_place_stop_growing_the_map(rng: np.random.Generator):
     local_map, sizes = LocalMap(SETTINGS), []
     for _ in range(12):
         local_map.insert(floor(rng), at(0.0))
@@ -75,17 +75,17 @@ def test_more_scans_of_the_same_place_do_not_make_the_map_larger_for_ever(rng: n
     assert sizes[-1] - sizes[-4] < 0.05 * sizes[-1]
 
 
-def test_what_lies_farther_off_than_the_radius_is_left_out(rng: np.random.Generator):
+def test_points_outside_the_radius_are_left_out(rng: np.random.Generator):
     local_map = LocalMap(LocalMapSettings(radius_m=15.0, threads=1))
     local_map.insert(floor(rng), at(0.0))
     local_map.insert(floor(rng), at(20.0))
     assert local_map.surface is not None
     distance = np.linalg.norm(local_map.surface.points - [20.0, 0.0, 0.0], axis=1)
     assert distance.max() < 15.0
-    assert (local_map.surface.points[:, 0] < 10.0).any()  # but the first keyframe's are there within it
+    assert (local_map.surface.points[:, 0] < 10.0).any()  # points of the first keyframe within it stay
 
 
-def test_a_place_not_seen_for_the_horizon_is_forgotten(rng: np.random.Generator):
+def test_cells_not_hit_within_the_horizon_are_dropped(rng: np.random.Generator):
     local_map = LocalMap(LocalMapSettings(horizon_keyframes=6, threads=1, radius_m=1000.0))
     local_map.insert(floor(rng), at(0.0))
     for k in range(1, 20):
@@ -94,7 +94,7 @@ def test_a_place_not_seen_for_the_horizon_is_forgotten(rng: np.random.Generator)
     assert local_map.surface.points[:, 0].min() > 80.0
 
 
-def test_a_cell_takes_in_ten_points_and_none_beside_another(rng: np.random.Generator):
+def test_a_cell_holds_ten_points_with_a_minimum_spacing(rng: np.random.Generator):
     local_map = LocalMap(SETTINGS)
     first, again = floor(rng, 3.0, count=60), floor(rng, 3.0, count=400)
     local_map.insert(first, at(0.0))
@@ -110,8 +110,8 @@ def test_a_cell_takes_in_ten_points_and_none_beside_another(rng: np.random.Gener
     assert apart.min() >= 0.1
 
 
-def test_normals_are_of_the_scan_whose_points_they_are(rng: np.random.Generator):
-    """The same as fitting planes to all of the scan's points by small_gicp."""
+def test_normals_are_those_of_small_gicp_over_the_whole_scan(rng: np.random.Generator):
+    """Planes are fitted to the added points only, and equal those that small_gicp fits to all points."""
     points = np.concatenate([floor(rng), floor(rng)[:, [2, 0, 1]]]) + 0.01 * rng.standard_normal((8000, 3))
     local_map = LocalMap(LocalMapSettings(threads=1, voxel_m=0.5))
     local_map.insert(points, np.eye(4))
@@ -122,10 +122,10 @@ def test_normals_are_of_the_scan_whose_points_they_are(rng: np.random.Generator)
     index, distance2 = small_gicp.KdTree(points, 1).batch_knn_search(surface.points, 1, 1)
     np.testing.assert_array_equal(distance2, 0.0)
     cosines = np.abs(np.einsum("ij,ij->i", surface.normals, cloud.normals()[index[:, 0], :3]))
-    assert np.mean(cosines > 1 - 1e-6) > 0.999  # but where the plane is anyone's guess
+    assert np.mean(cosines > 1 - 1e-6) > 0.999  # except at edges, where the plane is ambiguous
 
 
-def test_the_nearest_of_the_surface_is_the_nearest(rng: np.random.Generator):
+def test_the_nearest_point_is_that_of_a_brute_force_search(rng: np.random.Generator):
     local_map = LocalMap(SETTINGS)
     local_map.insert(floor(rng), at(0.0))
     surface = local_map.surface
@@ -153,8 +153,8 @@ def test_the_same_scans_give_the_same_bytes(threads: int):
 
 
 @pytest.mark.parametrize(("beams_deg", "planes"), [((1.0,), False), ((0.0, 1.0, 2.0), True)], ids=["one beam", "three"])
-def test_one_beams_points_make_no_plane(beams_deg: tuple[float, ...], planes: bool):
-    """Of a wall 20 m away one beam sees a line, level and slightly bent: the plane it lies in is not the wall."""
+def test_points_of_one_beam_make_no_plane(beams_deg: tuple[float, ...], planes: bool):
+    """One beam sees a wall 20 m away as a line, horizontal and slightly curved, in a plane that is not the wall's."""
     left = np.arange(-6.0, 6.0, 0.6)
     rings = [
         np.column_stack([np.full_like(left, 20.0), left, np.hypot(20.0, left) * np.tan(np.radians(b))])
@@ -167,8 +167,8 @@ def test_one_beams_points_make_no_plane(beams_deg: tuple[float, ...], planes: bo
         assert (np.abs(local_map.surface.normals[:, 0]) > 0.999).mean() > 0.9
 
 
-def test_planes_weigh_less_the_thicker_they_are(rng: np.random.Generator):
-    """Ground with the noise of a lidar counts in full, a hedge's points little; between them lies rough ground."""
+def test_thicker_planes_weigh_less(rng: np.random.Generator):
+    """Ground with a lidar's noise has full weight, rough ground somewhat less, a hedge little."""
     local_map, middles = LocalMap(SETTINGS), {"smooth": 0.0, "rough": 40.0, "hedge": -40.0}
     for half_thick_m, x in zip((0.01, 0.05, 1.2), middles.values(), strict=True):
         points = floor(rng) + np.array([x, 0.0, 0.0])
@@ -183,8 +183,8 @@ def test_planes_weigh_less_the_thicker_they_are(rng: np.random.Generator):
     assert weight["hedge"] < 0.4
 
 
-def test_tidying_changes_how_the_surface_is_kept_and_not_what_it_is(rng: np.random.Generator):
-    """Left alone, keyframes wear it out until one makes it of all points; tidied after each, none of them has to."""
+def test_rebuilding_does_not_change_the_points_of_the_surface(rng: np.random.Generator):
+    """Without ``rebuild_if_due`` a keyframe rebuilds the surface when that is overdue; with it, none has to."""
     left, tidied, worn = LocalMap(SETTINGS), LocalMap(SETTINGS), []
     for x in range(0, 24, 2):
         points = floor(rng)
@@ -201,7 +201,7 @@ def test_tidying_changes_how_the_surface_is_kept_and_not_what_it_is(rng: np.rand
     assert max(worn) < 0.3
 
 
-def test_tidying_an_empty_map_does_nothing():
+def test_rebuilding_an_empty_map_does_nothing():
     local_map = LocalMap(SETTINGS)
     local_map.rebuild_if_due()
     assert local_map.surface is None

@@ -1,4 +1,4 @@
-"""What is too thick for a plane is matched as points: exact equations, one kernel over all three directions."""
+"""Points in thick neighbourhoods are matched with points: exact derivatives, one kernel over the difference."""
 
 import numpy as np
 from rooms import ROOM, scene, seen_from
@@ -50,7 +50,7 @@ def test_gradient_and_hessian_are_those_of_the_weighted_squares(rng: np.random.G
     np.testing.assert_allclose(system.hessian, derivatives.T @ derivatives, rtol=1e-6, atol=1e-5)
 
 
-def test_a_small_way_changes_the_equations_as_matching_there_would(rng: np.random.Generator):
+def test_linear_extrapolation_equals_matching_at_the_displaced_pose(rng: np.random.Generator):
     surface, xi = with_a_bush(rng), np.array([2e-5, -1e-5, 3e-5, 2e-3, -1e-3, 5e-4])
     neighbours = MixedNeighbours(surface, seen_from(POSE, surface.points[::7] + 0.004), 1)
     way, there = neighbours.mixed(POSE, 1.0).system(0.1, xi), neighbours.mixed(POSE @ se3.exp(xi), 1.0).system(0.1)
@@ -58,7 +58,7 @@ def test_a_small_way_changes_the_equations_as_matching_there_would(rng: np.rando
     np.testing.assert_allclose(way.gradient, there.gradient, atol=1e-3 * np.abs(there.gradient).max())
 
 
-def test_where_all_is_flat_nothing_changes(rng: np.random.Generator):
+def test_thin_planes_give_the_point_to_plane_system(rng: np.random.Generator):
     surface = Surface(*scene(rng, ROOM))
     neighbours = MixedNeighbours(surface, seen_from(POSE, scene(rng, ROOM, 60)[0]), 1)
     mixed, flat = neighbours.mixed(POSE, 1.0).system(0.1), neighbours.matches(POSE, 1.0).system(0.1)
@@ -66,8 +66,8 @@ def test_where_all_is_flat_nothing_changes(rng: np.random.Generator):
     np.testing.assert_allclose(mixed.gradient, flat.gradient)
 
 
-def test_near_in_one_direction_and_far_in_another_is_far():
-    """The weight falls with the whole distance: at the kernel to a quarter, of points that count half each."""
+def test_the_kernel_is_over_the_length_of_the_difference():
+    """Neighbours of weight 0.5: the weighted distance equals the kernel at √2 kernels, where a quarter is left."""
     targets = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
     surface = Surface(targets, np.tile([0.0, 0.0, 1.0], (2, 1)), 1, np.full(2, 0.5))
     off = np.array([[0.0, 0.1 * np.sqrt(2), 0.0], [0.0, 0.0, 0.0]])
@@ -76,7 +76,7 @@ def test_near_in_one_direction_and_far_in_another_is_far():
     np.testing.assert_allclose(np.diag(system.hessian)[3:], 0.625)
 
 
-def test_a_bush_is_matched_closer_by_its_points_than_by_planes_through_them(rng: np.random.Generator):
+def test_a_bush_is_registered_better_by_points_than_by_planes(rng: np.random.Generator):
     start = POSE @ se3.exp(np.array([0.0, 0.0, 0.0, 0.08, -0.06, 0.05]))
     settings, held = RegistrationSettings(kernel_m=0.03, threads=1), np.empty((6, 0))
     errors_m = []

@@ -25,7 +25,7 @@ def test_gradient_and_hessian_are_those_of_the_weighted_cost(rng: np.random.Gene
     step, axes = 1e-4, np.eye(6)
     gradient = [(cost(step * e) - cost(-step * e)) / (2 * step) for e in axes]
     np.testing.assert_allclose(system.gradient, gradient, rtol=1e-5, atol=1e-5 * np.abs(gradient).max())
-    # Gauss-Newton leaves out the residuals' curvature: put the points on their planes and there is none
+    # Gauss-Newton neglects the residuals' curvature; with all points on their planes there is none
     normals = matches.planes[:, :3]
     offsets = np.einsum("ij,ij->i", se3.transform(pose, matches.source), normals)
     flat = PlaneMatches.linearised(pose, matches.source, np.column_stack([normals, offsets, matches.planes[:, 4]]))
@@ -53,14 +53,14 @@ def test_gradient_and_hessian_are_those_of_the_weighted_cost(rng: np.random.Gene
     np.testing.assert_allclose(exact.gradient, 0.0, atol=1e-9)
 
 
-def test_weights_fall_to_a_quarter_at_the_kernel(rng: np.random.Generator):
+def test_weights_are_a_quarter_at_the_kernel_width(rng: np.random.Generator):
     points, normals = wall(rng, *FLOOR)
     lifted = points + np.array([0.0, 0.0, 0.1])
     system = Neighbours(Surface(points, normals), lifted, 1).matches(np.eye(4), 1.0).system(0.1)
     np.testing.assert_allclose(system.weights, 0.25, rtol=1e-6)
 
 
-def test_along_a_small_way_the_system_is_as_good_as_that_made_anew_at_its_end(rng: np.random.Generator):
+def test_the_extrapolated_system_equals_one_linearised_at_its_end(rng: np.random.Generator):
     surface = Surface(*scene(rng, ROOM))
     source = seen_from(MOTION, scene(rng, ROOM, 60)[0] + 0.05 * rng.standard_normal((300, 3)))
     matches, way = Neighbours(surface, source, 1).matches(MOTION, 1.0), np.array([1, -1, 1, 5, 5, -5]) / 1e3
@@ -70,7 +70,7 @@ def test_along_a_small_way_the_system_is_as_good_as_that_made_anew_at_its_end(rn
     np.testing.assert_allclose(along.gradient, anew.gradient, atol=2e-3 * np.abs(anew.gradient).max())
 
 
-def test_neighbours_that_are_not_looked_for_anew_are_the_nearest_all_the_same(rng: np.random.Generator):
+def test_followed_neighbours_are_the_nearest(rng: np.random.Generator):
     points, normals = scene(rng, ROOM)
     surface, source = Surface(points, normals), seen_from(MOTION, scene(rng, ROOM, 200)[0])
     followed, pose = Neighbours(surface, source, 1), np.eye(4)
@@ -80,14 +80,14 @@ def test_neighbours_that_are_not_looked_for_anew_are_the_nearest_all_the_same(rn
         np.testing.assert_array_equal(kept.planes, fresh.planes)
 
 
-def test_points_without_a_neighbour_within_reach_are_left_out(rng: np.random.Generator):
+def test_points_without_a_neighbour_within_the_distance_are_left_out(rng: np.random.Generator):
     points, normals = wall(rng, *FLOOR)
     source = np.concatenate([points, points[:10] + np.array([0.0, 0.0, 0.5])])
     matches = Neighbours(Surface(points, normals), source, 1).matches(np.eye(4), 0.3)
     np.testing.assert_array_equal(matches.source, points)
 
 
-def test_a_surface_of_one_point_is_everyones_neighbour():
+def test_the_point_of_a_single_point_surface_is_every_points_neighbour():
     surface = Surface(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))
     source = np.array([[0.1, 0.0, 0.2], [0.0, 0.3, -0.1]])
     np.testing.assert_allclose(Neighbours(surface, source, 1).matches(np.eye(4), 1.0).rows[6], [0.2, -0.1])

@@ -3,7 +3,7 @@ import numpy as np
 from hybridlio.registration.voxel_map import CellTable, cells_of
 
 
-def test_a_cell_has_one_key_whatever_else_is_seen(rng: np.random.Generator):
+def test_a_cell_has_the_same_key_whatever_other_points_there_are(rng: np.random.Generator):
     points = rng.uniform(-50, 50, (3000, 3))
     labels, keys = cells_of(points, 2.0)
     assert (np.diff(keys) > 0).all()
@@ -16,12 +16,12 @@ def test_a_cell_has_one_key_whatever_else_is_seen(rng: np.random.Generator):
     np.testing.assert_array_equal(theirs[fewer], keys[labels[some]])
 
 
-def test_of_no_points_there_are_no_cells():
+def test_an_empty_cloud_has_no_cells():
     labels, keys = cells_of(np.empty((0, 3)), 2.0)
     assert len(labels) == len(keys) == 0
 
 
-def test_the_table_counts_like_a_dictionary(rng: np.random.Generator):
+def test_the_cell_table_counts_like_a_dictionary(rng: np.random.Generator):
     table, held, hit = CellTable(), {}, {}
     for time in range(30):
         keys = np.unique(rng.integers(0, 60, 20))
