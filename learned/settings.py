@@ -178,6 +178,7 @@ class OptimiserSettings:
         mirrored, swapped: share of pairs that are seen in a mirror that swaps left and right, and that run backwards,
             from the current scan to the last one.
         points: points of the current cloud that the loss takes, drawn anew each time; 0 takes all.
+        balanced: share of them that comes in equal numbers from those whose normals lie mainly along x, y and z.
     """
 
     epochs: int = 100
@@ -197,6 +198,7 @@ class OptimiserSettings:
     mirrored: float = 0.0
     swapped: float = 0.0
     points: int = 0
+    balanced: float = 0.0
 
     def __post_init__(self) -> None:
         _check_choices(self)
@@ -206,10 +208,9 @@ class OptimiserSettings:
         noises = (self.initial_noise_rad, self.initial_noise_m, self.velocity_noise_m_s)
         if min(self.weight_decay, self.clip_norm, self.points, *noises) < 0:
             raise ConfigError("optimiser: weight_decay, clip_norm, noise and points must be 0 or more")
-        if not (0 <= self.mirrored <= 1 and 0 <= self.swapped <= 1):
-            raise ConfigError(
-                f"optimiser: mirrored and swapped are shares from 0 to 1, got {self.mirrored}, {self.swapped}"
-            )
+        shares = (self.mirrored, self.swapped, self.balanced)
+        if not all(0 <= share <= 1 for share in shares):
+            raise ConfigError(f"optimiser: mirrored, swapped and balanced are shares from 0 to 1, got {shares}")
 
 
 @dataclass(frozen=True)

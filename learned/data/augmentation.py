@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from hybridlio.learned.data.pairs import PairBatch, Pairs
@@ -26,7 +27,7 @@ def training_batch(pairs: Pairs, indices: Sequence[int], settings: OptimiserSett
     draws = np.array([np.random.default_rng([seed, i, _VARYING]).random(2) for i in indices])
     backwards = [i for i, draw in zip(indices, draws, strict=True) if draw[1] < settings.swapped and pairs.swappable(i)]
     batch = mirrored(pairs.batch(indices, backwards), torch.from_numpy(draws[:, 0] < settings.mirrored))
-    return perturbed(with_points(batch, settings.points, seed), settings, seed)
+    return perturbed(with_points(batch, settings, seed), settings, seed)
 
 
 def perturbed(batch: PairBatch, settings: OptimiserSettings, seed: int) -> PairBatch:
@@ -78,16 +79,32 @@ def _mirrored_poses(poses: Tensor, polar: Tensor) -> Tensor:
     return mirror[:, :, None] * poses * mirror[:, None, :]
 
 
-def with_points(batch: PairBatch, count: int, seed: int) -> PairBatch:
-    """Return the batch with ``count`` points of each current cloud, drawn anew for each pair and seed; 0 keeps all."""
+def with_points(batch: PairBatch, settings: OptimiserSettings, seed: int) -> PairBatch:
+    """Return the batch with ``settings.points`` points of each current cloud, drawn anew for each pair and seed.
+
+    A share ``settings.balanced`` of them comes in equal numbers from the points whose normals lie mainly along x, y and
+    z (normal-space sampling: Rusinkiewicz and Levoy, "Efficient variants of the ICP algorithm", 2001). Few surfaces
+    face the direction of travel, so without it the loss hardly weighs how far the sensor went.
+    """
     cloud = batch.current
-    if not count or count >= cloud.points.shape[1]:
+    if not settings.points or settings.points >= cloud.points.shape[1]:
         return batch
-    rows = [
-        torch.from_numpy(np.random.default_rng([seed, int(index), _DRAWING]).integers(0, max(int(size), 1), count))
-        for index, size in zip(batch.index, cloud.there.sum(1), strict=True)
-    ]
-    chosen = torch.stack(rows)
+    axes = torch.where(cloud.normals.any(-1), cloud.normals.abs().argmax(-1), -1).numpy()
+    chosen = torch.stack(
+        [
+            torch.from_numpy(_draw(axis[there], settings, np.random.default_rng([seed, int(index), _DRAWING])))
+            for index, axis, there in zip(batch.index, axes, cloud.there.numpy(), strict=True)
+        ]
+    )
     each = chosen[..., None].expand(-1, -1, 3)
     thinned = Clouds(cloud.points.gather(1, each), cloud.normals.gather(1, each), cloud.there.gather(1, chosen))
     return replace(batch, current=thinned)
+
+
+def _draw(axes: NDArray[np.int64], settings: OptimiserSettings, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Return rows ``(settings.points,)`` of points whose normals lie mainly along ``axes`` (-1 without a normal)."""
+    of_axis = int(settings.points * settings.balanced) // 3
+    groups = [np.flatnonzero(axes == axis) for axis in range(3)]
+    parts = [rng.choice(group, of_axis) for group in groups if len(group)]
+    left = settings.points - sum(map(len, parts))
+    return np.concatenate([*parts, rng.integers(0, max(len(axes), 1), left)]).astype(np.int64)

@@ -73,7 +73,7 @@ def test_the_last_pairs_of_a_recording_do_not_run_backwards(pairs):
 
 def test_points_of_the_current_cloud_are_drawn_and_others_left_alone(pairs):
     batch = pairs.batch([0, 1])
-    drawn = with_points(batch, 50, seed=1)
+    drawn = with_points(batch, OptimiserSettings(points=50), seed=1)
     assert drawn.current.points.shape == (2, 50, 3)
     assert drawn.current.there.all()
     assert drawn.last is batch.last
@@ -81,8 +81,13 @@ def test_points_of_the_current_cloud_are_drawn_and_others_left_alone(pairs):
     assert {tuple(p) for p in drawn.current.points[1].tolist()} <= whole
 
 
+def test_points_are_drawn_alike_by_the_axis_of_their_normals(pairs):
+    drawn = with_points(pairs.batch([0]), OptimiserSettings(points=90, balanced=1.0), seed=1)
+    assert torch.bincount(drawn.current.normals[0].abs().argmax(-1)).tolist() == [30, 30, 30]
+
+
 def test_how_a_pair_is_varied_depends_on_the_pair_and_the_seed_alone(pairs):
-    settings = OptimiserSettings(mirrored=0.5, swapped=0.5, points=40, initial_noise_m=0.1)
+    settings = OptimiserSettings(mirrored=0.5, swapped=0.5, points=40, balanced=0.5, initial_noise_m=0.1)
     whole, part = training_batch(pairs, [0, 1, 2, 3], settings, 7), training_batch(pairs, [2], settings, 7)
     assert torch.equal(whole.network.last[2], part.network.last[0])
     assert torch.equal(whole.current.points[2], part.current.points[0])

@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.learned.data.pairs import Pairs
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
-from hybridlio.learned.networks.weights import load_weights, own_tensors, put_weights, save_weights, shipped
+from hybridlio.learned.networks.weights import load_weights, own_tensors, put_weights, save_weights, shipped, weights_path
 
 
 @pytest.mark.parametrize("siamese", ["shared", "twins"])
@@ -68,8 +68,8 @@ def test_training_needs_neither_gtsam_nor_open3d_nor_small_gicp(project_root):
         "for name in ('gtsam', 'open3d', 'small_gicp', 'pydantic', 'typer', 'filterpy', 'matplotlib'):\n"
         "    sys.modules[name] = None\n"
         "import importlib, pathlib\n"
-        "for path in sorted(pathlib.Path('learned').glob('*.py')):\n"
-        "    importlib.import_module(f'hybridlio.learned.{path.stem}')\n"
+        "for path in sorted(pathlib.Path('learned').rglob('*.py')):\n"
+        "    importlib.import_module('.'.join(['hybridlio', *path.with_suffix('').parts]))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=project_root, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-1000:]
@@ -82,3 +82,13 @@ def test_the_shipped_weights_load_and_are_small():
     assert sum(file.stat().st_size for file in path.parent.glob("*.safetensors")) <= 25e6
     with pytest.raises(ConfigError, match="default"):
         shipped("nothing")
+
+
+def test_weights_are_chosen_by_path_by_the_name_of_shipped_ones_or_as_shipped(tmp_path, monkeypatch):
+    assert weights_path("shipped") == weights_path("default") == shipped()
+    assert weights_path(tmp_path / "mine.safetensors") == tmp_path / "mine.safetensors"
+    with pytest.raises(ConfigError, match="there are default"):
+        weights_path("nothing")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "default").write_bytes(b"")
+    assert str(weights_path("default")) == "default"
