@@ -10,7 +10,14 @@ from safetensors.torch import save_file
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.learned.data.pairs import Pairs
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
-from hybridlio.learned.networks.weights import load_weights, own_tensors, put_weights, save_weights, shipped, weights_path
+from hybridlio.learned.networks.weights import (
+    load_weights,
+    own_tensors,
+    put_weights,
+    save_weights,
+    shipped,
+    weights_path,
+)
 
 
 @pytest.mark.parametrize("siamese", ["shared", "twins"])
