@@ -1,4 +1,4 @@
-"""The factor graph: GTSAM lives here and nowhere else."""
+"""Factor graphs; no other package imports GTSAM."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""The pose graph on its own: laws, closed forms, and GTSAM as the reference."""
+"""PoseGraph against GTSAM, closed forms and invariants."""
 
 from __future__ import annotations
 
 import re
+from typing import ClassVar
 
 import gtsam
 import numpy as np
@@ -22,7 +23,7 @@ def random_covariance(rng: np.random.Generator, size: int = 6) -> np.ndarray:
 
 
 def random_graph(rng: np.random.Generator, count: int = 12, dimension: int = 3, robust: str | None = None) -> PoseGraph:
-    """A chain with loops, noise, full covariances, and a prior at pose 0."""
+    """Return a noisy chain with loops, full covariances, and a prior at pose 0."""
     tangent = np.zeros((count, 6))
     used = slice(0, 6) if dimension == 3 else slice(2, 5)
     size = 6 if dimension == 3 else 3
@@ -42,7 +43,7 @@ def random_graph(rng: np.random.Generator, count: int = 12, dimension: int = 3, 
 
 
 def reference(graph: PoseGraph, start: np.ndarray) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """The same graph in space, written down for GTSAM by hand, and solved."""
+    """Return the same graph in space built by hand in GTSAM, and its solution."""
     bare, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for factor in graph.factors.values():
         x, y, z, *q = factor.measured
@@ -55,7 +56,7 @@ def reference(graph: PoseGraph, start: np.ndarray) -> tuple[gtsam.NonlinearFacto
     return bare, gtsam.GaussNewtonOptimizer(bare, values).optimize()
 
 
-def test_poses_errors_and_covariances_are_those_of_gtsam(rng):
+def test_poses_errors_and_covariances_equal_gtsams(rng):
     graph = random_graph(rng)
     solution = graph.optimize(tolerance=1e-12)
     bare, values = reference(graph, solution.poses)
@@ -69,7 +70,7 @@ def test_poses_errors_and_covariances_are_those_of_gtsam(rng):
         np.testing.assert_allclose(solution.covariance(key), marginals.marginalCovariance(key), rtol=1e-3, atol=1e-7)
 
 
-def test_a_chains_covariance_is_the_compounded_one(rng):
+def test_the_covariance_of_a_chain_is_the_compounded_one(rng):
     graph = PoseGraph()
     steps, covariances = se3.exp(rng.normal(size=(3, 6))), [random_covariance(rng) for _ in range(3)]
     prior = random_covariance(rng)
@@ -88,7 +89,7 @@ def test_a_chains_covariance_is_the_compounded_one(rng):
     assert solution.error == pytest.approx(0, abs=1e-12)
 
 
-def test_a_planar_graph_is_the_same_as_one_in_space_that_cannot_leave_the_plane(rng):
+def test_a_planar_graph_equals_a_graph_in_space_confined_to_the_plane(rng):
     flat = random_graph(rng, dimension=2)
     space = PoseGraph()
     for factor in flat.factors.values():
@@ -110,7 +111,7 @@ def test_a_planar_graph_is_the_same_as_one_in_space_that_cannot_leave_the_plane(
 
 
 @pytest.mark.parametrize("method", ["odometry", "spanning-tree", "chordal"])
-def test_every_way_to_initialise_ends_at_the_same_answer(rng, method):
+def test_every_initialisation_leads_to_the_same_solution(rng, method):
     graph = random_graph(rng)
     best = graph.optimize(tolerance=1e-9)
     graph.initialise(method)
@@ -118,7 +119,7 @@ def test_every_way_to_initialise_ends_at_the_same_answer(rng, method):
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_chordal_initialisation_of_a_graph_without_noise_is_exact(rng, dimension):
+def test_chordal_initialisation_of_a_noiseless_graph_is_exact(rng, dimension):
     graph = random_graph(rng, dimension=dimension)
     truth = graph.optimize().poses
     exact = PoseGraph(dimension)
@@ -131,7 +132,7 @@ def test_chordal_initialisation_of_a_graph_without_noise_is_exact(rng, dimension
     np.testing.assert_allclose([exact.initial(key) for key in exact.keys], truth, atol=1e-9)
 
 
-def test_a_bad_initial_guess_is_left_for_a_better_one(rng):
+def test_bad_initial_values_are_replaced_by_better_ones(rng):
     graph = random_graph(rng)
     best = graph.optimize()
     for key in graph.keys[1:]:
@@ -140,7 +141,7 @@ def test_a_bad_initial_guess_is_left_for_a_better_one(rng):
     assert solution.error == pytest.approx(best.error, rel=1e-6)
 
 
-def test_chi2_is_the_residual_in_units_of_the_covariance_and_halves_sum_to_the_error(rng):
+def test_chi2_is_the_squared_whitened_residual_and_sums_to_twice_the_error(rng):
     graph = random_graph(rng)
     solution = graph.optimize()
     for number, factor in graph.factors.items():
@@ -159,7 +160,7 @@ def reference_pose(graph: PoseGraph, number: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kernel", ["huber", "cauchy", "geman-mcclure", "dcs"])
-def test_a_robust_kernel_keeps_a_wrong_loop_from_bending_the_chain(rng, kernel):
+def test_a_robust_kernel_limits_the_effect_of_a_wrong_loop(rng, kernel):
     graph = PoseGraph()
     graph.add_prior(0, np.eye(4), sigmas=1e-3)
     step = se3.exp([0, 0, 0.1, 1, 0, 0])
@@ -181,15 +182,15 @@ def test_a_robust_kernel_keeps_a_wrong_loop_from_bending_the_chain(rng, kernel):
 
 @pytest.mark.parametrize("kernel", ["huber", "cauchy", "geman-mcclure", "dcs"])
 @pytest.mark.parametrize("norm", [0.5, 1.9, 2.1, 30.0])
-def test_a_kernels_loss_and_weight_are_gtsams(kernel, norm):
+def test_loss_and_weight_of_a_kernel_equal_gtsams(kernel, norm):
     name = {"huber": "Huber", "cauchy": "Cauchy", "geman-mcclure": "GemanMcClure", "dcs": "DCS"}[kernel]
-    own = Robust(kernel, 2.0)
+    ours = Robust(kernel, 2.0)
     theirs = getattr(gtsam.noiseModel.mEstimator, name)(4.0 if kernel == "dcs" else 2.0)
-    assert own.loss(norm**2) == pytest.approx(2 * theirs.loss(norm))
-    assert own.weight(norm) == pytest.approx(theirs.weight(norm))
+    assert ours.loss(norm**2) == pytest.approx(2 * theirs.loss(norm))
+    assert ours.weight(norm) == pytest.approx(theirs.weight(norm))
 
 
-def test_removing_a_factor_is_as_if_it_had_never_been_there(rng):
+def test_removing_a_factor_restores_the_solution_without_it(rng):
     graph = random_graph(rng)
     before = graph.optimize()
     number = graph.add_between(1, 8, np.eye(4), sigmas=SIGMAS)
@@ -201,7 +202,7 @@ def test_removing_a_factor_is_as_if_it_had_never_been_there(rng):
     assert graph.add_between(1, 8, np.eye(4), sigmas=SIGMAS) != number
 
 
-def test_sigmas_covariance_and_information_say_the_same(rng):
+def test_sigmas_covariance_and_information_are_equivalent(rng):
     step, covariance = se3.exp(rng.normal(size=6)), np.diag(SIGMAS**2)
     found = []
     for noise in ({"sigmas": SIGMAS}, {"covariance": covariance}, {"information": np.linalg.inv(covariance)}):
@@ -215,7 +216,7 @@ def test_sigmas_covariance_and_information_say_the_same(rng):
     np.testing.assert_allclose(found[0], covariance, rtol=1e-6, atol=1e-9)
 
 
-def test_robots_share_a_graph_by_keys_of_robot_and_index(rng):
+def test_robots_share_a_graph_with_keys_of_robot_and_index(rng):
     graph = PoseGraph()
     step = se3.exp([0, 0, 0.2, 1, 0, 0])
     graph.add_prior((0, 0), np.eye(4), sigmas=0.01)
@@ -229,7 +230,7 @@ def test_robots_share_a_graph_by_keys_of_robot_and_index(rng):
     assert len(graph.components()) == 1
 
 
-def test_parts_that_are_each_anchored_are_solved_together_and_told(rng):
+def test_parts_that_are_each_anchored_are_solved_together(rng):
     graph = random_graph(rng, count=9)
     graph.add_prior(100, np.eye(4), sigmas=0.1)
     graph.add_between(100, 101, se3.exp([0, 0, 1, 1, 0, 0]), sigmas=0.1)
@@ -237,19 +238,34 @@ def test_parts_that_are_each_anchored_are_solved_together_and_told(rng):
     np.testing.assert_allclose(graph.optimize().pose(101), se3.exp([0, 0, 1, 1, 0, 0]), atol=1e-6)
 
 
-def test_progress_is_told_with_a_falling_error(rng):
-    told: list[tuple[str, int, float]] = []
+def test_progress_reports_a_falling_error(rng):
+    reports: list[tuple[str, int, float]] = []
     graph = random_graph(rng)
     for key in graph.keys:
         graph.set_initial(key, np.eye(4))
-    solution = graph.optimize(initial="given", progress=lambda *news: told.append(news))
-    errors = [error for _, _, error in told]
-    assert len(told) == solution.iterations > 1
+    solution = graph.optimize(initial="given", progress=lambda *report: reports.append(report))
+    errors = [error for _, _, error in reports]
+    assert len(reports) == solution.iterations > 1
     assert errors == sorted(errors, reverse=True)
     assert errors[-1] == pytest.approx(solution.error)
 
 
-def test_a_solution_starts_the_next_one(rng):
+class Poses:
+    """Anything with keys and coordinates."""
+
+    keys: ClassVar = [1, 99]
+    coordinates = np.array([[1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0], np.zeros(7)])
+
+
+def test_start_from_takes_anything_with_keys_and_coordinates(rng):
+    graph = random_graph(rng)
+    graph.start_from(Poses())
+    np.testing.assert_array_equal(graph.initial(1), se3.make(np.eye(3), [1.0, 2.0, 3.0]))
+    assert graph.initial(2) is None
+    assert 99 not in graph
+
+
+def test_start_from_takes_a_solutions_poses(rng):
     graph = random_graph(rng)
     solution = graph.optimize()
     graph.start_from(solution)
@@ -257,7 +273,7 @@ def test_a_solution_starts_the_next_one(rng):
     assert again.error_before == pytest.approx(solution.error, rel=1e-9)
 
 
-def test_fixed_poses_stay_where_they_are_and_the_rest_lies_between():
+def test_fixed_poses_stay_and_free_poses_lie_between_them():
     graph = PoseGraph()
     for key, x in ((0, 0.0), (4, 4.4)):
         graph.add_pose(key, se3.make(np.eye(3), [x, 0, 0]))
@@ -271,7 +287,7 @@ def test_fixed_poses_stay_where_they_are_and_the_rest_lies_between():
     np.testing.assert_allclose(graph.optimize().pose(4)[:3, 3], [4.0, 0, 0], atol=1e-6)
 
 
-def test_a_fixed_pose_without_a_place_is_refused():
+def test_a_fixed_pose_without_initial_value_is_refused():
     graph = PoseGraph()
     graph.add_pose(3)
     graph.fix(3)
@@ -280,7 +296,7 @@ def test_a_fixed_pose_without_a_place_is_refused():
 
 
 @pytest.mark.parametrize(("solver", "dimension"), [("batch", 3), ("gnc", 3), ("batch", 2)])
-def test_a_straight_chain_of_5000_poses_solves_in_every_solver(rng, solver, dimension):
+def test_every_backend_solves_a_straight_chain_of_5000_poses(rng, solver, dimension):
     graph, used = PoseGraph(dimension), slice(0, 6) if dimension == 3 else slice(2, 5)
     graph.add_prior(0, np.eye(4), sigmas=1e-6)
     step = se3.make(np.eye(3), [1.0, 0, 0])
@@ -291,12 +307,12 @@ def test_a_straight_chain_of_5000_poses_solves_in_every_solver(rng, solver, dime
         graph.set_initial(k + 1, se3.make(np.eye(3), [k + 1.0, 0, 0]) @ se3.exp(off))
     solution = graph.optimize(solver, initial="given")
     np.testing.assert_allclose(solution.pose(4999)[:3, 3], [4999, 0, 0], atol=1e-3)
-    # the heading walks randomly, so the far end's side is off by σ √(n³/3)
-    side = solution.covariance(4999)[4, 4] if dimension == 3 else solution.covariance(4999)[2, 2]
-    assert np.sqrt(side) == pytest.approx(1e-4 * np.sqrt(4999**3 / 3), rel=0.01)
+    # heading noise integrates to a lateral standard deviation of σ √(n³/3) at the far end
+    lateral = solution.covariance(4999)[4, 4] if dimension == 3 else solution.covariance(4999)[2, 2]
+    assert np.sqrt(lateral) == pytest.approx(1e-4 * np.sqrt(4999**3 / 3), rel=0.01)
 
 
-def test_the_public_names_are_those_that_users_need():
+def test_the_public_names_are_exactly_these():
     assert {name for name in dir(PoseGraph()) if not name.startswith("_")} == {
         *("dimension", "keys", "factors", "fixed", "origin", "components"),
         *("add_pose", "initial", "set_initial", "start_from", "fix", "unfix", "set_origin", "remove"),

@@ -1,4 +1,4 @@
-"""However bad the given initial values are, a real benchmark reaches the error that GTSAM reaches from good ones."""
+"""From any initial values, a public benchmark reaches the error that GTSAM reaches from good ones."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ def sphere(shared_data: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def best(sphere: Path) -> float:
-    """GTSAM's least error, from the initial values of the file."""
+    """Return GTSAM's error from the initial values of the file."""
     graph, values = gtsam.readG2o(str(sphere), True)
     graph.add(gtsam.PriorFactorPose3(0, values.atPose3(0), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
     return float(graph.error(gtsam.GaussNewtonOptimizer(graph, values).optimize()))
 
 
 def starts(count: int, seed: int | None) -> Any:
-    """All poses at the identity (no seed), or anywhere and anyhow."""
+    """Return all poses at the identity (no seed), or random ones."""
     if seed is None:
         return np.tile(np.eye(4), (count, 1, 1))
     rng = np.random.default_rng(seed)

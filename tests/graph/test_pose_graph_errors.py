@@ -1,4 +1,4 @@
-"""What is wrong with a graph is said by name, and leaves the graph as it was."""
+"""Errors name the factor or pose at fault and leave the graph unchanged."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_an_error_names_the_offender_and_leaves_the_graph_as_it_was(case):
+def test_an_error_names_the_cause_and_leaves_the_graph_unchanged(case):
     call, kind, message = WRONG[case]
     graph = small_graph()
     before, initial = (graph.keys, dict(graph.factors), graph.fixed), [graph.initial(key) for key in graph.keys]
@@ -85,13 +85,13 @@ def test_an_error_names_the_offender_and_leaves_the_graph_as_it_was(case):
         np.testing.assert_array_equal(graph.initial(key), pose)
 
 
-def test_imu_samples_out_of_order_are_refused_with_their_row():
+def test_imu_samples_out_of_order_are_refused_by_row():
     stamps = np.array([0, 10, 5]) * 1_000_000
     with pytest.raises(DataError, match="row 2"):
         small_graph().add_imu(0, 1, ImuSamples(stamps, np.zeros((3, 3)), np.zeros((3, 3))))
 
 
-def test_a_graph_without_prior_is_refused_and_its_keys_named():
+def test_a_graph_without_anchor_is_refused_by_key():
     graph = PoseGraph()
     graph.add_pose(3)
     graph.add_between(3, 4, np.eye(4), sigmas=0.1)
@@ -99,14 +99,14 @@ def test_a_graph_without_prior_is_refused_and_its_keys_named():
         graph.optimize()
 
 
-def test_a_pose_that_no_factor_concerns_is_named():
+def test_a_pose_without_factors_is_named():
     graph = small_graph()
     graph.add_pose(77, np.eye(4))
     with pytest.raises(GraphError, match="no factor concerns pose 77"):
         graph.optimize()
 
 
-def test_parts_that_nothing_joins_are_named():
+def test_parts_that_no_factor_joins_are_named():
     graph = small_graph()
     graph.add_pose(10)
     graph.add_between(10, 11, np.eye(4), sigmas=0.1)
@@ -115,7 +115,7 @@ def test_parts_that_nothing_joins_are_named():
         graph.optimize()
 
 
-def test_what_gps_leaves_free_is_named():
+def test_directions_that_gps_does_not_determine_are_named():
     graph = PoseGraph()
     graph.add_pose(0)
     for k in range(3):
@@ -130,7 +130,7 @@ def test_what_gps_leaves_free_is_named():
     np.testing.assert_allclose(graph.optimize().pose(2)[:3, 3], [2, 0, 0], atol=1e-5)
 
 
-def test_a_speed_that_nothing_tells_is_refused():
+def test_an_undetermined_velocity_is_refused():
     graph = PoseGraph()
     graph.add_prior(0, np.eye(4), sigmas=0.1)
     graph.add_pose(1, np.eye(4))
@@ -139,7 +139,7 @@ def test_a_speed_that_nothing_tells_is_refused():
         graph.optimize()
 
 
-def test_missing_initial_values_are_named_where_the_given_ones_are_asked_for():
+def test_initial_given_names_poses_without_initial_value():
     with pytest.raises(GraphError, match="pose 1, 2 has no initial value"):
         small_graph().optimize(initial="given")
 
@@ -151,7 +151,7 @@ def test_a_broken_odometry_chain_is_named():
         graph.initialise("odometry")
 
 
-def test_a_planar_graph_refuses_what_leaves_the_plane():
+def test_a_planar_graph_refuses_poses_and_factors_out_of_the_plane():
     graph = PoseGraph(dimension=2)
     graph.add_prior(0, np.eye(3), sigmas=0.1)
     tilted = np.eye(4)
@@ -167,9 +167,9 @@ def test_an_empty_graph_is_refused():
         PoseGraph().optimize()
 
 
-def test_a_solution_knows_what_it_does_not_have():
+def test_a_solution_refuses_unknown_keys_and_quantities():
     solution = small_graph().optimize()
-    for ask, message in [
+    for call, message in [
         (lambda: solution.pose(9), "key 9"),
         (lambda: solution.covariance(9), "key 9"),
         (lambda: solution.velocity(1), "pose 1 has no velocity"),
@@ -177,4 +177,4 @@ def test_a_solution_knows_what_it_does_not_have():
         (lambda: solution.chi2(55), "no factor has id 55"),
     ]:
         with pytest.raises(GraphError, match=message):
-            ask()
+            call()

@@ -1,4 +1,4 @@
-"""Fixes by latitude and longitude: where they lie in world, about which origin, and that files keep it."""
+"""GPS fixes by latitude and longitude: positions in world, the origin, and files that keep it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PLACES = [(49.02, 8.43, 130.0), (48.99, 8.40, 90.0), (49.011, 8.45, 115.0)]
 
 
 def earth_centred(latitude_deg: float, longitude_deg: float, height_m: float) -> np.ndarray:
-    """WGS 84 to earth-centred coordinates, by the closed form."""
+    """Convert WGS 84 to earth-centred coordinates in closed form."""
     a, f = 6378137.0, 1 / 298.257223563
     phi, lam = np.radians([latitude_deg, longitude_deg])
     e2 = f * (2 - f)
@@ -39,7 +39,7 @@ def one_pose() -> PoseGraph:
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_a_fix_lies_where_the_closed_form_says(place):
+def test_the_position_of_a_fix_equals_the_closed_form(place):
     graph = one_pose()
     graph.set_origin(*ORIGIN)
     number = graph.add_gps_geodetic(0, *place, sigmas=[1.0, 2.0, 3.0], lever_arm_m=[0.5, 0.0, 1.0], robust="huber")
@@ -50,7 +50,7 @@ def test_a_fix_lies_where_the_closed_form_says(place):
     assert factor.robust.kernel == "huber"
 
 
-def test_the_first_fix_is_the_origin_and_stays_so():
+def test_the_first_fix_is_the_origin_and_remains_it():
     graph = one_pose()
     first = graph.add_gps_geodetic(0, *PLACES[0], sigmas=1.0)
     assert graph.origin == PLACES[0]
@@ -58,13 +58,13 @@ def test_the_first_fix_is_the_origin_and_stays_so():
     graph.remove(first)
     later = graph.add_gps_geodetic(0, *PLACES[1], sigmas=1.0)
     np.testing.assert_allclose(graph.factors[later].measured[:3], east_north_up(PLACES[1], graph.origin), atol=1e-6)
-    graph.set_origin(*PLACES[0])  # the same once more
+    graph.set_origin(*PLACES[0])  # setting the same origin again is allowed
     with pytest.raises(GraphError, match=r"origin at \(49\.02, 8\.43, 130\.0\); it cannot move"):
         graph.set_origin(*ORIGIN)
     assert graph.origin == PLACES[0]
 
 
-def test_a_longitude_may_be_counted_from_zero_to_360():
+def test_longitudes_from_zero_to_360_are_accepted():
     west, east = one_pose(), one_pose()
     for graph, longitude in ((west, -0.001), (east, 359.999)):
         graph.set_origin(51.5, 0.0, 0.0)
@@ -72,8 +72,8 @@ def test_a_longitude_may_be_counted_from_zero_to_360():
     np.testing.assert_allclose(west.factors[1].measured, east.factors[1].measured, atol=1e-6)
 
 
-def test_fixes_on_earth_and_in_world_place_a_drive_alike(rng):
-    """A drive is placed by fixes of an antenna off the body; the way back gives the fixes' latitudes."""
+def test_geodetic_fixes_place_a_drive_and_convert_back(rng):
+    """The antenna is off the body's origin; the solved poses convert back to the fixes' latitudes and longitudes."""
     lever = np.array([0.4, -0.2, 1.1])
     truth = [se3.exp([0, 0, 2.0, 250, -80, 12])]
     for _ in range(19):
@@ -111,7 +111,7 @@ def test_files_and_copies_keep_the_origin_to_the_last_bit(tmp_path):
 
 
 @pytest.mark.parametrize("origin", [[95.0, 8.0, 0.0], [49.0, 8.0], [np.nan, 8.0, 0.0], 7.0])
-def test_a_file_whose_origin_is_nowhere_is_refused(tmp_path, origin):
+def test_a_file_with_an_invalid_origin_is_refused(tmp_path, origin):
     one_pose().save(tmp_path / "graph.npz")
     with np.load(tmp_path / "graph.npz") as archive:
         arrays = dict(archive)
@@ -120,7 +120,7 @@ def test_a_file_whose_origin_is_nowhere_is_refused(tmp_path, origin):
         PoseGraph.load(tmp_path / "graph.npz")
 
 
-def test_a_planar_graph_has_no_place_on_earth():
+def test_a_planar_graph_refuses_an_origin_and_geodetic_fixes():
     graph = PoseGraph(dimension=2)
     graph.add_prior(0, np.eye(4), sigmas=1.0)
     for call in (lambda: graph.set_origin(*ORIGIN), lambda: graph.add_gps_geodetic(0, *ORIGIN, sigmas=1.0)):

@@ -1,4 +1,4 @@
-"""Inertial factors, GPS and attitude in a pose graph, on simulated drives of known noise."""
+"""Inertial, GPS and attitude factors of a pose graph on simulated drives of known noise."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from hybridlio.core import se3
 from hybridlio.core.sensors import ImuNoise, ImuSamples
 from hybridlio.graph import PoseGraph
 
-STEP_SIGMAS = np.r_[np.full(3, 1e-3), np.full(3, 0.02)]  # as the simulated drive's
+STEP_SIGMAS = np.r_[np.full(3, 1e-3), np.full(3, 0.02)]  # rad, m: noise of the simulated drive
 
 
 def inertial_graph(drive, steps: bool = True) -> tuple[PoseGraph, np.ndarray, np.ndarray]:
-    """The drive's IMU from pose to pose, its relative poses; true poses and velocities in a world with z up."""
+    """Return a graph of the drive's IMU and relative poses, and true poses and velocities in a world with z up."""
     g = drive.gravity / np.linalg.norm(drive.gravity)
     tilt = np.array([[0, 0, -1.0]]).T
     axis, angle = np.cross(g, tilt[:, 0]), np.arccos(np.clip(g @ tilt[:, 0], -1, 1))
@@ -37,7 +37,7 @@ def errors(solution, truth: np.ndarray) -> np.ndarray:
     return np.linalg.norm(solution.poses[:, :3, 3] - truth[:, :3, 3], axis=1)
 
 
-def test_inertial_factors_find_velocity_and_biases_and_better_poses(chain):
+def test_inertial_factors_estimate_velocity_and_biases_and_improve_poses(chain):
     drive = chain(3, steps=60)
     graph, poses, velocities = inertial_graph(drive)
     alone = PoseGraph()
@@ -65,7 +65,7 @@ def _matrix(coordinates: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("lever", [(0.0, 0.0, 0.0), (1.0, -0.5, 0.8)])
-def test_gps_with_a_lever_arm_places_a_drive_that_has_no_prior(chain, rng, lever):
+def test_gps_with_a_lever_arm_places_a_drive_without_prior(chain, rng, lever):
     drive = chain(5, steps=60)
     truth = se3.exp([0, 0, 2.0, 0, 0, 0]) @ se3.make(np.eye(3), [300.0, -200, 10]) @ drive.poses
     T = drive.calibration.T_imu_lidar
@@ -84,7 +84,7 @@ def test_gps_with_a_lever_arm_places_a_drive_that_has_no_prior(chain, rng, lever
     assert np.linalg.norm(turned, axis=1).max() < 0.03
 
 
-def test_gravity_levels_a_pose_but_leaves_its_heading():
+def test_gravity_levels_a_pose():
     graph = PoseGraph()
     truth = se3.exp([0.2, -0.1, 0.0, 0, 0, 0])
     graph.add_prior(0, np.eye(4), sigmas=[10, 10, 0.01, 1, 1, 1])
@@ -93,7 +93,7 @@ def test_gravity_levels_a_pose_but_leaves_its_heading():
     np.testing.assert_allclose(up, truth[2, :3], atol=1e-5)
 
 
-def test_standing_still_shows_the_biases(rng):
+def test_standing_still_determines_the_biases(rng):
     noise = ImuNoise()
     gyro_bias = np.array([0.004, -0.006, 0.008])
     graph = PoseGraph()
@@ -113,7 +113,7 @@ def test_standing_still_shows_the_biases(rng):
     np.testing.assert_allclose(solution.pose(5), np.eye(4), atol=1e-3)
 
 
-def test_a_bias_that_is_given_takes_the_place_of_the_one_at_power_up(chain):
+def test_a_bias_factor_replaces_the_prior_of_zero_bias(chain):
     drive = chain(7, steps=20)
     graph, _, _ = inertial_graph(drive)
     given = np.array([0.3, -0.2, 0.1])
@@ -121,7 +121,7 @@ def test_a_bias_that_is_given_takes_the_place_of_the_one_at_power_up(chain):
     np.testing.assert_allclose(graph.optimize().bias(0)[0], given, atol=0.01)
 
 
-def test_a_velocity_is_believed_as_much_as_it_is_sure(chain):
+def test_a_precise_velocity_factor_overrides_the_estimate(chain):
     drive = chain(9, steps=20)
     graph, _, velocities = inertial_graph(drive)
     free = graph.optimize()
@@ -130,7 +130,7 @@ def test_a_velocity_is_believed_as_much_as_it_is_sure(chain):
     assert np.linalg.norm(free.velocity(10) - velocities[10]) < 0.15
 
 
-def test_biases_that_nothing_tells_stay_at_zero():
+def test_unobserved_biases_stay_at_zero():
     graph = PoseGraph()
     graph.add_prior(0, np.eye(4), sigmas=10)
     graph.add_pose(1, np.eye(4))

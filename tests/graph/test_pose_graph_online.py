@@ -1,4 +1,4 @@
-"""Backends agree on the same factors, and an online solver follows its graph: what comes, what goes, what is wrong."""
+"""Agreement of all backends, and online solvers under additions, removals, marginalisation and errors."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def noisy(rng: np.random.Generator, xi: np.ndarray, dimension: int) -> np.ndarra
 
 
 def grow(graph: PoseGraph, rng: np.random.Generator, k: int) -> None:
-    """Pose ``k``: a step, and at every tenth a loop to twenty poses before."""
+    """Add pose ``k`` with a step, and at every tenth pose a loop to twenty poses before."""
     sigmas = SIGMAS[used(graph.dimension)]
     if k == 0:
         graph.add_prior(0, np.eye(4), sigmas=1e-3)
@@ -44,7 +44,7 @@ def looped(rng: np.random.Generator, dimension: int, count: int = 60) -> PoseGra
 
 
 def sigmas_off(a: np.ndarray, b: np.ndarray, covariance: np.ndarray) -> float:
-    """Between two poses, in standard deviations."""
+    """Return the distance between two poses in standard deviations."""
     xi = se3.log(se3.between(a, b))
     xi = xi if len(covariance) == 6 else xi[2:5]
     return float(np.sqrt(xi @ np.linalg.solve(covariance, xi)))
@@ -55,8 +55,7 @@ def sigmas_off(a: np.ndarray, b: np.ndarray, covariance: np.ndarray) -> float:
 def test_backends_agree_to_a_fiftieth_of_a_standard_deviation(rng, backend, dimension):
     graph = looped(rng, dimension)
     best, solution = graph.optimize(tolerance=1e-12), graph.optimize(backend)
-    kept = 1 - len(solution.rejected)  # gnc may leave out one right loop in a hundred
-    assert kept == 1
+    assert not solution.rejected
     assert max(sigmas_off(best.pose(k), solution.pose(k), best.covariance(k)) for k in graph.keys) < 0.02
     assert solution.error == pytest.approx(best.error, rel=1e-3)
     np.testing.assert_allclose(solution.covariance(59), best.covariance(59), rtol=0.05, atol=1e-6)
@@ -64,7 +63,7 @@ def test_backends_agree_to_a_fiftieth_of_a_standard_deviation(rng, backend, dime
 
 @pytest.mark.parametrize("backend", ["incremental", "fixed-lag"])
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_an_online_solver_gives_what_batch_gives_of_the_graph_so_far(rng, backend, dimension):
+def test_an_online_solver_equals_batch_on_the_graph_so_far(rng, backend, dimension):
     graph = PoseGraph(dimension)
     solver = graph.online(backend, lag=100)
     for k in range(45):
@@ -74,13 +73,13 @@ def test_an_online_solver_gives_what_batch_gives_of_the_graph_so_far(rng, backen
             best = graph.optimize(tolerance=1e-12)
             assert solver.keys == graph.keys
             assert sigmas_off(best.pose(k), solver.pose(k), best.covariance(k)) < 0.05
-            for ask in ("covariance", k), ("relative_covariance", k // 2, k), ("relative_covariance", k, k // 2):
-                mine, theirs = (getattr(of, ask[0])(*ask[1:]) for of in (solver, best))
-                np.testing.assert_allclose(mine, theirs, rtol=0.05, atol=1e-3 * theirs.max())
+            for call in ("covariance", k), ("relative_covariance", k // 2, k), ("relative_covariance", k, k // 2):
+                online, batch = (getattr(result, call[0])(*call[1:]) for result in (solver, best))
+                np.testing.assert_allclose(online, batch, rtol=0.05, atol=1e-3 * batch.max())
 
 
 @pytest.mark.parametrize("backend", ["incremental", "fixed-lag"])
-def test_what_is_taken_out_of_the_graph_is_taken_out_of_the_solver(rng, backend):
+def test_a_factor_removed_from_the_graph_is_removed_from_the_solver(rng, backend):
     graph = looped(rng, 3, count=30)
     solver = graph.online(backend)
     solver.update()
@@ -95,7 +94,7 @@ def test_what_is_taken_out_of_the_graph_is_taken_out_of_the_solver(rng, backend)
     np.testing.assert_allclose(solver.pose(29), before, atol=1e-3)
 
 
-def test_poses_can_be_held_and_let_go(rng):
+def test_poses_can_be_fixed_and_released(rng):
     graph = looped(rng, 3, count=10)
     solver = graph.online()
     solver.update()
@@ -111,7 +110,7 @@ def test_poses_can_be_held_and_let_go(rng):
 
 
 @pytest.mark.parametrize("backend", ["incremental", "fixed-lag"])
-def test_news_that_do_not_determine_a_pose_are_refused_and_change_nothing(rng, backend):
+def test_changes_that_leave_a_pose_undetermined_are_refused_and_change_nothing(rng, backend):
     graph = looped(rng, 3, count=10)
     solver = graph.online(backend)
     solver.update()
@@ -137,7 +136,7 @@ def test_news_that_do_not_determine_a_pose_are_refused_and_change_nothing(rng, b
 
 
 @pytest.mark.parametrize("backend", ["incremental", "fixed-lag"])
-def test_a_solver_that_failed_inside_goes_on_as_if_nothing_had_been(rng, backend, monkeypatch):
+def test_a_solver_recovers_from_a_failure_inside_gtsam(rng, backend, monkeypatch):
     graph = looped(rng, 3, count=40)
     solver = graph.online(backend, lag=30)
     for _ in range(3):
@@ -158,7 +157,7 @@ def test_a_solver_that_failed_inside_goes_on_as_if_nothing_had_been(rng, backend
     np.testing.assert_allclose(solver.pose(90), solver.pose(39) @ se3.exp(STEP), atol=1e-6)
 
 
-def test_a_pose_that_left_the_lag_stays_where_it_was_and_takes_no_factors(rng):
+def test_a_pose_that_left_the_lag_keeps_its_estimate_and_takes_no_factors(rng):
     graph = PoseGraph()
     solver = graph.online("fixed-lag", lag=25)
     for k in range(60):
@@ -183,12 +182,12 @@ def test_a_pose_that_left_the_lag_stays_where_it_was_and_takes_no_factors(rng):
         solver.update()
 
 
-def test_a_lag_holds_a_constant_number_of_poses_and_factors_in_solver_and_graph(rng):
+def test_a_lag_bounds_the_size_of_solver_and_graph(rng):
     graph = PoseGraph()
     solver = graph.online("fixed-lag", lag=25, forget=True)
     whole, sizes = PoseGraph(), []
     for k in range(120):
-        state = rng.bit_generator.state
+        state = rng.bit_generator.state  # both graphs get the same noise
         grow(graph, rng, k)
         rng.bit_generator.state = state
         grow(whole, rng, k)
@@ -202,7 +201,7 @@ def test_a_lag_holds_a_constant_number_of_poses_and_factors_in_solver_and_graph(
     np.testing.assert_array_equal(graph.initial(10), solver.pose(10))
 
 
-def test_a_loop_longer_than_the_lag_is_refused_by_name(rng):
+def test_a_loop_longer_than_the_lag_is_refused_by_key(rng):
     with pytest.raises(GraphError, match=r"between 30-10: its poses are 20 apart in order, but the lag is 15"):
         looped(rng, 3).optimize("fixed-lag", lag=15)
 
@@ -220,20 +219,20 @@ def test_a_straight_chain_of_5000_poses_solves_online(backend):
         graph.add_between(k, k + 1, step, sigmas=[1e-4] * 3 + [1e-3] * 3)
         solver.update()
     np.testing.assert_allclose(solver.pose(5020)[:3, 3], [5020, 0, 0], atol=1e-3)
-    side = np.sqrt(solver.covariance(5020)[-2, -2])
-    assert side == pytest.approx(1e-4 * np.sqrt(5020**3 / 3), rel=0.01)
+    lateral = np.sqrt(solver.covariance(5020)[-2, -2])
+    assert lateral == pytest.approx(1e-4 * np.sqrt(5020**3 / 3), rel=0.01)
 
 
-@pytest.mark.parametrize("bias", [False, True], ids=["biases unknown", "bias given"])
+@pytest.mark.parametrize("bias", [False, True], ids=["no bias factor", "bias factor"])
 @pytest.mark.parametrize(
     ("backend", "lag", "forget"),
     [("incremental", 80, False), ("fixed-lag", 80, False), ("fixed-lag", 25, False), ("fixed-lag", 25, True)],
 )
-def test_inertial_factors_come_online(chain, backend, lag, forget, bias):
+def test_inertial_factors_online_agree_with_batch(chain, backend, lag, forget, bias):
     drive = chain(3, steps=60)
     T = drive.calibration.T_imu_lidar
     g = drive.gravity / np.linalg.norm(drive.gravity)
-    up = se3.exp(np.r_[np.cross(-g, [0, 0, 1.0]), np.zeros(3)])  # small, so that sine and angle are one
+    up = se3.exp(np.r_[np.cross(-g, [0, 0, 1.0]), np.zeros(3)])  # a small tilt: the sine is the angle
     graph, whole = PoseGraph(), PoseGraph()
     for one in (graph, whole):
         one.add_prior(0, up @ drive.poses[0], sigmas=1e-3)
@@ -249,13 +248,13 @@ def test_inertial_factors_come_online(chain, backend, lag, forget, bias):
     best = whole.optimize(tolerance=1e-10)
     assert sigmas_off(best.pose(60), solver.pose(60), best.covariance(60)) < 0.3
     np.testing.assert_allclose(solver.velocity(60), best.velocity(60), atol=0.02)
-    for mine, theirs, atol in zip(solver.bias(60), best.bias(60), (0.02, 1e-3), strict=True):
-        np.testing.assert_allclose(mine, theirs, atol=atol)
+    for online, batch, atol in zip(solver.bias(60), best.bias(60), (0.02, 1e-3), strict=True):
+        np.testing.assert_allclose(online, batch, atol=atol)
     with pytest.raises(GraphError, match="key 61"):
         solver.velocity(61)
 
 
-def test_a_pose_that_samples_alone_lead_to_starts_where_they_lead():
+def test_a_pose_reached_by_samples_alone_starts_at_their_prediction():
     graph = PoseGraph()
     graph.add_prior(0, np.eye(4), sigmas=0.01)
     graph.add_velocity(0, [2.0, 0, 0], sigmas=0.01)
@@ -270,7 +269,7 @@ def test_a_pose_that_samples_alone_lead_to_starts_where_they_lead():
     np.testing.assert_allclose(solver.velocity(4), [2.0, 0, 0], atol=0.02)
 
 
-def test_nothing_says_where_a_pose_lies_is_said(rng):
+def test_an_empty_graph_and_bad_settings_are_refused(rng):
     graph = PoseGraph()
     with pytest.raises(GraphError, match="no poses"):
         graph.online().update()

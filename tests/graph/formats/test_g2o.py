@@ -7,7 +7,7 @@ from hybridlio.graph.formats.g2o import write_g2o
 
 
 def chain(rng: np.random.Generator, count: int) -> tuple[np.ndarray, list[tuple[int, int, RelativePose]]]:
-    """Poses kilometres from the origin, and steps between them with full covariances."""
+    """Return poses kilometres from the origin, and steps between them with full covariances."""
     poses, edges = [se3.exp([0.1, -0.2, 0.3, 1234.56789, -4321.98765, 12.3])], []
     for k in range(count - 1):
         root = rng.normal(size=(6, 6)) * [1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2]
@@ -17,7 +17,7 @@ def chain(rng: np.random.Generator, count: int) -> tuple[np.ndarray, list[tuple[
     return np.array(poses), edges
 
 
-def test_gtsam_reads_the_same_poses_and_factors_back(rng, tmp_path):
+def test_gtsam_reads_back_the_same_poses_and_factors(rng, tmp_path):
     poses, edges = chain(rng, 6)
     write_g2o(tmp_path / "graph.g2o", poses, edges)
     graph, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), True)
@@ -33,7 +33,7 @@ def test_gtsam_reads_the_same_poses_and_factors_back(rng, tmp_path):
         np.testing.assert_allclose(factor.error(values), expected, rtol=1e-6)
 
 
-def test_vertices_may_start_at_another_number(rng, tmp_path):
+def test_vertex_numbers_may_start_anywhere(rng, tmp_path):
     poses, edges = chain(rng, 3)
     write_g2o(tmp_path / "graph.g2o", poses, [(i + 7, j + 7, step) for i, j, step in edges], first=7)
     graph, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), True)

@@ -1,4 +1,4 @@
-"""Graduated non-convexity: wrong loops are found, right ones kept, and the answer is that of the clean graph."""
+"""Graduated non-convexity rejects wrong loops, keeps correct ones and ends at the solution of the clean graph."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hybridlio.graph.base.truncated_squares import chi2_bound, truncated_weights
 
 
 def laps(rng: np.random.Generator, dimension: int, count: int = 120, lap: int = 30) -> PoseGraph:
-    """Four laps of a circle, with a loop closure to the lap before at every other pose."""
+    """Return laps of a circle, with a loop closure to the previous lap at every other pose."""
     used = slice(0, 6) if dimension == 3 else slice(2, 5)
     sigmas = np.array([0.01, 0.01, 0.01, 0.05, 0.05, 0.05])
 
@@ -34,16 +34,16 @@ def laps(rng: np.random.Generator, dimension: int, count: int = 120, lap: int = 
 
 
 def add_wrong_loops(graph: PoseGraph, rng: np.random.Generator, share: float) -> set[int]:
-    """Loops between random poses that claim what some right loop measured."""
-    right = [f for f in graph.factors.values() if f.kind == "between" and abs(f.keys[0] - f.keys[1]) > 1]
+    """Add loops between random poses that claim the relative pose of some correct loop; return their ids."""
+    correct = [f for f in graph.factors.values() if f.kind == "between" and abs(f.keys[0] - f.keys[1]) > 1]
     truth = graph.optimize()
     wrong: set[int] = set()
-    while len(wrong) < round(share * len(right)):
+    while len(wrong) < round(share * len(correct)):
         i, j = (int(k) for k in rng.choice(len(graph), 2, replace=False))
-        model = right[rng.integers(len(right))]
-        measured = se3.between(truth.pose(model.keys[0]), truth.pose(model.keys[1]))
+        copied = correct[rng.integers(len(correct))]
+        measured = se3.between(truth.pose(copied.keys[0]), truth.pose(copied.keys[1]))
         if np.linalg.norm(truth.pose(i)[:3, 3] - truth.pose(j)[:3, 3]) > 3 and abs(i - j) > 1:
-            wrong.add(graph.add_between(i, j, measured, information=model.noise.information))
+            wrong.add(graph.add_between(i, j, measured, information=copied.noise.information))
     return wrong
 
 
@@ -53,34 +53,34 @@ def rmse(a: np.ndarray, b: np.ndarray) -> float:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("share", [0.1, 0.4])
-def test_wrong_loops_are_rejected_and_the_answer_is_the_clean_one(rng, dimension, share):
+def test_wrong_loops_are_rejected(rng, dimension, share):
     graph = laps(rng, dimension)
     clean = graph.optimize()
     wrong = add_wrong_loops(graph, rng, share)
     spoilt, solution = graph.optimize(), graph.optimize("gnc")
     assert wrong <= solution.rejected
-    assert len(solution.rejected - wrong) <= 2  # one right loop in a hundred lies beyond the bound
+    assert len(solution.rejected - wrong) <= 2  # one correct loop in a hundred exceeds the bound
     assert rmse(solution.poses, clean.poses) < 0.05
     assert rmse(spoilt.poses, clean.poses) > 0.5
     assert all(solution.weight(number) == 0 for number in wrong)
     assert min(solution.chi2(number) for number in wrong) > chi2_bound(6 if dimension == 3 else 3)
 
 
-def test_a_clean_graph_is_solved_as_by_batch(rng):
+def test_a_clean_graph_is_solved_as_in_batch(rng):
     graph = laps(rng, 3)
     batch, solution = graph.optimize(), graph.optimize("gnc")
     assert len(solution.rejected) <= 2
     assert rmse(solution.poses, batch.poses) < 0.01
 
 
-def test_a_part_that_hangs_on_a_loop_alone_keeps_it(rng):
+def test_a_loop_that_alone_joins_a_part_is_kept(rng):
     graph = laps(rng, 3, count=40)
     graph.add_between(5, 100, se3.exp([0, 0, 1, 2, 0, 0]), sigmas=0.1)
     solution = graph.optimize("gnc")
     np.testing.assert_allclose(solution.pose(5) @ se3.exp([0, 0, 1, 2, 0, 0]), solution.pose(100), atol=1e-4)
 
 
-def test_two_loops_that_contradict_each_other_about_a_part_are_refused(rng):
+def test_contradicting_loops_that_alone_join_a_part_are_refused(rng):
     graph = laps(rng, 3, count=40)
     graph.add_between(5, 100, se3.exp([0, 0, 0, 50, 0, 0]), sigmas=0.01)
     graph.add_between(5, 100, se3.exp([0, 0, 0, -50, 0, 0]), sigmas=0.01)
@@ -88,7 +88,7 @@ def test_two_loops_that_contradict_each_other_about_a_part_are_refused(rng):
         graph.optimize("gnc")
 
 
-def test_weights_go_from_nearly_all_to_all_or_nothing():
+def test_weights_go_from_nearly_quadratic_to_truncated():
     chi2, bound = np.array([0.0, 5.0, 9.9, 10.1, 20.0, 1e6]), 10.0
     soft, hard = truncated_weights(chi2, bound, 1e-6), truncated_weights(chi2, bound, 1e6)
     np.testing.assert_array_equal(hard, [1, 1, 1, 0, 0, 0])
@@ -97,7 +97,7 @@ def test_weights_go_from_nearly_all_to_all_or_nothing():
     assert (soft[1:] > 0).all()
 
 
-def test_a_tenth_of_wrong_loops_in_a_recorded_drive_is_found(shared_data: Path, rng):
+def test_a_tenth_of_wrong_loops_in_a_recorded_drive_is_rejected(shared_data: Path, rng):
     graph = PoseGraph.load(shared_data / "pose_graphs" / "kitti_00.g2o")
     clean = graph.optimize()
     wrong = add_wrong_loops(graph, rng, 0.1)
