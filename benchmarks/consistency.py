@@ -22,7 +22,7 @@ from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.motion_limits import unknown_motion_covariance
 from hybridlio.core.sensors import NS_PER_S, Frame
 from hybridlio.evaluation.consistency import PoseConsistency, pose_consistency
-from hybridlio.simulation.chain import Chain, make_chain
+from hybridlio.simulation.chain import Chain, ChainSettings, make_chain
 
 KINDS = {"independent steps": None, "matched to a map": 0.02}
 BACKENDS = ("incremental", "fixed-lag")
@@ -86,7 +86,7 @@ def measure(seeds: range, steps: int, drift_share: float | None) -> dict[str, tu
     """Errors of poses relative to the first, and of steps, by what estimated them."""
     out = {name: (Errors(), Errors()) for name in (*BACKENDS, "smoothed")}
     for seed in seeds:
-        drive = make_chain(seed, steps=steps, drift_share=drift_share)
+        drive = make_chain(seed, ChainSettings(steps=steps, drift_share=drift_share))
         true = drive.lidar_poses
         true_steps = se3.between(true[:-1], true[1:])
         for backend in BACKENDS:

@@ -27,7 +27,7 @@ from hybridlio.core import se3
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.graph.base.preintegration import covers, predict_step, preintegrate
 from hybridlio.record.record import Record
-from hybridlio.simulation.chain import make_chain
+from hybridlio.simulation.chain import ChainSettings, make_chain
 
 WINDOWS_S = (0.1, 1.0, 5.0)
 TRUTH_STEP = np.diag(np.r_[np.full(3, 5e-4), np.full(3, 1e-2)] ** 2)
@@ -40,7 +40,7 @@ Window = tuple[hl.State, hl.ImuSamples, np.ndarray]  # state at the start, sampl
 
 def simulated(window_s: float) -> Iterator[Window]:
     for seed in range(500, 500 + DRIVES):
-        drive = make_chain(seed, steps=DRIVE_STEPS)
+        drive = make_chain(seed, ChainSettings(steps=DRIVE_STEPS))
         imu = drive.record(drive.lidar_poses).imu
         stamps = np.array([frame.scan.stamp_ns for frame in drive.frames])
         span = round(window_s / 0.1)

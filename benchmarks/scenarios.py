@@ -121,7 +121,8 @@ def main() -> None:
         by_seed = [measured(scenario, seed, options) for seed in seeds]
         found[scenario] = {name: [one[name] for one in by_seed] for name in by_seed[0]}
         said = {name: summary(rows, found[_NORMAL][name]) for name, rows in found[scenario].items()}
-        text = f"{scenario}: {SCENARIOS[scenario].what}\n\n{tables.to_markdown(words(said), ('system', 'verdict'))}\n"
+        table = tables.to_markdown(words(said), ("system", "verdict"))
+        text = f"{scenario}: {SCENARIOS[scenario].description}\n\n{table}\n"
         print(f"\n{text}", flush=True)
         if options.out is not None:
             write_atomically(options.out / f"{scenario}.md", text)

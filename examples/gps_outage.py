@@ -16,7 +16,7 @@ import hybridlio as hl
 from hybridlio.core.geodesy import GeodeticPoint
 from hybridlio.evaluation.evaluate import ate
 from hybridlio.record.record import Record
-from hybridlio.simulation.chain import make_chain
+from hybridlio.simulation.chain import ChainSettings, make_chain
 from hybridlio.smoothing.georeference import georeference, write_georeferenced
 from hybridlio.smoothing.gps_options import GpsOptions
 
@@ -25,7 +25,8 @@ ORIGIN = GeodeticPoint(49.0, 8.4, 110.0)
 
 
 def main(folder: str | None = None, *_: str) -> None:
-    drive = make_chain(5, steps=200, step_sigmas=np.r_[np.full(3, 4e-3), np.full(3, 0.08)])  # 20 s, a poor odometry
+    poor = np.r_[np.full(3, 4e-3), np.full(3, 0.08)]
+    drive = make_chain(5, ChainSettings(steps=200, step_sigmas=poor))  # 20 s
     stamps = np.array([frame.scan.stamp_ns for frame in drive.frames])
     poses = [np.eye(4)]
     for step in drive.relative:

@@ -1,4 +1,4 @@
-"""The simulated world: a town, a road, a lidar and an IMU that agree with each other exactly."""
+"""The simulated world: a drive through a town, whose sensors measure one exact motion."""
 
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.simulate import simulate

@@ -1,4 +1,4 @@
-"""What a simulated drive is made of: one frozen tree of settings."""
+"""Settings of a simulated drive."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.sensors import LIDAR_MODELS, ImuNoise, LidarModel
-
-Scene = Literal["town", "corridor", "field"]
-Driving = Literal["calm", "hard"]
+from hybridlio.simulation.choices import Driving, Scene
 
 
 class SimulationConfig(BaseModel):
     """Settings of a simulated drive; the same settings give the same bytes.
 
     Attributes:
-        seconds: duration, a day at most; by default 60 s, or with ``poses`` the whole file.
-        length_m: drive this far instead of for ``seconds``.
-        seed: decides road, world, noise; drives of other seeds share nothing.
-        speed_m_s: cruising speed; curves, junctions and stops are slower. Not used along a pose file.
-        driving: ``calm``, or ``hard``: bends at 6 m/s² sideways, brakes at 7 m/s². Not used along a pose file.
-        scene: ``town`` (houses, gardens, open stretches), ``corridor`` (smooth parallel walls: hardly anything says
-            how far one went) or ``field`` (open ground and a few distant trees: hardly anything at all).
+        seconds: duration, at most a day; by default 60 s, or with ``poses`` the whole file.
+        length_m: length of the drive, instead of ``seconds``.
+        seed: of road, world, traffic and noise.
+        speed_m_s: cruising speed; bends, junctions and stops are slower. Not used along a pose file.
+        driving: ``calm``, or ``hard``: bends at 6 m/s² lateral acceleration, braking at 7 m/s². Not used along a pose
+            file.
+        scene: ``town`` (houses, gardens, open stretches), ``corridor`` (smooth parallel walls, which hardly constrain
+            the motion along them) or ``field`` (open ground and a few distant trees, which hardly constrain any
+            horizontal motion).
         lidar: a name of :data:`hybridlio.core.sensors.LIDAR_MODELS`.
-        motion_distortion: the car moves during a sweep, and points carry times; else a scan is one instant.
-        start_moving: begin at cruising speed instead of from two seconds of standstill.
-        loops: the route comes back to streets it has been in.
+        motion_distortion: let the car move during a sweep, and give every point its time; else a scan is instantaneous.
+        start_moving: start at driving speed instead of standing for two seconds.
+        loops: let the route return to streets it has passed.
         traffic_per_km: moving cars per kilometre of road.
-        parked: share of parking places taken.
-        gps: write GPS fixes too.
-        gps_rate_hz, gps_sigma_m: how many fixes a second, and their standard deviation on each axis.
-        imu_noise: what the IMU is worth.
-        poses: drive along this pose file: KITTI (12 numbers a row, one every 0.1 s) or TUM (8 numbers a row).
-        poses_frame: what moves in a KITTI file: the left ``camera`` (KITTI's own), or the ``lidar``. TUM files hold
-            lidar poses.
+        parked: share of parking places that are taken.
+        gps: also write GPS fixes.
+        gps_rate_hz, gps_sigma_m: rate of the fixes, and their standard deviation on each axis.
+        imu_noise: noise densities of the IMU; may be 0.
+        poses: drive along this pose file: KITTI format (12 numbers a row, 0.1 s apart) or TUM format (8 numbers a row).
+        poses_frame: what the poses of a KITTI file are of: the left ``camera`` (KITTI's own files) or the ``lidar``.
+            TUM files hold lidar poses.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -69,15 +69,15 @@ class SimulationConfig(BaseModel):
 
     @property
     def lidar_model(self) -> LidarModel:
-        """The sensor's specification."""
+        """The lidar's specification."""
         return LIDAR_MODELS[self.lidar]
 
     def require_poses(self) -> Path:
-        """The pose file.
+        """Return the pose file.
 
         Raises:
-            ConfigError: none is set, or there is no such file.
+            ConfigError: no pose file is set, or it does not exist.
         """
         if self.poses is None or not self.poses.is_file():
-            raise ConfigError(f"simulation: no pose file at {self.poses}; give a KITTI or TUM trajectory")
+            raise ConfigError(f"simulation: no pose file at {self.poses}; give a KITTI or TUM pose file")
         return self.poses

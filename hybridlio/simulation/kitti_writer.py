@@ -1,4 +1,4 @@
-"""KITTI's raw-data layout: folders, stamps, calibration, navigation rows and scans."""
+"""Writer of KITTI's raw-data layout: folders, stamps, calibration, navigation rows and scans."""
 
 from __future__ import annotations
 
@@ -8,61 +8,64 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hybridlio.core import se3
-from hybridlio.core.arrays import Array
+from hybridlio.core.arrays import Array, Stamps
 from hybridlio.core.files import write_atomically
 from hybridlio.core.geodesy import EARTH_RADIUS_M, GeodeticPoint
-from hybridlio.core.sensors import Scan
+from hybridlio.core.sensors import NS_PER_S, Scan
 from hybridlio.simulation.drive.path import Motion
 from hybridlio.simulation.rig import T_CAMERA_LIDAR, T_LIDAR_IMU
 
-DATE = "2026_01_01"
-START_NS = int(datetime.datetime(2026, 1, 1, 12, tzinfo=datetime.UTC).timestamp()) * 1_000_000_000
-FIRST_PLACE = GeodeticPoint(49.0, 8.4, 110.0)  # of the first row
+DATE = "2026_01_01"  # of all simulated drives; none of KITTI's dates
+START_NS = int(datetime.datetime(2026, 1, 1, 12, tzinfo=datetime.UTC).timestamp()) * NS_PER_S
+FIRST_PLACE = GeodeticPoint(49.0, 8.4, 110.0)  # of the first navigation row: Karlsruhe, where KITTI was recorded
+# Status columns of the navigation rows, constant: position and velocity accuracy, navigation status, satellites, and
+# three modes; the values are those of undisturbed reception in KITTI's files.
+_STATUS = (0.02, 0.01, 4, 10, 5, 5, 6)
+_CAMERA_MATRIX = ((720.0, 0, 610, 0), (0, 720, 173, 0), (0, 0, 1, 0))  # near that of KITTI's left camera; no images
 
 
 @dataclass(frozen=True)
 class DriveFolders:
-    """Where the parts of drive ``number`` lie below ``root``."""
+    """Folders of drive ``number`` below ``root``."""
 
     root: Path
     number: int
 
     @property
     def date(self) -> Path:
-        """Both drives' parent, with the calibration."""
+        """The date's folder, with the calibration."""
         return self.root / DATE
 
     @property
     def sync(self) -> Path:
-        """Scans, navigation rows at 10 Hz, the truth and the settings."""
+        """The folder of scans, 10 Hz navigation rows, ground truth and settings."""
         return self.date / f"{DATE}_drive_{self.number:04d}_sync"
 
     @property
     def extract(self) -> Path:
-        """Navigation rows at 100 Hz."""
+        """The folder of 100 Hz navigation rows."""
         return self.date / f"{DATE}_drive_{self.number:04d}_extract"
 
     @property
     def velodyne(self) -> Path:
-        """Scans and their stamps."""
+        """The folder of scans and their stamps."""
         return self.sync / "velodyne_points"
 
 
-def stamps_text(stamps_ns: NDArray[np.int64]) -> str:
-    """Stamps as KITTI writes them, one a line: ``2026-01-01 12:00:00.000000000`` (UTC)."""
+def stamps_text(stamps_ns: Stamps) -> str:
+    """Format stamps as KITTI does, one per line: ``2026-01-01 12:00:00.000000000`` (UTC)."""
     texts = np.datetime_as_string(np.asarray(stamps_ns, dtype=np.int64).view("datetime64[ns]"), unit="ns")
     return "".join(text.replace("T", " ") + "\n" for text in texts)
 
 
 def write_calibration(date: Path) -> None:
-    """``calib_imu_to_velo.txt``, ``calib_velo_to_cam.txt`` and ``calib_cam_to_cam.txt`` of the simulated car."""
+    """Write ``calib_imu_to_velo.txt``, ``calib_velo_to_cam.txt`` and ``calib_cam_to_cam.txt`` of the simulated car."""
     write_atomically(date / "calib_imu_to_velo.txt", _rigid_text(T_LIDAR_IMU))
     write_atomically(date / "calib_velo_to_cam.txt", _rigid_text(T_CAMERA_LIDAR))
-    rows = {"R_rect_00": np.eye(3), "P_rect_00": np.array([[720.0, 0, 610, 0], [0, 720, 173, 0], [0, 0, 1, 0]])}
+    rows = {"R_rect_00": np.eye(3), "P_rect_00": np.array(_CAMERA_MATRIX)}
     text = "".join(f"{name}: {' '.join(f'{v:.12e}' for v in value.ravel())}\n" for name, value in rows.items())
     write_atomically(date / "calib_cam_to_cam.txt", "calib_time: 01-Jan-2026 12:00:00\n" + text)
 
@@ -73,10 +76,15 @@ def _rigid_text(T: Array) -> str:
 
 
 def oxts_rows(motion: Motion, origin_m: Array, gyro_rad_s: Array, accel_m_s2: Array) -> Array:
-    """Navigation rows ``(N, 30)``, true but for the inertial columns, which are ``gyro_rad_s`` and ``accel_m_s2``.
+    """Return navigation rows ``(N, 30)``: exact, except for the inertial columns, which are given.
 
-    Latitude and longitude are those that KITTI's Mercator projection, at the first row's latitude, takes back to the
-    position relative to ``origin_m`` ``(3,)``, the position of the first row.
+    Latitude and longitude are the inverse of KITTI's Mercator projection at the first row's latitude
+    (:mod:`hybridlio.datasets.oxts`).
+
+    Args:
+        motion: of the IMU at ``N`` times.
+        origin_m: ``(3,)`` the position of the first row, world frame.
+        gyro_rad_s, accel_m_s2: ``(N, 3)`` the IMU's measurements.
     """
     R = motion.poses[:, :3, :3]
     yaw, pitch, roll = Rotation.from_matrix(R).as_euler("ZYX").T
@@ -91,12 +99,12 @@ def oxts_rows(motion: Motion, origin_m: Array, gyro_rad_s: Array, accel_m_s2: Ar
     level_accel, level_gyro = (np.einsum("nij,nj->ni", level, v) for v in (accel_m_s2, gyro_rad_s))
     velocity = motion.velocity_m_s
     columns = [latitude, longitude, FIRST_PLACE.height_m + up, roll, pitch, yaw, velocity[:, 1], velocity[:, 0]]
-    status = np.tile([0.02, 0.01, 4, 10, 5, 5, 6], (len(yaw), 1))
+    status = np.tile(_STATUS, (len(yaw), 1))
     return np.column_stack([*columns, local, accel_m_s2, level_accel, gyro_rad_s, level_gyro, status])
 
 
-def write_oxts(folder: Path, stamps_ns: NDArray[np.int64], rows: Array) -> None:
-    """An ``oxts`` folder: one file a row, and the stamps."""
+def write_oxts(folder: Path, stamps_ns: Stamps, rows: Array) -> None:
+    """Write an ``oxts`` folder: one file per row, and the stamps."""
     data = folder / "data"
     data.mkdir(parents=True, exist_ok=True)
     for k, row in enumerate(rows):
@@ -106,9 +114,9 @@ def write_oxts(folder: Path, stamps_ns: NDArray[np.int64], rows: Array) -> None:
 
 
 def write_scan(velodyne: Path, index: int, scan: Scan) -> None:
-    """``data/NNNNNNNNNN.bin`` (float32 x y z reflectance), and ``offsets/NNNNNNNNNN.npy`` where points have times.
+    """Write ``data/NNNNNNNNNN.bin`` (float32 x y z reflectance), and ``offsets/NNNNNNNNNN.npy`` if points have times.
 
-    The ``.bin`` comes last, so a scan that is there is complete.
+    The ``.bin`` is written last, so that an existing one marks a complete scan.
     """
     if scan.time_offsets_ns is not None:
         buffer = io.BytesIO()
@@ -120,6 +128,6 @@ def write_scan(velodyne: Path, index: int, scan: Scan) -> None:
 
 
 def pose_rows(poses: Array) -> str:
-    """Poses ``(N, 4, 4)`` in KITTI's format, 12 numbers a row, with 15 significant digits, from the first pose."""
+    """Format poses ``(N, 4, 4)`` relative to the first as KITTI does, 12 numbers a row, with 16 significant digits."""
     relative = se3.between(poses[0], poses)
     return "".join(" ".join(f"{v:.15e}" for v in row) + "\n" for row in relative[:, :3].reshape(-1, 12))

@@ -1,4 +1,4 @@
-"""From settings to everything a drive needs: the path, the world along it, and the traffic."""
+"""The plan of a drive, from its settings: the path, the world along it, and the traffic."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hybridlio.simulation.drive.path import SmoothPath
 from hybridlio.simulation.drive.pose_files import path_along, read_lidar_poses
 from hybridlio.simulation.drive.revisits import level_revisits
 from hybridlio.simulation.drive.rises import without_false_rises
-from hybridlio.simulation.drive.traffic import MovingCar, traffic
+from hybridlio.simulation.drive.traffic import EgoDrive, MovingCar, traffic
 from hybridlio.simulation.drive.vehicle import FINE_S, drive_path, lane_of
 from hybridlio.simulation.rig import LIDAR_HEIGHT_M, SCAN_RATE_HZ, T_IMU_LIDAR
 from hybridlio.simulation.world.ground import CAMBER, Ground, Height, land_along, waves
@@ -23,9 +23,16 @@ from hybridlio.simulation.world.roads import LANE_OFFSET_M, MANNERS, STEP_M, Roa
 from hybridlio.simulation.world.world import World
 
 DEFAULT_SECONDS = 60.0
-_MARGIN_S = 1.0
-_BEHIND_M, _AHEAD_M = 70.0, 130.0
-_STRETCHES = (1.0, 1.3, 1.7, 2.2)
+_MARGIN_S = 1.0  # of the path before and after the scans, for the IMU's lead and the spline's ends
+_BEHIND_M, _AHEAD_M = 70.0, 130.0  # road and town before the start and after the end: as far as the lidar sees them
+_STRETCHES = (1.0, 1.3, 1.7, 2.2)  # factors of the road's length that are tried until the drive fits
+_ROUND_TRIP_SHARE = 0.25  # of the length: with bends and stops, two round trips fit in any drive of a minute
+_ROUND_TRIP_M = (220.0, 700.0)  # two blocks of houses
+_EGO_STEP_S = 0.1  # of the ego car's positions that traffic is checked against
+# Unevenness as sums of 24 waves: lengths in m, rms slope. Land: plausible hills. Bumps and cracks of the road: the
+# slopes of a good road (below 1 %). Unpaved ground: knee-high.
+_LAND, _CORRIDOR_SHARE = (12, (90.0, 500.0), 0.025), 0.3
+_ROUGHNESS, _BUMPS, _CRACKS = (24, (1.2, 6.0), 0.05), (24, (5.0, 25.0), 0.008), (24, (1.5, 5.0), 0.008)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +40,10 @@ class Drive:
     """A planned drive.
 
     Attributes:
-        path: of the IMU, defined from a second before time zero to a second after the last scan.
-        scan_times_s: ``(N,)`` when each scan's stamp is, from zero.
-        world: what stands still.
-        cars: what moves.
+        path: of the IMU, from a second before time zero to a second after the last scan.
+        scan_times_s: ``(N,)`` times of the scans' stamps, from zero.
+        world: everything that stands still.
+        cars: everything that moves, except the recording car.
     """
 
     path: SmoothPath
@@ -46,10 +53,11 @@ class Drive:
 
 
 def plan(config: SimulationConfig) -> Drive:
-    """The drive that ``config`` describes; the same settings give the same drive.
+    """Plan the drive that ``config`` describes; the same settings give the same drive.
 
     Raises:
-        ConfigError, DataError: the pose file is missing or malformed.
+        ConfigError: there is no such pose file.
+        DataError: the pose file is malformed.
     """
     return _along_poses(config) if config.poses is not None else _along_generated_road(config)
 
@@ -57,8 +65,8 @@ def plan(config: SimulationConfig) -> Drive:
 def _ground(land: Height, centreline: Road, config: SimulationConfig) -> Ground:
     rng = np.random.default_rng([config.seed, 2])
     points = centreline.at(np.arange(0.0, centreline.length_m, STEP_M))
-    roughness = waves(rng, 24, (1.2, 6.0), 0.05)
-    bumps, cracks = waves(rng, 24, (5.0, 25.0), 0.008), waves(rng, 24, (1.5, 5.0), 0.008)
+    roughness = waves(rng, *_ROUGHNESS)
+    bumps, cracks = waves(rng, *_BUMPS), waves(rng, *_CRACKS)
     return Ground(land, roughness, lambda xy: bumps(xy) + cracks(xy), cKDTree(points), curbs=config.scene == "town")
 
 
@@ -77,20 +85,21 @@ def _along_generated_road(config: SimulationConfig) -> Drive:
         seconds = max(float(times[min(int(np.searchsorted(driven, config.length_m)), len(times) - 101)]), 0.2)
     used = slice(0, round((seconds + 2 * _MARGIN_S) / FINE_S) + 1)
     path = drive_path(lane, s[used], times[used], ground)
-    return _furnished(config, path, centreline, lane, ground, seconds)
+    return _with_world(config, path, centreline, lane, ground, seconds)
 
 
 def _driven(config: SimulationConfig, length: float, stretch: float, times: Array) -> tuple[Road, Road, Ground, Array]:
-    """A road for ``length`` metres of driving, its right-hand lane, the ground, and how far along one is at ``times``.
+    """Return a road, its right-hand lane, the ground, and the arc length on the lane at ``times``.
 
-    Rounded corners shorten a road, by how much only its bends tell: ``stretch`` makes it longer.
+    ``length`` is the distance to drive. Rounded corners shorten the road by an amount that depends on its bends;
+    ``stretch`` makes it longer.
     """
     rng = np.random.default_rng([config.seed, 1])
-    # bends and stops halve the speed; two round trips and more fit in any drive of a minute
-    round_trip = float(np.clip(0.25 * length, 220.0, 700.0)) if config.loops else None
+    round_trip = float(np.clip(_ROUND_TRIP_SHARE * length, *_ROUND_TRIP_M)) if config.loops else None
     centreline = generate_centreline(rng, stretch * length + _BEHIND_M + _AHEAD_M, config.scene, round_trip)
-    flat = 0.3 if config.scene == "corridor" else 1.0
-    land = waves(np.random.default_rng([config.seed, 3]), 12, (90.0, 500.0), 0.025 * flat)
+    count, lengths, slope = _LAND
+    flat = _CORRIDOR_SHARE if config.scene == "corridor" else 1.0
+    land = waves(np.random.default_rng([config.seed, 3]), count, lengths, slope * flat)
     ground = _ground(land, centreline, config)
     lane = lane_of(centreline, rng)
     manner = MANNERS[config.driving]
@@ -112,11 +121,14 @@ def _along_poses(config: SimulationConfig) -> Drive:
     lane = _road_below(below[:, :2], lidar[:, :2, 0])
     centreline = Road.through(lane.beside(np.arange(0.0, lane.length_m, STEP_M), LANE_OFFSET_M))
     land = land_along(below + np.array([0.0, 0.0, CAMBER * LANE_OFFSET_M]))
-    return _furnished(config, path, centreline, lane, _ground(land, centreline, config), seconds)
+    return _with_world(config, path, centreline, lane, _ground(land, centreline, config), seconds)
 
 
 def _road_below(points: Array, ahead: Array) -> Road:
-    """The road of a car that was at ``points`` ``(N, 2)``, which may stand or repeat, and a piece before and after."""
+    """Return the lane of a car that was at ``points`` ``(N, 2)`` and may have stood, extended at both ends.
+
+    ``ahead`` ``(N, 2)`` is the car's direction.
+    """
     kept = [0]
     for i in range(1, len(points)):
         if np.linalg.norm(points[i] - points[kept[-1]]) > STEP_M:
@@ -130,20 +142,23 @@ def _road_below(points: Array, ahead: Array) -> Road:
     return Road.through(gaussian_filter1d(even, 3.0 / STEP_M, axis=0, mode="nearest"))
 
 
-def _furnished(
+def _with_world(
     config: SimulationConfig, path: SmoothPath, centreline: Road, lane: Road, ground: Ground, seconds: float
 ) -> Drive:
-    items = lay_out(centreline, ground.centre, config, np.random.default_rng([config.seed, 4]))
+    items = lay_out(centreline, ground.centre, config.scene, config.parked, np.random.default_rng([config.seed, 4]))
     scans = np.arange(max(round(seconds * SCAN_RATE_HZ), 2)) / SCAN_RATE_HZ
-    times = np.arange(-0.5, scans[-1] + 0.6, 0.1)
+    times = np.arange(-0.5, scans[-1] + 0.6, _EGO_STEP_S)
     ego_xy = path.poses(times)[:, :2, 3]
-    ego_s = _arc_length_of(lane, ego_xy)
-    cars = traffic(centreline, lane, ego_s, times, ego_xy, ground, config.traffic_per_km, config.seed)
+    ego = EgoDrive(lane, times, _arc_length_of(lane, ego_xy), ego_xy)
+    cars = traffic(centreline, ego, ground, config.traffic_per_km, config.seed)
     return Drive(path, scans, World(ground, items, config.seed), cars)
 
 
 def _arc_length_of(lane: Road, xy: Array) -> Array:
-    """Arc length ``(N,)`` of successive positions on a lane that may cross itself: each step searched near the last."""
+    """Return the arc length ``(N,)`` of successive positions: the first by search, the others by distance driven.
+
+    A search for each would fail where the lane crosses itself.
+    """
     start = int(np.argmin(np.linalg.norm(lane.at(np.arange(0.0, 2 * _BEHIND_M, STEP_M)) - xy[0], axis=1))) * STEP_M
     steps = np.concatenate([[0.0], np.linalg.norm(np.diff(xy, axis=0), axis=1)])
     return np.asarray(np.minimum(start + np.cumsum(steps), lane.length_m))

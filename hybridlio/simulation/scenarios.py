@@ -1,6 +1,6 @@
-"""Hard cases by name: worlds, sensors and ways of driving that odometry finds hard, and faults put into a recording.
+"""Scenarios by name: worlds, sensors and driving that are hard for odometry, and faults injected into a recording.
 
-The cases of one seed share road and town as far as they can, so that each can be held against ``normal``.
+The scenarios of one seed share road and town as far as possible, so that each can be compared with ``normal``.
 """
 
 from __future__ import annotations
@@ -18,56 +18,62 @@ from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.faults import block_sector, drop_scans, imu_bias, imu_gap
 from hybridlio.simulation.simulate import simulate
 
-_SPEED_M_S, _HARD_SPEED_M_S = 10.0, 16.0
+_SPEED_M_S, _HARD_SPEED_M_S = 10.0, 16.0  # ordinary and fast driving in a town: 36 and 58 km/h
+# Faults that a robust system should survive: fifty scans with half a view, ten without inertial data, every fifth scan
+# lost, and biases at the edge of what the noise model allows.
+_BLOCKED_S, _IMU_GAP_S = 5.0, 1.0
+_DROPPED_SHARE, _BIAS_SIGMAS = 0.2, 3.0
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """One hard case.
+    """One scenario.
 
     Attributes:
-        what: in words.
-        settings: of the simulated drive, beside its length and seed.
-        fault: what is done to the recording; it is given the recording and the drive's seed.
+        description: in words.
+        settings: of the simulated drive, besides length and seed.
+        fault: injects a fault; takes the recording and the drive's seed.
     """
 
-    what: str
+    description: str
     settings: Mapping[str, Any] = field(default_factory=dict)
     fault: Callable[[Sequence, int], Sequence] | None = None
 
 
 def _blocked(sequence: Sequence, _seed: int) -> Sequence:
     middle_s = sequence.duration_s / 2
-    return block_sector(sequence, middle_s - 2.5, middle_s + 2.5)
+    return block_sector(sequence, middle_s - _BLOCKED_S / 2, middle_s + _BLOCKED_S / 2)
 
 
 def _gap(sequence: Sequence, _seed: int) -> Sequence:
     middle_s = sequence.duration_s / 2
-    return imu_gap(sequence, middle_s - 0.5, middle_s + 0.5)
+    return imu_gap(sequence, middle_s - _IMU_GAP_S / 2, middle_s + _IMU_GAP_S / 2)
 
 
 SCENARIOS: dict[str, Scenario] = {
     "normal": Scenario("a town with some traffic, 64 beams, calm driving"),
-    "corridor": Scenario("smooth parallel walls: hardly anything says how far one went", {"scene": "corridor"}),
+    "corridor": Scenario("smooth parallel walls, which hardly constrain the motion along them", {"scene": "corridor"}),
     "field": Scenario("open ground and a few distant trees", {"scene": "field"}),
     "hard-driving": Scenario(
-        "brakes at 7 m/s² and bends at 6 m/s² from 16 m/s", {"driving": "hard", "speed_m_s": _HARD_SPEED_M_S}
+        "braking at 7 m/s² and bends at 6 m/s², from 16 m/s", {"driving": "hard", "speed_m_s": _HARD_SPEED_M_S}
     ),
-    "heavy-traffic": Scenario("eight times the moving cars", {"traffic_per_km": 96.0}),
-    "16-beam": Scenario("a sensor of 16 beams", {"lidar": "16-beam"}),
-    "distortion": Scenario("the car moves during a sweep, and points carry times", {"motion_distortion": True}),
-    "dropped-scans": Scenario("a fifth of the scans is lost", fault=lambda s, seed: drop_scans(s, 0.2, seed)),
+    "heavy-traffic": Scenario("eight times as many moving cars", {"traffic_per_km": 96.0}),
+    "16-beam": Scenario("a lidar with 16 beams", {"lidar": "16-beam"}),
+    "distortion": Scenario("the car moves during a sweep, and points have times", {"motion_distortion": True}),
+    "dropped-scans": Scenario(
+        "a fifth of the scans is lost", fault=lambda s, seed: drop_scans(s, _DROPPED_SHARE, seed)
+    ),
     "blocked": Scenario("the front half of each scan is blocked for 5 s", fault=_blocked),
     "imu-gap": Scenario("no inertial samples for 1 s", fault=_gap),
-    "imu-bias": Scenario("biases three times what is assumed", fault=lambda s, seed: imu_bias(s, 3.0, seed)),
+    "imu-bias": Scenario("biases of three standard deviations", fault=lambda s, seed: imu_bias(s, _BIAS_SIGMAS, seed)),
 }
 
 
 def scenario_config(name: str, seed: int, length_m: float) -> SimulationConfig:
-    """The simulated drive of a scenario.
+    """Return the settings of a scenario's drive.
 
     Raises:
-        ConfigError: there is no such scenario; lists those there are.
+        ConfigError: there is no such scenario; the message lists all.
     """
     settings = {"seed": seed, "length_m": length_m, "speed_m_s": _SPEED_M_S, **_scenario(name).settings}
     return SimulationConfig.model_validate(settings)
@@ -76,19 +82,19 @@ def scenario_config(name: str, seed: int, length_m: float) -> SimulationConfig:
 def open_scenario(
     name: str, out: Path, seed: int = 1, length_m: float = 300.0, progress: Progress | None = None
 ) -> Sequence:
-    """A scenario's recording, simulated below ``out`` unless it is there; faults are put in while it is read.
+    """Open a scenario's recording, simulated below ``out`` if it does not exist; faults are injected on reading.
 
-    Scenarios that differ in nothing but a fault share one drive on disk.
+    Scenarios that differ only in a fault share one drive on disk.
 
     Args:
         name: one of :data:`SCENARIOS`.
-        out: a folder for the drives of all scenarios, one below it for each.
+        out: a folder for the drives of all scenarios, each in a folder of its own.
         seed, length_m: of the drive.
         progress: as of :func:`hybridlio.simulation.simulate.simulate`.
 
     Raises:
         ConfigError: there is no such scenario.
-        DataError: ``out`` holds other drives.
+        DataError: ``out`` holds drives with other settings.
     """
     scenario = _scenario(name)
     world = name if scenario.settings else "normal"

@@ -1,4 +1,4 @@
-"""A simulated drive, written as KITTI raw data."""
+"""Simulation of a drive, written as KITTI raw data."""
 
 from __future__ import annotations
 
@@ -35,24 +35,24 @@ from hybridlio.simulation.sensors.imu import add_noise, ideal_imu
 from hybridlio.simulation.sensors.lidar import RayPattern, first_hits, measure, ray_pattern
 
 FORMAT_VERSION = 1
-_LEAD_S = 0.2  # the IMU runs so long before the first scan's stamp and after the last one's
+_LEAD_S = 0.2  # of the IMU before the first scan's stamp and after the last: more than a sweep
 
 
 def simulate(out: Path, config: SimulationConfig, progress: Progress | None = None) -> Path:
     """Simulate a drive and write it below ``out`` as KITTI raw data.
 
-    The drive appears when it is complete: until then it is in a hidden folder beside, from which an interrupted run
-    with the same settings goes on. A finished drive with the same settings is left as it is.
+    The drive appears when it is complete. Until then it is in a hidden folder of ``out``, from which a later run with
+    the same settings resumes after an interrupt. A finished drive with the same settings is not simulated again.
 
     Args:
-        out: the folder to write to, made where it is missing.
+        out: the folder to write to; created if missing.
         config: the settings.
-        progress: called after each scan with an empty stage, scans done and scans in all.
+        progress: called after each scan with an empty stage, scans done and scans in total.
 
     Returns:
-        The drive, ``OUT/<date>/<date>_drive_NNNN_sync``. In it also lie ``poses.txt`` (exact lidar poses in the first
-        scan's frame), ``simulation.json`` and, if asked for, ``gps.csv``; beside it the calibration and the 100 Hz
-        rows (``…_extract``).
+        The drive's folder, ``OUT/<date>/<date>_drive_NNNN_sync``. Besides KITTI's files it holds ``poses.txt`` (exact
+        lidar poses in the first scan's frame), ``simulation.json`` and, with ``config.gps``, ``gps.csv``. The
+        calibration and the 100 Hz rows (``…_extract``) are beside it.
 
     Raises:
         DataError: ``out`` holds a drive of this seed with other settings or cannot be written to, or the pose file is
@@ -67,7 +67,7 @@ def simulate(out: Path, config: SimulationConfig, progress: Progress | None = No
     partial = DriveFolders(Path(out) / f".partial-{_fingerprint(description)}", done.number)
     drive = plan(config)
     with locked(partial.root / ".lock"):
-        if not done.sync.exists():  # another process may have made it meanwhile
+        if not done.sync.exists():  # another process may have simulated it meanwhile
             _write_measurements(partial, drive, config)
             _write_scans(partial, drive, config, progress)
             write_atomically(partial.sync / "simulation.json", json.dumps(description, indent=2) + "\n")
@@ -77,7 +77,7 @@ def simulate(out: Path, config: SimulationConfig, progress: Progress | None = No
 
 
 def _move(partial: DriveFolders, done: DriveFolders) -> None:
-    """Move a drive into its place, what says that it is there last."""
+    """Move a drive to its place. The ``sync`` folder, whose existence marks a finished drive, is moved last."""
     write_calibration(done.date)
     for source, target in ((partial.extract, done.extract), (partial.sync, done.sync)):
         shutil.rmtree(target, ignore_errors=True)
@@ -85,9 +85,9 @@ def _move(partial: DriveFolders, done: DriveFolders) -> None:
 
 
 def describe(config: SimulationConfig) -> dict[str, Any]:
-    """What ``simulation.json`` says: settings, sensor, and a pose file's contents by their hash."""
+    """Return the content of ``simulation.json``: settings, sensors, and the hash of a pose file."""
     settings = json.loads(config.model_dump_json())
-    sensors = {"lidar": settings["lidar"], "imu_noise": settings["imu_noise"]}  # what the reader looks for
+    sensors = {"lidar": settings["lidar"], "imu_noise": settings["imu_noise"]}  # these two are for the reader
     description: dict[str, Any] = {"version": FORMAT_VERSION, **sensors, "config": settings}
     if config.poses is not None:
         description["poses_sha256"] = hashlib.sha256(config.require_poses().read_bytes()).hexdigest()
@@ -104,23 +104,23 @@ def _require_same(drive: Path, description: dict[str, Any]) -> None:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        raise DataError(f"{drive} is there already and is no simulated drive; choose another folder") from None
+        raise DataError(f"{drive} exists and is no simulated drive; choose another folder") from None
     if _completed(found) != description:
         raise DataError(
-            f"{path} says that another drive is there, of this seed or of one with the same last four digits, which "
-            "number the folders; choose another folder or seed"
+            f"{path} describes another drive. Folders are numbered by the last four digits of the seed; choose another "
+            "folder or seed"
         )
 
 
 def _completed(found: Any) -> Any:
-    """The description with the defaults of settings that there were not yet when it was written."""
+    """Return the description with defaults for settings that did not exist when it was written."""
     if not isinstance(found, dict) or not isinstance(found.get("config"), dict):
         return found
     return {**found, "config": json.loads(SimulationConfig().model_dump_json()) | found["config"]}
 
 
 def _write_measurements(folders: DriveFolders, drive: Drive, config: SimulationConfig) -> None:
-    """Everything but the scans: calibration, stamps, inertial and navigation rows, truth, GPS."""
+    """Write everything except scans and calibration: stamps, navigation rows, ground truth, GPS."""
     scan_stamps = START_NS + np.round(drive.scan_times_s * NS_PER_S).astype(np.int64)
     lead = round(_LEAD_S * IMU_RATE_HZ)
     per_scan = IMU_RATE_HZ // SCAN_RATE_HZ

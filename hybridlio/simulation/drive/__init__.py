@@ -1,1 +1,1 @@
-"""The simulated motion: path, vehicle, traffic, recorded paths."""
+"""The simulated motion: the path, the vehicle, traffic, and recorded paths."""

@@ -1,4 +1,4 @@
-"""Pose files to drive along: KITTI's and TUM's, as lidar poses every 0.1 s with the z axis up."""
+"""Pose files to drive along, KITTI or TUM format, read as lidar poses every 0.1 s with the z axis up."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from hybridlio.core.trajectory_files import is_tum_file, read_trajectory
 from hybridlio.simulation.drive.path import SmoothPath
 from hybridlio.simulation.rig import SCAN_RATE_HZ, T_CAMERA_LIDAR, T_LIDAR_IMU
 
-KNOT_S = 0.3
-MARGIN_STEPS = 10
-_LEAST_POSES = 10
-_TWIST_STEPS = 5
+KNOT_S = 0.3  # three poses per knot: averages the noise of recorded poses, follows all that a car does
+MARGIN_STEPS = 10  # a second at either end, for the IMU's lead and the derivatives at the ends
+_MIN_POSES = 10  # enough for the twist at both ends
+_TWIST_STEPS = 5  # half a second, over which the twist at an end is averaged
 
 
 def read_lidar_poses(path: Path, frame: str) -> Array:
-    """Lidar poses ``(N, 4, 4)``, one every 0.1 s, turned so that the lidar's z axis is up on average.
+    """Read lidar poses ``(N, 4, 4)``, one every 0.1 s, in a world whose z axis is the mean of the lidar's.
 
     Args:
         path: KITTI format (12 numbers a row, 0.1 s apart) or TUM format (time, position, quaternion x y z w).
-        frame: what a KITTI file's poses are of, ``camera`` or ``lidar``.
+        frame: what the poses of a KITTI file are of, ``camera`` or ``lidar``.
 
     Raises:
         DataError: as :func:`hybridlio.core.trajectory_files.read_trajectory`, or fewer than 10 poses.
     """
     recorded, is_tum = read_trajectory(path), is_tum_file(path)
-    if len(recorded) < _LEAST_POSES:
-        raise DataError(f"{path}: {len(recorded)} poses; a drive needs {_LEAST_POSES} or more")
+    if len(recorded) < _MIN_POSES:
+        raise DataError(f"{path}: {len(recorded)} poses; a drive needs at least {_MIN_POSES}")
     if is_tum:
         return _upright(_evenly(recorded))
     return _upright(recorded.poses @ T_CAMERA_LIDAR if frame == "camera" else recorded.poses)
 
 
 def _evenly(recorded: Trajectory) -> Array:
-    """The poses, interpolated every 0.1 s from the first."""
+    """Return the poses interpolated every 0.1 s from the first."""
     times = recorded.times_s
     at = np.arange(0.0, times[-1] + 1e-9, 1.0 / SCAN_RATE_HZ)
     attitude = Slerp(times, Rotation.from_matrix(recorded.poses[:, :3, :3]))(at).as_matrix()
@@ -49,7 +49,7 @@ def _evenly(recorded: Trajectory) -> Array:
 
 
 def _upright(poses: Array) -> Array:
-    """The poses in a world whose z axis is the mean of the lidar's, from the first pose's position."""
+    """Return the poses in a world at the first position, whose z axis is the mean of the lidar's."""
     up = poses[:, :3, 2].mean(axis=0)
     up /= np.linalg.norm(up)
     ahead = poses[0, :3, 0] - up * (up @ poses[0, :3, 0])
@@ -59,7 +59,7 @@ def _upright(poses: Array) -> Array:
 
 
 def path_along(lidar_poses: Array) -> SmoothPath:
-    """The IMU's smooth path near lidar poses ``(N, 4, 4)`` at 0, 0.1, 0.2 … s, with a second more at either end."""
+    """Fit the IMU's path to lidar poses ``(N, 4, 4)`` at 0, 0.1, 0.2 … s, extended by a second at either end."""
     first, last = (
         se3.log(se3.between(lidar_poses[i], lidar_poses[i + _TWIST_STEPS])) / _TWIST_STEPS
         for i in (0, len(lidar_poses) - 1 - _TWIST_STEPS)

@@ -1,4 +1,4 @@
-"""Cars that drive: oncoming ones, and ones ahead of and behind the recording car."""
+"""Moving cars: oncoming ones, and ones ahead of and behind the recording car (the ego car)."""
 
 from __future__ import annotations
 
@@ -12,30 +12,39 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.simulation.world import street
 from hybridlio.simulation.world.ground import Ground
+from hybridlio.simulation.world.rays import RayScene
 from hybridlio.simulation.world.roads import LANE_OFFSET_M, Road
 from hybridlio.simulation.world.shapes import Mesh
-from hybridlio.simulation.world.world import RayScene
 
-_CLEARANCE_M = 3.0
-_REACH_M = 90.0
-CAR_RADIUS_M = 5.5
-_SENSORS_M = 0.5  # around the recording car's IMU
+CAR_RADIUS_M = 5.5  # of a sphere about a car's middle that contains the longest, a lorry of 9 m
+_CLEARANCE_M = 3.0  # between the middles of two cars that pass, at least: lanes are 3.5 m apart
+_SENSORS_M = 0.5  # the ego car's sensors are within this of its IMU
+_REACH_M = 90.0  # farther, a dark car returns almost nothing
+# Plausible for a town; this is not a traffic model.
+_ONCOMING_SHARE = 0.7  # these meet the ego car, the others keep their distance to it
+_MIN_MEAN_SPEED_M_S = 4.0  # of others, also where the ego car creeps
+_MIN_SAMPLES = 10  # a car that is on the road for less than a second (10 Hz) is left out
 
 
 @dataclass(eq=False)
 class MovingCar:
-    """A car with a motion: ``(x, y, z, heading)`` over the seconds that it is there for."""
+    """A moving car.
+
+    Attributes:
+        motion: ``(x, y, z, heading)`` in world over the seconds that the car is on the road.
+        shape_seed: decides its shape.
+    """
 
     motion: CubicSpline
     shape_seed: tuple[int, int]
     _scene: RayScene | None = None
 
     def present(self, time_s: float) -> bool:
-        """Whether the car is on the road at ``time_s``."""
+        """Return whether the car is on the road at ``time_s``."""
         return bool(self.motion.x[0] <= time_s <= self.motion.x[-1])
 
     def poses(self, times_s: Array) -> Array:
-        """``T_world_car`` ``(N, 4, 4)``; held at the ends of its time."""
+        """Return ``T_world_car`` ``(N, 4, 4)``, constant before and after its time on the road."""
         x, y, z, heading = self.motion(np.clip(times_s, self.motion.x[0], self.motion.x[-1])).T
         c, s, zero, one = np.cos(heading), np.sin(heading), np.zeros_like(x), np.ones_like(x)
         R = np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(-1, 3, 3)
@@ -43,48 +52,74 @@ class MovingCar:
 
     @property
     def mesh(self) -> Mesh:
-        """Its shape, in its own frame."""
+        """The car's shape, in its own frame."""
         return street.car(np.random.default_rng(self.shape_seed))
 
     @property
     def scene(self) -> RayScene:
-        """Its shape, ready for rays."""
+        """The car's shape, ready for ray casting."""
         if self._scene is None:
             self._scene = RayScene.of(self.mesh, np.zeros(3))
         return self._scene
 
 
-def traffic(
-    centreline: Road, lane: Road, ego_s: Array, times_s: Array, ego_xy: Array, ground: Ground, per_km: float, seed: int
-) -> list[MovingCar]:
-    """Moving cars of a drive whose own car is at ``ego_s`` ``(N,)`` of its lane, at ``ego_xy``, at ``times_s``.
+@dataclass(frozen=True, eq=False)
+class EgoDrive:
+    """Where the ego car is over time.
 
-    Seven in ten come the other way, the others keep some seconds ahead or behind. Cars that would come too near the
-    recording car (where the road crosses itself) stay at home.
+    Attributes:
+        lane: the line that it follows.
+        times_s: ``(N,)``, every 0.1 s.
+        s: ``(N,)`` arc length on the lane.
+        xy: ``(N, 2)`` position of the IMU, world frame.
+    """
+
+    lane: Road
+    times_s: Array
+    s: Array
+    xy: Array
+
+
+def traffic(centreline: Road, ego: EgoDrive, ground: Ground, per_km: float, seed: int) -> list[MovingCar]:
+    """Draw the moving cars of a drive.
+
+    Seven in ten are oncoming, the others stay some seconds ahead or behind. Cars that would come too near to the ego
+    car, where the road crosses itself, are left out.
+
+    Args:
+        centreline: of the road.
+        ego: the ego car's drive.
+        ground: on which the cars drive.
+        per_km: cars per kilometre.
+        seed: of the drive.
     """
     rng = np.random.default_rng([seed, 5])
     cars = []
-    driven = float(ego_s[-1] - ego_s[0])
-    mean_speed = max(driven / float(times_s[-1] - times_s[0]), 4.0)
+    times_s = ego.times_s
+    driven = float(ego.s[-1] - ego.s[0])
+    mean_speed = max(driven / float(times_s[-1] - times_s[0]), _MIN_MEAN_SPEED_M_S)
     for number in range(rng.poisson(per_km * (2 * driven + 200.0) / 1000.0)):
-        if rng.random() < 0.7:
+        if rng.random() < _ONCOMING_SHARE:
             speed = mean_speed * rng.uniform(0.7, 1.3)
-            meeting = float(ego_s[0]) + rng.uniform(-50.0, 2 * driven + 150.0)
+            meeting = float(ego.s[0]) + rng.uniform(-50.0, 2 * driven + 150.0)
             motion = _motion(centreline, meeting - speed * times_s, LANE_OFFSET_M, times_s, ground)
         else:
             shifted = times_s + rng.choice([-1, 1]) * rng.uniform(2.0, 6.0)
-            s = np.where((shifted > times_s[0]) & (shifted < times_s[-1]), np.interp(shifted, times_s, ego_s), -1.0)
-            motion = _motion(lane, s, 0.0, times_s, ground)
+            s = np.where((shifted > times_s[0]) & (shifted < times_s[-1]), np.interp(shifted, times_s, ego.s), -1.0)
+            motion = _motion(ego.lane, s, 0.0, times_s, ground)
         car = None if motion is None else MovingCar(motion, (seed, 1000 + number))
-        if car is not None and _keeps_clear(car, times_s, ego_xy):
+        if car is not None and _keeps_clear(car, ego):
             cars.append(car)
     return cars
 
 
 def _motion(road: Road, s: Array, left_m: float, times_s: Array, ground: Ground) -> CubicSpline | None:
-    """Position, height and heading over the time that ``s`` is on the road; None where that is short."""
+    """Return position, height and heading while ``s`` is on the road; None if that is too short.
+
+    ``left_m`` is the distance to the left of the road's line; a car on the left drives the other way.
+    """
     on_road = (s > 1.0) & (s < road.length_m - 1.0)
-    if on_road.sum() < 10:
+    if on_road.sum() < _MIN_SAMPLES:
         return None
     s, times_s = s[on_road], times_s[on_road]
     xy = road.beside(s, left_m)
@@ -92,11 +127,11 @@ def _motion(road: Road, s: Array, left_m: float, times_s: Array, ground: Ground)
     return CubicSpline(times_s, np.column_stack([xy, ground.height(xy), heading]))
 
 
-def _keeps_clear(car: MovingCar, times_s: Array, ego_xy: Array) -> bool:
-    """Whether the recording car keeps away from the moving one's middle, and its sensors out of its outline."""
-    together = (times_s >= car.motion.x[0]) & (times_s <= car.motion.x[-1])
-    x, y, _, heading = car.motion(times_s[together]).T
-    off = ego_xy[together] - np.column_stack([x, y])
+def _keeps_clear(car: MovingCar, ego: EgoDrive) -> bool:
+    """Return whether the ego car keeps its distance from the other's middle, and its sensors out of the outline."""
+    together = (ego.times_s >= car.motion.x[0]) & (ego.times_s <= car.motion.x[-1])
+    x, y, _, heading = car.motion(ego.times_s[together]).T
+    off = ego.xy[together] - np.column_stack([x, y])
     along = np.cos(heading) * off[:, 0] + np.sin(heading) * off[:, 1]
     aside = np.cos(heading) * off[:, 1] - np.sin(heading) * off[:, 0]
     half_length, half_width = np.abs(car.mesh.vertices[:, :2]).max(axis=0) + _SENSORS_M
@@ -105,7 +140,7 @@ def _keeps_clear(car: MovingCar, times_s: Array, ego_xy: Array) -> bool:
 
 
 def in_reach(cars: Sequence[MovingCar], position: Array, time_s: float) -> list[MovingCar]:
-    """The cars that are near enough to be seen from ``position`` ``(3,)``."""
+    """Return the cars that can be seen from ``position`` ``(3,)``, world frame, at ``time_s``."""
     near = []
     for car in cars:
         if car.present(time_s):

@@ -1,4 +1,4 @@
-"""The car on the road: lane keeping, attitude from the ground below the wheels, and the suspension between them."""
+"""The car on the road: its lane, its attitude from the ground below the wheels, and its suspension."""
 
 from __future__ import annotations
 
@@ -14,15 +14,18 @@ from hybridlio.simulation.rig import T_VEHICLE_IMU
 from hybridlio.simulation.world.ground import Ground
 from hybridlio.simulation.world.roads import LANE_OFFSET_M, STEP_M, Road
 
-KNOT_S = 0.05
-FINE_S = 0.01
+KNOT_S = 0.05  # of the path's spline: a fifteenth of the suspension's period
+FINE_S = 0.01  # step of the vehicle's dynamics
+# Textbook values of a passenger car: its body on the springs has 1 to 1.5 Hz with a damping ratio of 0.2 to 0.4, and
+# it rolls and dives by 3 to 5° per g.
 _WHEELBASE_M, _TRACK_M = 2.7, 1.6
 _SUSPENSION_HZ, _DAMPING = 1.3, 0.35
 _DIVE_RAD_PER_M_S2, _ROLL_RAD_PER_M_S2 = 0.006, 0.008
+_PEDAL_STEPS, _TYRE_STEPS = 5.0, 1.5  # of FINE_S: smoothing of the acceleration, and of what passes the suspension
 
 
 def lane_of(centreline: Road, rng: np.random.Generator) -> Road:
-    """The right-hand lane of a road, driven with a slow wander of some ten centimetres."""
+    """Return the line driven in the right-hand lane, which wanders slowly by one or two decimetres."""
     s = np.arange(0.0, centreline.length_m, STEP_M)
     wander = 0.15 * np.sin(2 * np.pi * s / rng.uniform(60, 110) + rng.uniform(0, 6))
     wander += 0.08 * np.sin(2 * np.pi * s / rng.uniform(25, 45) + rng.uniform(0, 6))
@@ -30,15 +33,21 @@ def lane_of(centreline: Road, rng: np.random.Generator) -> Road:
 
 
 def drive_path(lane: Road, s: Array, times_s: Array, ground: Ground) -> SmoothPath:
-    """The IMU's path of a car whose rear axle is at arc length ``s`` ``(N,)`` of the lane at ``times_s``, every 10 ms.
+    """Return the path of the IMU of a car that drives along a lane.
 
-    Heave, pitch and roll follow the ground under the wheels, and the car leans and dives with its acceleration,
-    through one spring and damper each.
+    Heave, pitch and roll follow the ground below the wheels and the car's acceleration, each through a spring with a
+    damper.
+
+    Args:
+        lane: the line that the middle of the rear axle follows.
+        s: ``(N,)`` arc length of the rear axle.
+        times_s: ``(N,)``, every ``FINE_S``.
+        ground: the ground.
     """
     xy, heading = lane.at(s), lane.heading(s)
     height, pitch, roll = _ground_attitude(xy, heading, ground)
     speed = np.gradient(s, FINE_S)
-    ahead = gaussian_filter1d(np.gradient(speed, FINE_S), 5.0, mode="nearest")
+    ahead = gaussian_filter1d(np.gradient(speed, FINE_S), _PEDAL_STEPS, mode="nearest")
     aside = speed**2 * lane.curvature(s)
     pitch = pitch - _DIVE_RAD_PER_M_S2 * ahead
     roll = roll + _ROLL_RAD_PER_M_S2 * aside
@@ -50,7 +59,7 @@ def drive_path(lane: Road, s: Array, times_s: Array, ground: Ground) -> SmoothPa
 
 
 def _ground_attitude(xy: Array, heading: Array, ground: Ground) -> tuple[Array, Array, Array]:
-    """Height, pitch and roll of the plane through the ground below the four wheels."""
+    """Return height of the rear axle, pitch and roll on the ground below the four wheels, each ``(N,)``."""
     forward = np.column_stack([np.cos(heading), np.sin(heading)])
     left = np.column_stack([-np.sin(heading), np.cos(heading)])
     corners = [(x, y) for x in (0.0, _WHEELBASE_M) for y in (-_TRACK_M / 2, _TRACK_M / 2)]
@@ -62,7 +71,7 @@ def _ground_attitude(xy: Array, heading: Array, ground: Ground) -> tuple[Array, 
 
 
 def _suspension(signal: Array) -> Array:
-    """The signal after a damped spring (natural frequency, damping ratio above), settled at its first value."""
+    """Filter a signal by a damped spring, which starts settled at the first value."""
     w = 2 * np.pi * _SUSPENSION_HZ
     numerator, denominator, _ = cont2discrete(
         ([2 * _DAMPING * w, w**2], [1.0, 2 * _DAMPING * w, w**2]), FINE_S, "bilinear"
@@ -70,4 +79,4 @@ def _suspension(signal: Array) -> Array:
     b, a = numerator.ravel(), denominator.ravel()
     settled = lfilter_zi(b, a) * signal[0]
     filtered, _ = lfilter(b, a, signal, zi=settled)
-    return np.asarray(gaussian_filter1d(filtered, 1.5, mode="nearest"))
+    return np.asarray(gaussian_filter1d(filtered, _TYRE_STEPS, mode="nearest"))

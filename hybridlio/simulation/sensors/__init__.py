@@ -1,1 +1,1 @@
-"""The simulated sensors: lidar, IMU, GPS."""
+"""The simulated sensors: lidar, IMU and GPS."""

@@ -1,4 +1,4 @@
-"""GPS fixes of the path."""
+"""GPS fixes along the path."""
 
 from __future__ import annotations
 
@@ -18,10 +18,15 @@ def gps_fixes(
     rng: np.random.Generator,
     origin: GeodeticPoint | None = None,
 ) -> tuple[GpsFix, ...]:
-    """Fixes of the IMU's position (east, north, up) with independent Gaussian noise of ``sigma_m`` on each axis.
+    """Return fixes of the IMU's position (east, north, up) with white noise. The antenna is at the IMU.
 
-    ``start_ns`` is the stamp of the path's time zero, ``origin`` where on Earth the path's frame lies. The antenna is
-    taken to sit at the IMU.
+    Args:
+        path: of the IMU.
+        times_s: ``(N,)`` times of the fixes.
+        start_ns: stamp of time zero.
+        sigma_m: standard deviation on each axis.
+        rng: of the noise.
+        origin: geodetic position of the path's origin, or None.
     """
     times = np.asarray(times_s, dtype=np.float64)
     positions = path.poses(times)[:, :3, 3]
@@ -31,7 +36,7 @@ def gps_fixes(
 
 
 def gps_csv(fixes: tuple[GpsFix, ...]) -> str:
-    """The fixes as CSV: ``stamp_ns,east,north,up,sigma``; and ``latitude,longitude,height`` with a known origin."""
+    """Format fixes as CSV: ``stamp_ns,east,north,up,sigma``; with an origin also ``latitude,longitude,height``."""
     known = bool(fixes) and fixes[0].origin is not None
     rows = ["stamp_ns,east,north,up,sigma" + (",latitude,longitude,height" if known else "")]
     for fix in fixes:

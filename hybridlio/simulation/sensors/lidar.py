@@ -1,4 +1,4 @@
-"""A spinning lidar in the world: rays, returns, noise, and the sweep's motion."""
+"""A spinning lidar: rays, first hits, and what the sensor reports of them."""
 
 from __future__ import annotations
 
@@ -9,41 +9,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.core import se3
-from hybridlio.core.arrays import Array
+from hybridlio.core.arrays import Array, Index, Stamps
 from hybridlio.core.sensors import NS_PER_S, LidarModel, Scan
 from hybridlio.simulation.drive.traffic import CAR_RADIUS_M, MovingCar, in_reach
-from hybridlio.simulation.world.world import Hits, RayScene
+from hybridlio.simulation.world.rays import Hits, RayScene
 
-# a return is seen where reflectance · cos(incidence) / range² is above this, give or take the spread of its logarithm:
-# asphalt is then lost beyond 60 m or so, and a dark car beyond 90 m
-_THRESHOLD_M2 = 1.6e-6
-_THRESHOLD_SPREAD = 0.35
-_INTENSITY_SIGMA = 0.03
-_MARGIN_RAD = 0.05
+# A return is detected if the received power, reflectance · cos(incidence) / range² (lidar equation of an extended,
+# diffuse surface), exceeds a threshold. With this one asphalt is lost beyond about 60 m and a dark car beyond about
+# 90 m, which is plausible for an HDL-64E. The standard deviation of its logarithm blurs these limits.
+_THRESHOLD_1_M2 = 1.6e-6
+_THRESHOLD_LOG_SIGMA = 0.35
+_MIN_RANGE_M = 1e-3  # keeps the power finite
+_SHINE = (0.55, 0.45)  # share of the reported reflectance that is independent of incidence, and its cosine's share
+_REFLECTANCE_SIGMA = 0.03  # of the reported reflectance: three of its hundredths
+_MARGIN_RAD = 0.05  # 1.5 m (half a sweep at 30 m/s) seen at 30 m; nearer, the sphere is far larger than a car
 
 
 @dataclass(frozen=True, eq=False)
 class RayPattern:
-    """One turn of a lidar, beam by beam from the top.
+    """The ``R`` rays of one turn of a lidar, beam by beam from the top.
 
     Attributes:
         directions: ``(R, 3)`` unit vectors in the lidar frame.
         column: ``(R,)`` azimuth step of each ray.
         column_offset_ns: ``(columns,)`` time of each azimuth step relative to the scan's stamp. The sensor turns
-            counter-clockwise, begins and ends at the rear, and looks ahead at the stamp.
+            counter-clockwise, starts and ends at the rear, and points forward at the stamp.
     """
 
     directions: Array
-    column: NDArray[np.int64]
-    column_offset_ns: NDArray[np.int64]
+    column: Index
+    column_offset_ns: Stamps
 
     def rays_near(self, centre: Array, radius_m: float) -> NDArray[np.intp]:
-        """The rays that may meet a sphere about ``centre`` ``(3,)``, lidar frame, with a margin for its motion."""
-        columns, away = len(self.column_offset_ns), float(np.hypot(centre[0], centre[1]))
-        if away <= radius_m:
+        """Return the rays that may hit a sphere about ``centre`` ``(3,)``, lidar frame, while it moves in a sweep."""
+        columns, distance = len(self.column_offset_ns), float(np.hypot(centre[0], centre[1]))
+        if distance <= radius_m:
             return np.arange(len(self.column))
         middle = (np.arctan2(centre[1], centre[0]) / (2 * np.pi) + 0.5) * columns
-        half = (np.arcsin(radius_m / away) + _MARGIN_RAD) / (2 * np.pi) * columns
+        half = (np.arcsin(radius_m / distance) + _MARGIN_RAD) / (2 * np.pi) * columns
         window = np.unique(np.arange(int(middle - half), int(middle + half) + 1) % columns)
         rows = (np.arange(len(self.column) // columns)[:, None] * columns + window).reshape(-1)
         along = self.directions[rows] @ centre
@@ -51,7 +54,7 @@ class RayPattern:
 
 
 def ray_pattern(model: LidarModel) -> RayPattern:
-    """The rays of one turn of ``model``."""
+    """Return the rays of one turn of a lidar."""
     fraction = (np.arange(model.columns) + 0.5) / model.columns - 0.5
     azimuth = 2 * np.pi * fraction
     elevation = np.radians(model.elevations_deg)[:, None]
@@ -63,18 +66,18 @@ def ray_pattern(model: LidarModel) -> RayPattern:
 
 
 def first_hits(scene: RayScene, cars: Sequence[MovingCar], pattern: RayPattern, poses: Array, times_s: Array) -> Hits:
-    """Exact first hits of a sweep.
+    """Return the exact first hits of a sweep.
 
     Args:
-        scene: everything that stands still, in world coordinates.
+        scene: everything that stands still, world frame.
         cars: everything that moves.
         pattern: the rays.
-        poses: ``(columns, 4, 4)`` ``T_world_lidar`` at each azimuth step, or ``(1, 4, 4)`` for an instant.
-        times_s: ``(columns,)`` or ``(1,)`` the times of these poses.
+        poses: ``(columns, 4, 4)`` ``T_world_lidar`` at each azimuth step, or ``(1, 4, 4)`` for an instantaneous scan.
+        times_s: ``(columns,)`` or ``(1,)``, the times of these poses.
     """
     instant = len(poses) == 1
     if instant:
-        # not a matrix product: its threads cost more than the product of so small a matrix
+        # einsum, because a matrix product starts threads, which cost more than so small a product
         directions = np.einsum("ij,rj->ri", poses[0, :3, :3], pattern.directions)
         origins = np.broadcast_to(poses[0, :3, 3], directions.shape)
     else:
@@ -97,18 +100,25 @@ def first_hits(scene: RayScene, cars: Sequence[MovingCar], pattern: RayPattern, 
 def measure(
     hits: Hits, pattern: RayPattern, model: LidarModel, stamp_ns: int, timed: bool, rng: np.random.Generator
 ) -> Scan:
-    """What the sensor reports of exact hits: range noise, lost returns, reflectance in hundredths.
+    """Return the scan that the sensor reports of exact hits, with range noise, lost returns and reflectance noise.
 
-    ``timed`` gives every point its time, as a scan that needs motion compensation has.
+    Args:
+        hits: exact first hits of ``pattern``.
+        pattern: the rays.
+        model: the lidar.
+        stamp_ns: the scan's stamp.
+        timed: whether points get their times, as in a scan that needs motion compensation.
+        rng: of the noise.
     """
-    power = hits.reflectance * hits.cosine / np.maximum(hits.range_m, 1e-3) ** 2
-    spread = np.float32(_THRESHOLD_SPREAD) * rng.standard_normal(len(power), dtype=np.float32)
-    seen = (power > _THRESHOLD_M2 * np.exp(spread)) & (rng.random(len(power), dtype=np.float32) >= model.dropout)
+    power = hits.reflectance * hits.cosine / np.maximum(hits.range_m, _MIN_RANGE_M) ** 2
+    spread = np.float32(_THRESHOLD_LOG_SIGMA) * rng.standard_normal(len(power), dtype=np.float32)
+    seen = (power > _THRESHOLD_1_M2 * np.exp(spread)) & (rng.random(len(power), dtype=np.float32) >= model.dropout)
     seen &= (hits.range_m >= model.min_range_m) & (hits.range_m <= model.max_range_m)
     rows = np.flatnonzero(seen)
     measured = hits.range_m[rows] + model.range_sigma_m * rng.standard_normal(len(rows))
     points = (pattern.directions[rows] * measured[:, None]).astype(np.float32)
-    shine = hits.reflectance[rows] * (0.55 + 0.45 * hits.cosine[rows])
-    shine += _INTENSITY_SIGMA * rng.standard_normal(len(rows))
+    shine = hits.reflectance[rows] * (_SHINE[0] + _SHINE[1] * hits.cosine[rows])
+    shine += _REFLECTANCE_SIGMA * rng.standard_normal(len(rows))
     offsets = pattern.column_offset_ns[pattern.column[rows]] if timed else None
+    # KITTI reports reflectances in hundredths
     return Scan(stamp_ns, points, np.round(np.clip(shine, 0.0, 1.0), 2).astype(np.float32), offsets)

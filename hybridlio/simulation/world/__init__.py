@@ -1,1 +1,1 @@
-"""The simulated surroundings: roads, ground, houses, and the ray-casting scene."""
+"""The simulated surroundings: roads, ground, objects beside the road, and ray casting."""

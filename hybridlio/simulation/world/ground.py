@@ -1,4 +1,8 @@
-"""The ground: rolling land, and the road's bed with camber, curbs and sidewalks on it."""
+"""The ground: rolling land, and on it the road with camber, curbs and sidewalks.
+
+Cross-section of a European residential street, by common road design values: 11 m between curbs (two lanes of 3.5 m
+and two of 2 m for parking), 2 % camber, curbs of 12 cm, sidewalks of 2 m.
+"""
 
 from __future__ import annotations
 
@@ -14,15 +18,16 @@ from hybridlio.simulation.world.shapes import Mesh
 
 Height = Callable[[Array], Array]
 
-CURB_OFFSET_M = 5.5
+CURB_OFFSET_M = 5.5  # from the centreline, as all offsets
 CURB_HEIGHT_M = 0.12
-CAMBER = 0.02
+CAMBER = 0.02  # slope of the road to either side, for drainage
 SIDEWALK_END_M = 7.5
-_ASPHALT, _PAVING, _GRASS = 0.22, 0.32, 0.42
+_VERGE_M = 1.5  # width over which paved ground turns into unpaved, and the sidewalk's height ends
+_ASPHALT, _PAVING, _GRASS = 0.22, 0.32, 0.42  # reflectances, plausible at 905 nm; only their order matters
 
 
 def waves(rng: np.random.Generator, count: int, lengths_m: tuple[float, float], slope: float) -> Height:
-    """A smooth random surface: ``count`` plane waves of log-uniform length, together of rms slope ``slope``."""
+    """Return a smooth random surface: ``count`` plane waves of log-uniform length, of total rms slope ``slope``."""
     length = np.exp(rng.uniform(np.log(lengths_m[0]), np.log(lengths_m[1]), count))
     angle, phase = rng.uniform(0, 2 * np.pi, (2, count))
     k = 2 * np.pi / length
@@ -36,9 +41,10 @@ def waves(rng: np.random.Generator, count: int, lengths_m: tuple[float, float], 
 
 
 def land_along(points: Array, margin_m: float = 150.0, cell_m: float = 4.0) -> Height:
-    """Land that passes through ``points`` ``(N, 3)`` and levels out away from them.
+    """Return land that passes through ``points`` ``(N, 3)`` and is smooth away from them.
 
-    A normalised convolution of the points' heights on a grid, from a narrow kernel near them to wide ones further off.
+    Heights are spread on a grid by normalised convolution (Knutsson and Westin, CVPR 1993), with kernels from wide to
+    narrow; each replaces the wider one where it has enough weight.
     """
     origin = points[:, :2].min(axis=0) - margin_m
     shape = tuple(np.ceil((np.ptp(points[:, :2], axis=0) + 2 * margin_m) / cell_m).astype(int) + 1)
@@ -47,7 +53,7 @@ def land_along(points: Array, margin_m: float = 150.0, cell_m: float = 4.0) -> H
     np.add.at(total, (index[:, 0], index[:, 1]), points[:, 2])
     np.add.at(weight, (index[:, 0], index[:, 1]), 1.0)
     surface = np.full(shape, float(points[:, 2].mean()))
-    for sigma in (128.0, 32.0, 8.0, 2.0, 1.0):
+    for sigma in (128.0, 32.0, 8.0, 2.0, 1.0):  # cells
         smooth_total, smooth_weight = (gaussian_filter(a, sigma, mode="constant") for a in (total, weight))
         trust = smooth_weight / (smooth_weight + 1e-3 / sigma)
         surface = (1 - trust) * surface + trust * smooth_total / np.maximum(smooth_weight, 1e-12)
@@ -60,13 +66,13 @@ def land_along(points: Array, margin_m: float = 150.0, cell_m: float = 4.0) -> H
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """Heights of everything one can drive or walk on.
+    """Height of the ground as the sum of land, road profile and unevenness.
 
     Attributes:
-        land: the large shape, metres at ``(N, 2)`` positions.
-        roughness: of unpaved ground.
+        land: the large shape; metres at positions ``(N, 2)``.
+        roughness: unevenness of unpaved ground.
         pavement: unevenness of the road.
-        centre: a tree of the centrelines' points ``(x, y)``, half a metre apart.
+        centre: k-d tree of points ``(x, y)`` on the centrelines, half a metre apart.
         curbs: whether the road has curbs and sidewalks.
     """
 
@@ -77,20 +83,20 @@ class Ground:
     curbs: bool = True
 
     def distance(self, xy: Array) -> Array:
-        """Distance ``(N,)`` in metres to the nearest centreline."""
+        """Return the distance ``(N,)`` in metres to the nearest centreline."""
         return np.asarray(self.centre.query(xy, workers=1)[0])
 
     def height(self, xy: Array) -> Array:
-        """Height ``(N,)`` of the ground at positions ``(N, 2)``."""
+        """Return the height ``(N,)`` of the ground at positions ``(N, 2)``."""
         d = self.distance(xy)
-        unpaved = np.clip((d - SIDEWALK_END_M) / 1.5, 0.0, 1.0)
+        unpaved = np.clip((d - SIDEWALK_END_M) / _VERGE_M, 0.0, 1.0)
         profile = -CAMBER * np.minimum(d, CURB_OFFSET_M)
         if self.curbs:
-            profile = profile + CURB_HEIGHT_M * ((d > CURB_OFFSET_M) & (d < SIDEWALK_END_M + 1.5))
+            profile = profile + CURB_HEIGHT_M * ((d > CURB_OFFSET_M) & (d < SIDEWALK_END_M + _VERGE_M))
         return self.land(xy) + profile + (1 - unpaved) * self.pavement(xy) + unpaved * self.roughness(xy)
 
     def patch(self, low: Array, size_m: float, cell_m: float) -> Mesh:
-        """The square ``(2,)`` ``low`` to ``low + size_m`` as a regular grid of triangles."""
+        """Return the square from corner ``low`` ``(2,)`` to ``low + size_m`` as a regular grid of triangles."""
         count = round(size_m / cell_m)
         axis = np.linspace(0.0, size_m, count + 1)
         xy = np.stack(np.meshgrid(low[0] + axis, low[1] + axis, indexing="ij"), axis=-1).reshape(-1, 2)

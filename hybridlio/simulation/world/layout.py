@@ -1,4 +1,7 @@
-"""Where things stand along the road: a town in stretches of different character, a walled corridor, an open field."""
+"""Where objects stand along the road: in a town of varied stretches, a walled corridor, or an open field.
+
+Spacings, setbacks and chances are plausible for a European town; they were chosen by eye on rendered scans.
+"""
 
 from __future__ import annotations
 
@@ -10,31 +13,23 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hybridlio.core.arrays import Array
-from hybridlio.simulation.config import SimulationConfig
+from hybridlio.simulation.choices import Scene
 from hybridlio.simulation.world import street
 from hybridlio.simulation.world.ground import CURB_OFFSET_M, SIDEWALK_END_M
+from hybridlio.simulation.world.items import Build, Item
 from hybridlio.simulation.world.roads import Road
-from hybridlio.simulation.world.shapes import Mesh
 
-Build = Callable[[np.random.Generator], Mesh]
-
-_ALREADY_DRESSED_M = 6.0
-
-
-@dataclass(frozen=True, eq=False)
-class Item:
-    """A thing in the world: ``build`` makes its mesh when it is first in sight."""
-
-    x: float
-    y: float
-    yaw: float
-    radius: float
-    build: Build
+_SAME_STREET_M = 6.0  # a point nearer than this to an earlier piece of the route is on the same street
+_SAMPLE_M = 2.0  # distance of the points at which the route is searched for streets driven before
+_CAR_CLEARANCE_M = 3.3  # from every centreline to a parked car, which may reach 0.2 m into the lane
+_HOUSE_TOLERANCE = 0.95  # neighbouring houses may touch: circles of their size may overlap by 5 %
+_HOUSE_MARGIN, _OBJECT_OVERLAP = 1.15, 0.6  # an object keeps off a house's circle, but its own outline may reach in
+_NEAREST_HOUSES = 60  # the last ones placed; only these can be near
 
 
 @dataclass(eq=False)
 class Layout:
-    """Things placed so far, each clear of the road and of the houses before it."""
+    """Objects placed so far, each clear of the road and of the houses before it."""
 
     road: Road
     centre: cKDTree
@@ -43,9 +38,17 @@ class Layout:
     _houses: list[tuple[float, float, float]] = field(default_factory=list)
 
     def place(self, s: float, left_m: float, yaw: float, radius: float, build: Build, clear_m: float) -> bool:
-        """Put a thing beside the road, turned by ``yaw`` from the road's heading, unless something is in the way.
+        """Place an object beside the road, unless it is too near to a centreline or in a house.
 
-        ``clear_m`` is the distance its outline of ``radius`` must keep from every centreline.
+        Args:
+            s, left_m: arc length, and metres to the left of the centreline.
+            yaw: rotation from the road's heading, in radians.
+            radius: of the object's outline, in metres.
+            build: makes the mesh.
+            clear_m: distance that the outline must keep from every centreline.
+
+        Returns:
+            Whether it was placed.
         """
         at, heading = self._at(s, left_m)
         if self.centre.query(at)[0] < clear_m + radius - 1e-6 or self._in_a_house(at, radius):
@@ -54,7 +57,7 @@ class Layout:
         return True
 
     def place_house(self, s: float, left_m: float, width: float, depth: float, height: float, detached: bool) -> bool:
-        """Put a house with its front ``left_m`` from the centreline, facing the road."""
+        """Place a house with its front ``left_m`` from the centreline, facing the road, unless it is in the way."""
         side = 1.0 if left_m > 0 else -1.0
         front, heading = self._at(s, left_m)
         yaw = heading if side > 0 else heading + np.pi
@@ -64,7 +67,10 @@ class Layout:
         if self.centre.query(outline)[0].min() < min(abs(left_m), SIDEWALK_END_M) - 0.05:
             return False
         middle, radius = outline.mean(axis=0), float(min(width, depth) / 2)
-        if any((middle[0] - x) ** 2 + (middle[1] - y) ** 2 < (0.95 * (r + radius)) ** 2 for x, y, r in self._houses):
+        if any(
+            (middle[0] - x) ** 2 + (middle[1] - y) ** 2 < (_HOUSE_TOLERANCE * (r + radius)) ** 2
+            for x, y, r in self._houses
+        ):
             return False
         self._houses.append((float(middle[0]), float(middle[1]), radius))
         build = partial(street.house, width, depth, height, detached)
@@ -76,43 +82,80 @@ class Layout:
         return self.road.beside(where, left_m)[0], float(self.road.heading(where)[0])
 
     def _in_a_house(self, at: Array, radius: float) -> bool:
-        near = np.array(self._houses[-60:]).reshape(-1, 3)
-        return bool((np.hypot(near[:, 0] - at[0], near[:, 1] - at[1]) < near[:, 2] * 1.15 + radius * 0.6).any())
+        near = np.array(self._houses[-_NEAREST_HOUSES:]).reshape(-1, 3)
+        distance = np.hypot(near[:, 0] - at[0], near[:, 1] - at[1])
+        return bool((distance < near[:, 2] * _HOUSE_MARGIN + radius * _OBJECT_OVERLAP).any())
 
 
-def lay_out(road: Road, centre: cKDTree, config: SimulationConfig, rng: np.random.Generator) -> list[Item]:
-    """Everything that stands along the road. Streets driven twice are furnished once."""
+@dataclass(frozen=True, eq=False)
+class _Stretch:
+    """One side of a stretch of street.
+
+    Attributes:
+        start, end: arc lengths on the centreline.
+        side: 1 on the left, -1 on the right.
+        is_first: returns whether the route is on its street for the first time at an arc length.
+    """
+
+    start: float
+    end: float
+    side: float
+    is_first: Callable[[float], bool]
+
+
+@dataclass(frozen=True)
+class _HouseStyle:
+    """Ranges of houses in metres: gaps between them, widths, and heights of the eaves."""
+
+    detached: bool
+    gaps: tuple[float, float]
+    widths: tuple[float, float]
+    heights: tuple[float, float]
+
+
+_ROW_HOUSES = _HouseStyle(detached=False, gaps=(0.0, 3.0), widths=(8.0, 17.0), heights=(6.0, 14.0))
+_DETACHED_HOUSES = _HouseStyle(detached=True, gaps=(4.0, 12.0), widths=(8.0, 13.0), heights=(4.0, 8.5))
+
+
+def lay_out(road: Road, centre: cKDTree, scene: Scene, parked: float, rng: np.random.Generator) -> list[Item]:
+    """Place all objects along the road. Streets that the route passes twice are furnished once.
+
+    Args:
+        road: the route's centreline.
+        centre: k-d tree of points on the centreline.
+        scene: kind of surroundings.
+        parked: share of parking places that are taken.
+        rng: decides what stands where.
+    """
     layout = Layout(road, centre, rng)
-    if config.scene == "corridor":
+    if scene == "corridor":
         _corridor(layout)
-    elif config.scene == "field":
+    elif scene == "field":
         _field(layout)
     else:
-        fresh = _fresh(road)
+        is_first = _first_visits(road)
         s = 0.0
         while s < road.length_m:
             length = rng.uniform(45.0, 140.0)
             for side in (1.0, -1.0):
                 kind = rng.choice(["row", "detached", "park", "open"], p=[0.4, 0.32, 0.14, 0.14])
-                _stretch(layout, fresh, s, min(s + length, road.length_m), side, str(kind), config.parked)
+                _furnish(layout, _Stretch(s, min(s + length, road.length_m), side, is_first), str(kind), parked)
             s += length
     return layout.items
 
 
-def _fresh(road: Road) -> Callable[[float], bool]:
-    """Whether the road at ``s`` is not one driven earlier."""
-    s = np.arange(0.0, road.length_m + 2.0, 2.0)
+def _first_visits(road: Road) -> Callable[[float], bool]:
+    """Return a function of arc length: whether the route is on that street for the first time."""
+    s = np.arange(0.0, road.length_m + _SAMPLE_M, _SAMPLE_M)
     points = road.at(np.minimum(s, road.length_m))
-    pairs = cKDTree(points).query_pairs(_ALREADY_DRESSED_M, output_type="ndarray")
+    pairs = cKDTree(points).query_pairs(_SAME_STREET_M, output_type="ndarray")
     again = np.zeros(len(s), dtype=bool)
-    again[pairs[pairs[:, 1] - pairs[:, 0] > 20, 1]] = True
-    return lambda at: not again[min(int(at / 2.0), len(again) - 1)]
+    again[pairs[pairs[:, 1] - pairs[:, 0] > 20, 1]] = True  # neighbours along the road are not visits
+    return lambda at: not again[min(int(at / _SAMPLE_M), len(again) - 1)]
 
 
-def _stretch(
-    layout: Layout, fresh: Callable[[float], bool], start: float, end: float, side: float, kind: str, parked: float
-) -> None:
-    """One side of a stretch of street."""
+def _furnish(layout: Layout, stretch: _Stretch, kind: str, parked: float) -> None:
+    """Furnish one side of a stretch of street; ``kind`` is ``row``, ``detached``, ``park`` or ``open``."""
     rng = layout.rng
     fittings: list[tuple[Callable[[Layout, float, float], None], float, float]] = [
         (_lamp, 22.0, 40.0),
@@ -124,48 +167,38 @@ def _stretch(
         fittings.append((_street_tree, 8.0, 16.0))
     if kind == "row":
         setback = rng.uniform(SIDEWALK_END_M + 0.3, 9.5)
-        _houses(layout, fresh, start, end, side, setback, (0.0, 3.0), (8.0, 17.0), (6.0, 14.0), False)
+        _houses(layout, stretch, setback, _ROW_HOUSES)
     elif kind == "detached":
         setback = rng.uniform(11.0, 16.0)
         style = str(rng.choice(["wall", "picket", "rail", "hedge"]))
         fittings += [(partial(_fence, style=style), 2.4, 2.4), (_garden, 5.0, 14.0)]
-        _houses(layout, fresh, start, end, side, setback, (4.0, 12.0), (8.0, 13.0), (4.0, 8.5), True)
+        _houses(layout, stretch, setback, _DETACHED_HOUSES)
     else:
         fittings.append((_park if kind == "park" else _meadow, 2.5, 6.0))
     for fit, shortest, longest in fittings:
-        s = start + rng.uniform(0.0, shortest)
-        while s < end:
-            if fresh(s):
-                fit(layout, s, side)
+        s = stretch.start + rng.uniform(0.0, shortest)
+        while s < stretch.end:
+            if stretch.is_first(s):
+                fit(layout, s, stretch.side)
             s += rng.uniform(shortest, longest)
 
 
-def _houses(
-    layout: Layout,
-    fresh: Callable[[float], bool],
-    start: float,
-    end: float,
-    side: float,
-    setback: float,
-    gap: tuple[float, float],
-    widths: tuple[float, float],
-    heights: tuple[float, float],
-    detached: bool,
-) -> None:
-    rng = layout.rng
-    s, eaves = start, rng.uniform(*heights)
-    while s < end:
-        width, depth = rng.uniform(*widths), rng.uniform(8.0, 12.0)
-        if fresh(s + width / 2) and s + width < layout.road.length_m and rng.random() < 0.93:
-            high = float(np.clip(eaves + rng.normal(0, 1.2), *heights))
-            front = setback + (rng.uniform(-0.5, 2.0) if detached else rng.choice([0.0, 0.0, 0.4]))
-            layout.place_house(s + width / 2, side * front, width, depth, high, detached)
+def _houses(layout: Layout, stretch: _Stretch, setback: float, style: _HouseStyle) -> None:
+    """Place houses with fronts about ``setback`` metres from the centreline, and some in a second row behind."""
+    rng, side = layout.rng, stretch.side
+    s, eaves = stretch.start, rng.uniform(*style.heights)
+    while s < stretch.end:
+        width, depth = rng.uniform(*style.widths), rng.uniform(8.0, 12.0)
+        if stretch.is_first(s + width / 2) and s + width < layout.road.length_m and rng.random() < 0.93:
+            high = float(np.clip(eaves + rng.normal(0, 1.2), *style.heights))
+            front = setback + (rng.uniform(-0.5, 2.0) if style.detached else rng.choice([0.0, 0.0, 0.4]))
+            layout.place_house(s + width / 2, side * front, width, depth, high, style.detached)
             if rng.random() < 0.5:
                 back = setback + rng.uniform(24.0, 45.0)
                 layout.place_house(
                     s, side * back, rng.uniform(9, 18), rng.uniform(8, 12), high + rng.uniform(-1, 3), True
                 )
-        s += width + (rng.uniform(*gap) if detached or rng.random() < 0.3 else 0.0)
+        s += width + (rng.uniform(*style.gaps) if style.detached or rng.random() < 0.3 else 0.0)
 
 
 def _lamp(layout: Layout, s: float, side: float) -> None:
@@ -182,7 +215,7 @@ def _parked_car(layout: Layout, s: float, side: float, chance: float) -> None:
     rng = layout.rng
     if rng.random() < chance:
         yaw = (0.0 if side < 0 else np.pi) + rng.normal(0.0, 0.03)
-        layout.place(s, side * (CURB_OFFSET_M - 1.05 + rng.normal(0, 0.08)), yaw, 0.9, street.car, 3.3)
+        layout.place(s, side * (CURB_OFFSET_M - 1.05 + rng.normal(0, 0.08)), yaw, 0.9, street.car, _CAR_CLEARANCE_M)
 
 
 def _street_tree(layout: Layout, s: float, side: float) -> None:
@@ -191,7 +224,7 @@ def _street_tree(layout: Layout, s: float, side: float) -> None:
 
 def _fence(layout: Layout, s: float, side: float, style: str) -> None:
     if layout.rng.random() < 0.06:
-        return  # a gate
+        return  # leave a gate
     at = side * (SIDEWALK_END_M + 0.3)
     build: Build
     if style == "hedge":
@@ -231,7 +264,7 @@ def _meadow(layout: Layout, s: float, side: float) -> None:
 
 
 def _corridor(layout: Layout) -> None:
-    """Smooth walls on both sides, with a lamp post now and then."""
+    """Place smooth walls on both sides, and a lamp post every 120 m."""
     for side in (1.0, -1.0):
         for s in np.arange(2.0, layout.road.length_m - 2.0, 4.0):
             layout.place(float(s), side * 8.5, 0.0, 0.1, partial(street.fence, "wall", 4.06, 4.5), 7.0)
@@ -240,7 +273,7 @@ def _corridor(layout: Layout) -> None:
 
 
 def _field(layout: Layout) -> None:
-    """A tree or a bush every thirty metres or so, most of them far from the road."""
+    """Place a tree or a bush about every 30 m, mostly far from the road, and grass between."""
     rng = layout.rng
     s = 0.0
     while s < layout.road.length_m:

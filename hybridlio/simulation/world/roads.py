@@ -1,4 +1,7 @@
-"""Roads: a route through streets, as a smooth centreline, and the speed one drives along it."""
+"""Roads: the route as a smooth centreline, and the speed of a driver along it.
+
+Lengths of straights, angles and chances are plausible for a European town and were chosen by eye on rendered scans.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +12,27 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
 from hybridlio.core.arrays import Array
-from hybridlio.simulation.config import Driving, Scene
+from hybridlio.simulation.choices import Driving, Scene
 
-STEP_M = 0.5
-LANE_OFFSET_M = 1.75
-CORNER_SIGMA_M = 11.0  # corners end up with a radius of 0.89 of it
-_STOP_CHANCE = 0.25
+STEP_M = 0.5  # between points of a sampled road: a twentieth of the smallest bend's radius
+LANE_OFFSET_M = 1.75  # from the centreline to the middle of a lane 3.5 m wide
+# Smoothing of corners. A right angle gets a smallest radius of 0.89 times this, about 10 m: a turn at a junction.
+CORNER_SIGMA_M = 11.0
+_STOP_CHANCE = 0.25  # at a bend: most junctions are passed without a stop
+_STOP_BEFORE_M = 6.0  # the stop line is this far before the slowest point of the bend
+_FREE_START_M = 40.0  # no stop in the first metres, so that short drives move
+_MIN_CLEARANCE_M = 45.0  # between pieces of the route, so that houses fit between them
+_ROAD_RESERVE_M = 60.0  # added to the length, because smoothing shortens corners
+_MIN_CURVATURE_1_M = 1e-4  # keeps the speed limit of a straight finite
+_ARRIVED_M_S = 0.15  # below it, a car that brakes for a stop has stopped
 
 
 @dataclass(frozen=True)
 class Manner:
-    """How hard a driver takes bends, brakes and speeds up."""
+    """Largest accelerations of a driver.
+
+    Calm values are those of ordinary traffic, hard ones near the grip of tyres on dry asphalt (7 to 9 m/s²).
+    """
 
     lateral_m_s2: float
     brake_m_s2: float
@@ -31,11 +44,11 @@ MANNERS: dict[Driving, Manner] = {"calm": Manner(2.0, 1.8, 1.4), "hard": Manner(
 
 @dataclass(frozen=True, eq=False)
 class Road:
-    """A smooth curve in the plane, by its arc length.
+    """A smooth curve in the plane, parametrised by arc length in metres.
 
     Attributes:
-        curve: position ``(…, 2)`` in metres at arc length in metres.
-        length_m: where it ends.
+        curve: position ``(…, 2)`` in metres at an arc length.
+        length_m: arc length of the end.
     """
 
     curve: CubicSpline
@@ -43,28 +56,28 @@ class Road:
 
     @classmethod
     def through(cls, points: Array) -> Road:
-        """The curve through densely spaced points ``(N, 2)``, parametrised by arc length anew."""
+        """Return the curve through densely spaced points ``(N, 2)``."""
         s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
         even = np.linspace(0.0, s[-1], max(int(s[-1] / STEP_M), 8) + 1)
         return cls(CubicSpline(even, CubicSpline(s, points)(even)), float(s[-1]))
 
     def at(self, s: Array) -> Array:
-        """Positions ``(…, 2)``."""
+        """Return positions ``(…, 2)`` at arc lengths ``s``."""
         return np.asarray(self.curve(s))
 
     def heading(self, s: Array) -> Array:
-        """Headings in radians, continuous along ascending ``s``."""
+        """Return headings in radians at arc lengths ``s``, continuous if ``s`` ascends."""
         tangent = self.curve(s, 1)
         return np.asarray(np.unwrap(np.arctan2(tangent[..., 1], tangent[..., 0])))
 
     def curvature(self, s: Array) -> Array:
-        """Signed curvatures in 1/m, positive to the left."""
+        """Return signed curvatures in 1/m at arc lengths ``s``, positive to the left."""
         first, second = self.curve(s, 1), self.curve(s, 2)
         cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
         return np.asarray(cross / np.linalg.norm(first, axis=-1) ** 3)
 
     def beside(self, s: Array, left_m: float | Array) -> Array:
-        """Positions ``(N, 2)`` at ``left_m`` metres to the left of the curve at ``s`` ``(N,)``."""
+        """Return positions ``(N, 2)``, ``left_m`` metres to the left of the curve at arc lengths ``s`` ``(N,)``."""
         tangent = self.curve(s, 1)
         tangent /= np.linalg.norm(tangent, axis=-1, keepdims=True)
         normal = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
@@ -74,7 +87,7 @@ class Road:
 def generate_centreline(
     rng: np.random.Generator, length_m: float, scene: Scene, round_trip_m: float | None = None
 ) -> Road:
-    """A road of ``length_m`` or more that starts at the origin; back there after ``round_trip_m``, where given."""
+    """Generate a road of at least ``length_m``; with ``round_trip_m``, it returns to its start after that length."""
     corners = _loop_corners(rng, length_m, round_trip_m) if round_trip_m else _open_corners(rng, length_m, scene)
     corners = corners + rng.normal(0.0, 0.05, corners.shape)
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
@@ -85,9 +98,10 @@ def generate_centreline(
 
 
 def _open_corners(rng: np.random.Generator, length_m: float, scene: Scene) -> Array:
+    """Draw the corners ``(N, 2)`` of a route that stays clear of itself, if possible within 30 trials per piece."""
     heading = rng.uniform(-np.pi, np.pi)
     points, walked, last_turn = [np.zeros(2)], 0.0, 0.0
-    while walked < length_m + 60.0:
+    while walked < length_m + _ROAD_RESERVE_M:
         for _ in range(30):
             leg, turn = _leg(rng, scene)
             if points[1:] and abs(last_turn) > 0.5 and turn * last_turn > 0 and rng.random() < 0.7:
@@ -101,7 +115,7 @@ def _open_corners(rng: np.random.Generator, length_m: float, scene: Scene) -> Ar
 
 
 def _leg(rng: np.random.Generator, scene: Scene) -> tuple[float, float]:
-    """Length of the next straight piece and the turn before it."""
+    """Draw the length in metres of the next straight piece, and the turn in radians before it."""
     sign = rng.choice([-1.0, 1.0])
     if scene != "town":
         return rng.uniform(120.0, 300.0), sign * np.radians(rng.uniform(0.0, 6.0 if scene == "corridor" else 20.0))
@@ -110,19 +124,19 @@ def _leg(rng: np.random.Generator, scene: Scene) -> tuple[float, float]:
     return rng.uniform(50.0, 180.0), sign * np.radians(rng.uniform(3.0, 40.0))
 
 
-def _clear_of(points: list[Array], end: Array, clearance_m: float = 45.0) -> bool:
-    """Whether the piece from the last point to ``end`` stays away from the road so far."""
+def _clear_of(points: list[Array], end: Array) -> bool:
+    """Return whether the piece from the last point to ``end`` keeps its distance from the route so far."""
     if len(points) < 3:
         return True
     piece = points[-1] + np.linspace(0.3, 1.0, 12)[:, None] * (end - points[-1])
     old = np.array(points[:-1])
     between = old[:-1, None] + np.linspace(0, 1, 20)[:, None] * (old[1:] - old[:-1])[:, None]
     gap = np.linalg.norm(piece[:, None] - between.reshape(-1, 2), axis=-1)
-    return bool(gap.min() > clearance_m)
+    return bool(gap.min() > _MIN_CLEARANCE_M)
 
 
 def _loop_corners(rng: np.random.Generator, length_m: float, round_trip_m: float) -> Array:
-    """A walk over the streets round two blocks: once about both, then wherever junctions lead, never turning back."""
+    """Draw the corners of a route around two blocks: once around both, then at random at junctions, without U-turns."""
     width, depth = round_trip_m * rng.uniform(0.14, 0.18), round_trip_m * rng.uniform(0.16, 0.2)
     grid = {(i, j): np.array([i * width, j * depth]) + rng.normal(0.0, 4.0, 2) for i in range(3) for j in range(2)}
     walk = [(0, 0), (1, 0), (2, 0), (2, 1), (1, 1), (0, 1), (0, 0), (1, 0)]
@@ -132,7 +146,7 @@ def _loop_corners(rng: np.random.Generator, length_m: float, round_trip_m: float
     def walked() -> float:
         return float(np.linalg.norm(np.diff([grid[n] for n in walk], axis=0), axis=1).sum())
 
-    while walked() < length_m + 60.0:
+    while walked() < length_m + _ROAD_RESERVE_M:
         (i, j), back = walk[-1], walk[-2]
         ways = [n for n in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)) if n in grid and n != back]
         walk.append(ways[rng.integers(len(ways))])
@@ -140,11 +154,11 @@ def _loop_corners(rng: np.random.Generator, length_m: float, round_trip_m: float
 
 
 def speed_limit(road: Road, cruise_m_s: float, rng: np.random.Generator, manner: Manner = MANNERS["calm"]) -> Array:
-    """The speed one would drive at each ``STEP_M`` of the road, from its curves and one's mood, braking in time."""
+    """Return the speed at each ``STEP_M`` of the road, limited by bends, slowly varying, braking in time."""
     s = np.arange(0.0, road.length_m, STEP_M)
-    mood = 1.0 + 0.12 * np.sin(2 * np.pi * s / rng.uniform(150, 400) + rng.uniform(0, 6)) - 0.08
-    bend = np.sqrt(manner.lateral_m_s2 / np.maximum(np.abs(road.curvature(s)), 1e-4))
-    limit = np.minimum(cruise_m_s * mood, bend)
+    variation = 1.0 + 0.12 * np.sin(2 * np.pi * s / rng.uniform(150, 400) + rng.uniform(0, 6)) - 0.08
+    bend = np.sqrt(manner.lateral_m_s2 / np.maximum(np.abs(road.curvature(s)), _MIN_CURVATURE_1_M))
+    limit = np.minimum(cruise_m_s * variation, bend)
     for i in range(len(limit) - 2, -1, -1):
         limit[i] = min(limit[i], np.sqrt(limit[i + 1] ** 2 + 2 * manner.brake_m_s2 * STEP_M))
     return np.asarray(limit)
@@ -159,14 +173,26 @@ def drive(
     rng: np.random.Generator,
     manner: Manner = MANNERS["calm"],
 ) -> Array:
-    """Metres driven since ``start_m`` ``(N,)`` at evenly spaced ``times_s``: braking for bends, halting at some.
+    """Drive along a road, braking for bends and stopping at some.
 
-    Not moving at the start means a standstill until two seconds after time zero.
+    Args:
+        road: the lane.
+        start_m: arc length of the start.
+        cruise_m_s: cruising speed.
+        times_s: ``(N,)``, evenly spaced.
+        start_moving: whether the car moves at the first time; else it stands until two seconds after time zero.
+        rng: decides where the car stops, and for how long.
+        manner: the driver's largest accelerations.
+
+    Returns:
+        Metres ``(N,)`` driven since ``start_m``.
     """
     limit = speed_limit(road, cruise_m_s, rng, manner)
     slow = (limit[1:-1] < 0.55 * cruise_m_s) & (limit[1:-1] <= limit[:-2]) & (limit[1:-1] < limit[2:])
     stops = [
-        i * STEP_M - 6.0 for i in np.flatnonzero(slow) if rng.random() < _STOP_CHANCE and i * STEP_M > start_m + 40.0
+        i * STEP_M - _STOP_BEFORE_M
+        for i in np.flatnonzero(slow)
+        if rng.random() < _STOP_CHANCE and i * STEP_M > start_m + _FREE_START_M
     ]
     dt = float(times_s[1] - times_s[0])
     speed = float(limit[int(start_m / STEP_M)]) if start_moving else 0.0
@@ -180,7 +206,7 @@ def drive(
         goal = limit[min(int(s / STEP_M), len(limit) - 1)]
         if stops:
             goal = min(goal, np.sqrt(2 * manner.brake_m_s2 * max(stops[0] - s, 0.0)))
-            if goal < 0.15:
+            if goal < _ARRIVED_M_S:
                 stops.pop(0)
                 wait = rng.uniform(1.5, 4.0)
         speed += np.clip(goal - speed, -2 * manner.brake_m_s2 * dt, manner.accelerate_m_s2 * dt)

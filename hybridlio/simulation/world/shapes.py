@@ -1,4 +1,4 @@
-"""Triangle meshes with a reflectance on each face, and the few shapes that a street is built of."""
+"""Triangle meshes with a reflectance per face, and the basic shapes of which objects are composed."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from hybridlio.core.arrays import Array
+from hybridlio.core.arrays import Array, Index
 
 _CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _CUBE_FACES = np.array(
@@ -18,36 +18,36 @@ _CUBE_FACES = np.array(
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles.
+    """A triangle mesh.
 
     Attributes:
-        vertices: ``(V, 3)`` metres.
+        vertices: ``(V, 3)`` in metres.
         triangles: ``(F, 3)`` indices of vertices.
-        reflectance: ``(F,)`` share of the light that a face sends back, 0 to 1.
+        reflectance: ``(F,)`` share of the light that a face reflects, 0 to 1.
     """
 
     vertices: Array
-    triangles: NDArray[np.int64]
+    triangles: Index
     reflectance: Array
 
     @classmethod
     def empty(cls) -> Mesh:
-        """No triangles."""
+        """Return a mesh without triangles."""
         return cls(np.empty((0, 3)), np.empty((0, 3), np.int64), np.empty(0))
 
     def placed(self, x: float, y: float, z: float, yaw: float) -> Mesh:
-        """The mesh turned about its z axis by ``yaw`` radians, then moved."""
+        """Return the mesh rotated about its z axis by ``yaw`` radians, then translated."""
         c, s = np.cos(yaw), np.sin(yaw)
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         return Mesh(self.vertices @ R.T + [x, y, z], self.triangles, self.reflectance)
 
     def moved(self, offset_m: ArrayLike) -> Mesh:
-        """The mesh moved by ``offset_m`` ``(3,)``."""
+        """Return the mesh translated by ``offset_m`` ``(3,)``."""
         return Mesh(self.vertices + np.asarray(offset_m), self.triangles, self.reflectance)
 
 
 def merge(meshes: Iterable[Mesh]) -> Mesh:
-    """All meshes as one."""
+    """Merge meshes into one."""
     parts = [m for m in meshes if len(m.triangles)]
     if not parts:
         return Mesh.empty()
@@ -60,7 +60,7 @@ def merge(meshes: Iterable[Mesh]) -> Mesh:
 
 
 def boxes(low: ArrayLike, high: ArrayLike, reflectance: float) -> Mesh:
-    """Axis-parallel boxes from corners ``low`` to corners ``high``, each ``(B, 3)`` or ``(3,)``."""
+    """Return axis-parallel boxes from corners ``low`` to corners ``high``, each ``(B, 3)`` or ``(3,)``."""
     low, high = np.atleast_2d(np.asarray(low, dtype=np.float64)), np.atleast_2d(np.asarray(high, dtype=np.float64))
     low, high = np.broadcast_arrays(low, high)
     vertices = ((low + high) / 2)[:, None] + _CUBE * (high - low)[:, None]
@@ -69,9 +69,9 @@ def boxes(low: ArrayLike, high: ArrayLike, reflectance: float) -> Mesh:
 
 
 def prism(profile: ArrayLike, low_y: float, high_y: float, reflectance: float, top_inset: float = 0.0) -> Mesh:
-    """A convex profile ``(K, 2)`` of x and z, counter-clockwise, extruded along y.
+    """Extrude a convex profile ``(K, 2)`` of x and z, counter-clockwise, along y from ``low_y`` to ``high_y``.
 
-    ``top_inset`` narrows the body towards its highest vertices by so much on either side.
+    ``top_inset`` narrows the body, linearly with height, by this many metres on either side at the top.
     """
     profile = np.asarray(profile, dtype=np.float64)
     count = len(profile)
@@ -88,7 +88,7 @@ def prism(profile: ArrayLike, low_y: float, high_y: float, reflectance: float, t
 def cylinder(
     radius_low: float, radius_high: float, low_z: float, high_z: float, reflectance: float, sides: int = 8
 ) -> Mesh:
-    """An upright (tapered) cylinder on the z axis, open below."""
+    """Return an upright cylinder on the z axis, tapered if the radii differ, open at the bottom."""
     angle = np.arange(sides) * 2 * np.pi / sides
     ring = np.column_stack([np.cos(angle), np.sin(angle)])
     low = np.column_stack([ring * radius_low, np.full(sides, low_z)])
@@ -102,7 +102,7 @@ def cylinder(
 
 
 def facets(centres: Array, size_m: float, reflectance: float, rng: np.random.Generator) -> Mesh:
-    """One small triangle of random attitude at each centre ``(N, 3)``: foliage, as a lidar sees it."""
+    """Return one small triangle of random attitude at each centre ``(N, 3)``: foliage, as a lidar sees it."""
     corners = centres[:, None] + rng.normal(0.0, size_m, (len(centres), 3, 3))
     shades = np.clip(reflectance + rng.normal(0.0, 0.06, len(centres)), 0.05, 1.0)
     return Mesh(corners.reshape(-1, 3), np.arange(3 * len(centres)).reshape(-1, 3), shades)

@@ -1,4 +1,9 @@
-"""What stands along a street: houses, cars, trees, hedges, poles, signs, fences. Each a mesh at the origin, z up."""
+"""Objects along a street: houses, cars, trees, hedges, poles, signs, fences. Each is a mesh at the origin, z up.
+
+Sizes are those of common objects in a European town, drawn within plausible ranges and checked by eye on rendered
+scans; they do not follow a standard. Reflectances are those of dull surfaces at 905 nm, from 0.08 (rubber) to 0.6
+(light plaster), and 0.95 for the retroreflecting plates of signs.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +12,11 @@ import numpy as np
 from hybridlio.core.arrays import Array
 from hybridlio.simulation.world.shapes import Mesh, boxes, cylinder, facets, merge, prism
 
-_FOUNDATION_M = 2.0  # everything reaches so far below its ground, which is uneven
+_FOUNDATION_M = 2.0  # objects extend this far below their origin, so that none floats above uneven ground
 
 
 def facade(width: float, height: float, recess: float, rng: np.random.Generator) -> Mesh:
-    """A front at y from 0 to ``recess`` and x from 0 to ``width``: piers and bands around recessed windows."""
+    """Return a front at x from 0 to ``width`` and y from 0 to ``recess``: piers and bands around recessed windows."""
     storey = rng.uniform(2.7, 3.3)
     floors = max(int(height / storey), 1)
     axes = max(int(width / rng.uniform(2.2, 3.6)), 1)
@@ -47,7 +52,7 @@ def _balconies(width: float, height: float, rng: np.random.Generator) -> Mesh:
 
 
 def house(width: float, depth: float, height: float, detached: bool, rng: np.random.Generator) -> Mesh:
-    """A house centred on x, its front at y = 0 facing -y, with windows, perhaps balconies, a roof and a chimney."""
+    """Return a house, centred in x, front at y = 0 facing -y; some have balconies, a gabled roof, a chimney."""
     recess = rng.uniform(0.12, 0.35)
     core = boxes(
         (recess, recess, -_FOUNDATION_M), (width - recess, depth - recess, height - 0.02), rng.uniform(0.1, 0.3)
@@ -67,7 +72,7 @@ def _roof(width: float, depth: float, height: float, detached: bool, rng: np.ran
         return boxes((0.0, -0.1, height), (width, depth, height + rng.uniform(0.2, 0.9)), 0.3)
     over, rise = rng.uniform(0.2, 0.6), depth / 2 * np.tan(np.radians(rng.uniform(25, 45)))
     gable = prism([(-over, height), (depth + over, height), (depth / 2, height + rise)], 0.0, width, 0.3)
-    # the prism's profile lies along x; turned, it lies along y
+    # the profile of a prism is in x and z; rotated, it is in y and z
     roof = gable.placed(width, 0.0, 0.0, np.pi / 2)
     x = rng.uniform(1.0, width - 1.6)
     chimney = boxes((x, depth * 0.4, height), (x + 0.6, depth * 0.4 + 0.6, height + rise + 0.6), 0.35)
@@ -75,7 +80,7 @@ def _roof(width: float, depth: float, height: float, detached: bool, rng: np.ran
 
 
 def car(rng: np.random.Generator) -> Mesh:
-    """A car, van or lorry of random size and paint, its middle at the origin, x forward."""
+    """Return a car, van or lorry of random size and paint, centred on the origin, x forward."""
     paint = rng.uniform(0.08, 0.7)
     kind = rng.random()
     length, width, height = rng.uniform(3.8, 4.8), rng.uniform(1.68, 1.85), rng.uniform(1.42, 1.65)
@@ -123,7 +128,7 @@ def _lorry(length: float, paint: float) -> Mesh:
 
 
 def tree(rng: np.random.Generator) -> Mesh:
-    """A tree: a trunk, and a crown of clustered facets."""
+    """Return a tree: a trunk, and a crown of clustered facets."""
     trunk, radius = rng.uniform(1.8, 3.2), rng.uniform(0.09, 0.28)
     crown_radius, crown_height = rng.uniform(1.3, 3.2), rng.uniform(2.5, 6.0)
     count = int(220 * min(crown_radius, 2.5))
@@ -137,7 +142,7 @@ def tree(rng: np.random.Generator) -> Mesh:
 
 
 def bush(length: float, height: float, rng: np.random.Generator) -> Mesh:
-    """A bush, or a piece of hedge ``length`` metres along x: facets around a smaller dark core."""
+    """Return a bush, or a piece of hedge ``length`` metres along x: facets around a smaller solid core."""
     count = int(60 + 55 * length * height)
     spread = rng.uniform(-0.5, 0.5, (count, 3)) * [length, 0.7, 1.0]
     spread[:, 2] = rng.uniform(0.05, 1.0, count) * height
@@ -146,7 +151,7 @@ def bush(length: float, height: float, rng: np.random.Generator) -> Mesh:
 
 
 def grass_tuft(rng: np.random.Generator) -> Mesh:
-    """Knee-high growth on open land."""
+    """Return knee-high growth on open land."""
     count = int(rng.integers(15, 60))
     spot = rng.normal(0.0, rng.uniform(0.3, 1.0), (count, 3))
     spot[:, 2] = rng.uniform(0.0, rng.uniform(0.2, 0.7), count)
@@ -154,7 +159,7 @@ def grass_tuft(rng: np.random.Generator) -> Mesh:
 
 
 def pole(rng: np.random.Generator) -> Mesh:
-    """A lamp post with its arm, or a plain mast."""
+    """Return a lamp post with an arm, or a plain mast."""
     height, radius = rng.uniform(4.5, 8.0), rng.uniform(0.06, 0.13)
     post = cylinder(radius, radius * 0.7, -_FOUNDATION_M, height, 0.5, 8)
     if rng.random() < 0.5:
@@ -163,7 +168,7 @@ def pole(rng: np.random.Generator) -> Mesh:
 
 
 def sign(rng: np.random.Generator) -> Mesh:
-    """A traffic sign on its post, facing -x."""
+    """Return a traffic sign on a post, facing -x."""
     height, size = rng.uniform(2.0, 2.6), rng.uniform(0.5, 0.9)
     post = cylinder(0.03, 0.03, -_FOUNDATION_M, height + size / 2, 0.5, 6)
     plate = boxes((-0.06, -size / 2, height - size / 2), (-0.04, size / 2, height + size / 2), 0.95)
@@ -171,7 +176,7 @@ def sign(rng: np.random.Generator) -> Mesh:
 
 
 def fence(style: str, length: float, height: float, rng: np.random.Generator) -> Mesh:
-    """A piece of ``wall``, ``picket`` or ``rail`` fence along x, centred."""
+    """Return a piece of fence along x, centred; ``style`` is ``wall``, ``picket`` or ``rail``."""
     half, shade = length / 2, rng.uniform(0.3, 0.5)
     if style == "wall":
         return boxes((-half, -0.12, -_FOUNDATION_M), (half, 0.12, height), shade)
@@ -189,6 +194,7 @@ def fence(style: str, length: float, height: float, rng: np.random.Generator) ->
 
 
 def _in_ball(rng: np.random.Generator, count: int) -> Array:
+    """Draw ``(count, 3)`` points uniformly from the unit ball."""
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return np.asarray(direction * np.cbrt(rng.random((count, 1))))

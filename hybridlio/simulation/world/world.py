@@ -1,85 +1,35 @@
-"""The world that the lidar sees: tiles of ground and things, and one ray-casting scene of those around the car."""
+"""The world that the lidar sees: tiles of ground and objects, and the ray-casting scene of those around the car."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridlio.core.arrays import Array
 from hybridlio.simulation.world.ground import SIDEWALK_END_M, Ground
-from hybridlio.simulation.world.layout import Item
+from hybridlio.simulation.world.items import Item
+from hybridlio.simulation.world.rays import RayScene
 from hybridlio.simulation.world.shapes import Mesh, merge
 
-TILE_M = 32.0
-FINE_CELL_M, COARSE_CELL_M = 0.5, 2.0
-_SIGHT_M = 120.0
-_REBUILD_M = 40.0
+TILE_M = 32.0  # many times an object's size; small enough that tiles out of sight are not built
+FINE_CELL_M, COARSE_CELL_M = 0.5, 2.0  # of the ground: fine enough for curbs on the road, coarse elsewhere
+_FINE_MARGIN_M = 4.0  # the fine ground extends this far beyond the sidewalk
+_SIGHT_M = 120.0  # the longest range of a lidar model
+_REBUILD_M = 40.0  # distance between scenes: a scene serves some seconds of driving
 
 Tile = tuple[int, int]
 
 
-@dataclass(frozen=True, eq=False)
-class Hits:
-    """What rays meet first.
-
-    Attributes:
-        range_m: ``(R,)`` metres along the ray, infinite where there is nothing.
-        cosine: ``(R,)`` of the angle of incidence, 0 where there is nothing.
-        reflectance: ``(R,)``, 0 where there is nothing.
-    """
-
-    range_m: Array
-    cosine: Array
-    reflectance: Array
-
-    def take_nearer(self, rows: NDArray[np.intp], others: Hits) -> None:
-        """Put ``others``, hits of the rays ``rows``, where they are nearer."""
-        nearer = others.range_m < self.range_m[rows]
-        for mine, theirs in zip(vars(self).values(), vars(others).values(), strict=True):
-            mine[rows[nearer]] = theirs[nearer]
-
-
-@dataclass(eq=False)
-class RayScene:
-    """Triangles ready for rays; everything relative to ``origin`` ``(3,)``, for single precision's sake."""
-
-    origin: Array
-    reflectance: Array
-    scene: Any
-
-    @classmethod
-    def of(cls, mesh: Mesh, origin: Array) -> RayScene:
-        """Build the acceleration structure (Embree, by Open3D)."""
-        import open3d as o3d
-
-        scene = o3d.t.geometry.RaycastingScene()
-        vertices = np.ascontiguousarray(mesh.vertices - origin, dtype=np.float32)
-        triangles = np.ascontiguousarray(mesh.triangles, dtype=np.uint32)
-        scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(triangles))
-        return cls(origin, np.append(mesh.reflectance, 0.0), scene)
-
-    def cast(self, origins: Array, directions: Array) -> Hits:
-        """First hits of rays from ``origins`` along unit ``directions``, each ``(R, 3)``."""
-        import open3d as o3d
-
-        rays = np.empty((len(directions), 6), dtype=np.float32)
-        rays[:, :3], rays[:, 3:] = origins - self.origin, directions
-        answer = self.scene.cast_rays(o3d.core.Tensor.from_numpy(rays))
-        faces = np.minimum(answer["primitive_ids"].numpy(), len(self.reflectance) - 1)
-        normals = answer["primitive_normals"].numpy()
-        cosine = np.abs(np.einsum("ni,ni->n", normals, rays[:, 3:]))
-        return Hits(answer["t_hit"].numpy().astype(np.float64), cosine, self.reflectance[faces])
-
-
 @dataclass(eq=False)
 class World:
-    """Ground and things by tile; meshes are made when first in sight and dropped when far behind.
+    """Ground and objects by tile. Meshes are built when they come into sight and dropped when out of sight.
 
-    The same ``seed`` gives every thing the same shape whenever it is built.
+    Attributes:
+        ground: the ground.
+        items: the objects.
+        seed: gives each object its shape, the same whenever it is built.
     """
 
     ground: Ground
@@ -97,9 +47,10 @@ class World:
         self._item_z = self.ground.height(np.array([(i.x, i.y) for i in self.items]).reshape(-1, 2))
 
     def scene_around(self, position: Array) -> RayScene:
-        """The scene of everything in sight of ``position`` ``(3,)``; rebuilt every _REBUILD_M or so.
+        """Return the scene of everything in sight of ``position`` ``(3,)``, world frame.
 
-        Which scene serves a position depends on the position alone, so a resumed drive sees the same triangles.
+        The scene depends only on the cell of 40 m that the position is in, not on earlier calls, so a resumed drive
+        sees the same triangles.
         """
         cell = np.round(position / _REBUILD_M) * _REBUILD_M
         if self._scene is None or not np.array_equal(self._scene.origin, cell):
@@ -111,10 +62,10 @@ class World:
         return self._scene
 
     def tile_mesh(self, tile: Tile) -> Mesh:
-        """Ground and things of one tile."""
+        """Build ground and objects of one tile."""
         low = np.array(tile) * TILE_M
         to_road = float(self.ground.distance(low[None] + TILE_M / 2)[0])
-        fine = to_road < SIDEWALK_END_M + 4.0 + TILE_M * np.sqrt(0.5)
+        fine = to_road < SIDEWALK_END_M + _FINE_MARGIN_M + TILE_M * np.sqrt(0.5)
         parts = [self.ground.patch(low, TILE_M, FINE_CELL_M if fine else COARSE_CELL_M)]
         for index in self._by_tile.get(tile, ()):
             item = self.items[index]

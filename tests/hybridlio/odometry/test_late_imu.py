@@ -14,7 +14,7 @@ from hybridlio.core.sensors import Frame, ImuSamples
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.graph.run.smooth import smooth
 from hybridlio.odometry.odometry import Odometry
-from hybridlio.simulation.chain import Chain, make_chain
+from hybridlio.simulation.chain import Chain, ChainSettings, make_chain
 
 LATE = 15
 
@@ -53,7 +53,7 @@ def driven(drive: Chain, frames: list[Frame], backend: str) -> tuple[Odometry, l
 
 @pytest.fixture(scope="module", params=[None, 0.1], ids=["steps", "map"])
 def drive(request: pytest.FixtureRequest) -> Chain:
-    return make_chain(5, steps=45, drift_share=request.param)
+    return make_chain(5, ChainSettings(steps=45, drift_share=request.param))
 
 
 @pytest.mark.parametrize("backend", ["incremental", "fixed-lag"])

@@ -1,3 +1,5 @@
+"""Faults injected into a recording."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -13,7 +15,7 @@ STAMPS = 1_700_000_000_000_000_000 + np.arange(101) * 100_000_000
 
 
 def load(k: int) -> Scan:
-    """A ring of 360 points, one a degree, each with its number as intensity."""
+    """Return a ring of 360 points, one per degree, with their numbers as intensity."""
     angles = np.radians(np.arange(360) - 179.5)
     points = np.column_stack([np.cos(angles), np.sin(angles), np.full(360, float(k))]).astype(np.float32)
     return Scan(int(STAMPS[k]), points, np.arange(360, dtype=np.float32), np.arange(360, dtype=np.int64))
@@ -29,7 +31,7 @@ def sequence() -> Sequence:
     return Sequence("ring", STAMPS, load, imu, reference=reference, forward_speed_m_s=np.arange(101.0))
 
 
-def test_dropped_scans_are_missing_with_their_rows_and_the_rest_keep_theirs(sequence: Sequence):
+def test_dropping_scans_keeps_the_data_of_the_others(sequence: Sequence):
     dropped = drop_scans(sequence, 0.2, seed=4)
     assert len(dropped) == 81
     assert dropped.stamps_ns[0] == STAMPS[0]
@@ -44,19 +46,19 @@ def test_dropped_scans_are_missing_with_their_rows_and_the_rest_keep_theirs(sequ
     assert "20 of 101 scans" in dropped.notes[-1]
 
 
-def test_what_is_dropped_depends_on_the_seed_alone(sequence: Sequence):
+def test_dropped_scans_depend_only_on_the_seed(sequence: Sequence):
     first, again, other = (drop_scans(sequence, 0.2, seed).stamps_ns.tolist() for seed in (1, 1, 2))
     assert first == again != other
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.0, float("nan")])
-def test_a_share_that_is_none_is_refused(sequence: Sequence, share: float):
+def test_an_invalid_share_is_rejected(sequence: Sequence, share: float):
     with pytest.raises(ConfigError, match="share"):
         drop_scans(sequence, share)
 
 
 @pytest.mark.parametrize(("middle", "where"), [(0.0, [1, 0]), (90.0, [0, 1]), (180.0, [-1, 0])])
-def test_a_blocked_half_has_no_points_while_it_is_blocked(sequence: Sequence, middle: float, where: list[int]):
+def test_a_blocked_sector_has_no_points_during_the_interval(sequence: Sequence, middle: float, where: list[int]):
     blocked = block_sector(sequence, 2.0, 5.0, middle)
     for k, points in ((19, 360), (20, 180), (49, 180), (50, 360)):
         scan = blocked[k].scan
@@ -69,7 +71,7 @@ def test_a_blocked_half_has_no_points_while_it_is_blocked(sequence: Sequence, mi
             assert (scan.points[:, :2] @ where < 0).all()
 
 
-def test_in_a_gap_there_are_no_samples_and_none_are_made_up(sequence: Sequence):
+def test_an_imu_gap_has_no_samples_and_none_are_interpolated(sequence: Sequence):
     silent = imu_gap(sequence, 2.0, 3.0)
     assert len(silent.imu) == len(sequence.imu) - 100
     assert len(silent[25].imu) == 0
@@ -77,7 +79,7 @@ def test_in_a_gap_there_are_no_samples_and_none_are_made_up(sequence: Sequence):
     assert len(silent[31].imu) == 11
 
 
-def test_biases_are_as_many_times_those_assumed(sequence: Sequence):
+def test_injected_biases_are_multiples_of_the_noise_model(sequence: Sequence):
     for noise, assumed in ((None, ImuNoise()), (ImuNoise(1, 1, 1, 1, 0.5, 2.0),) * 2):
         object.__setattr__(sequence, "imu_noise", noise)
         biased = imu_bias(sequence, 3.0, seed=2)
@@ -87,7 +89,7 @@ def test_biases_are_as_many_times_those_assumed(sequence: Sequence):
         np.testing.assert_array_equal(np.ptp(gyro, axis=0), 0.0)
 
 
-def test_a_time_that_ends_before_it_starts_is_refused(sequence: Sequence):
+def test_an_interval_that_ends_before_it_starts_is_rejected(sequence: Sequence):
     for fault in (block_sector, imu_gap):
         with pytest.raises(ConfigError, match="ends before it starts"):
             fault(sequence, 3.0, 2.0)

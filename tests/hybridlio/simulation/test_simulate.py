@@ -1,3 +1,5 @@
+"""Simulated drives: files, reproducibility, interrupts, settings."""
+
 import json
 import shutil
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +25,7 @@ def contents(root: Path) -> dict[str, bytes]:
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
-def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(tmp_path: Path):
+def test_the_seed_determines_all_bytes(tmp_path: Path):
     timed = TOWN.model_copy(update={"motion_distortion": True, "gps": True})
     first = contents(simulate(tmp_path / "a", timed).parent)
     again = contents(simulate(tmp_path / "b", timed).parent)
@@ -48,23 +50,23 @@ def test_the_layout_is_that_of_kitti_raw_data(tmp_path: Path):
     assert not (drive / "velodyne_points/offsets").exists()
 
 
-def test_the_written_poses_are_the_lidars_in_the_first_scans_frame(tmp_path: Path):
+def test_written_poses_are_lidar_poses_in_the_first_scans_frame(tmp_path: Path):
     rows = np.loadtxt(simulate(tmp_path, SMALL) / "poses.txt").reshape(-1, 3, 4)
     drive = plan(SMALL)
     lidar = drive.path.poses(drive.scan_times_s) @ T_IMU_LIDAR
     np.testing.assert_allclose(rows, se3.between(lidar[0], lidar)[:, :3], atol=1e-12)
 
 
-def test_the_lidar_sits_where_kittis_does():
+def test_the_lidar_is_mounted_as_on_kittis_car():
     np.testing.assert_allclose(T_LIDAR_IMU @ T_IMU_LIDAR, np.eye(4), atol=1e-12)
     assert np.linalg.norm(T_LIDAR_IMU[:3, 3]) == pytest.approx(1.18, abs=0.05)
 
 
 class InterruptError(Exception):
-    """What stops a simulation in these tests."""
+    """Raised to interrupt a simulation."""
 
 
-def test_an_interrupted_drive_shows_nothing_and_goes_on_to_the_same_bytes(tmp_path: Path):
+def test_an_interrupted_drive_is_hidden_and_resumes_to_the_same_bytes(tmp_path: Path):
     def interrupt(stage: str, done: int, total: int) -> None:
         if done == 3:
             raise InterruptError
@@ -83,7 +85,7 @@ def test_an_interrupted_drive_shows_nothing_and_goes_on_to_the_same_bytes(tmp_pa
     assert [p.name for p in (tmp_path / "a").iterdir()] == [DATE]
 
 
-def test_processes_that_simulate_one_drive_at_once_make_it_once(tmp_path: Path):
+def test_concurrent_simulations_of_one_drive_write_it_once(tmp_path: Path):
     ready = Barrier(3)
 
     def begin(_: int) -> Path:
@@ -96,14 +98,14 @@ def test_processes_that_simulate_one_drive_at_once_make_it_once(tmp_path: Path):
     assert [p.name for p in (tmp_path / "a").iterdir()] == [DATE]
 
 
-def test_a_drive_cut_off_while_it_moved_into_place_is_made_whole(tmp_path: Path):
+def test_a_drive_interrupted_while_moving_into_place_is_completed(tmp_path: Path):
     drive = simulate(tmp_path, SMALL)
     whole = contents(drive.parent)
     shutil.rmtree(drive)  # the 100 Hz rows arrive first; only they are there
     assert contents(simulate(tmp_path, SMALL).parent) == whole
 
 
-def test_a_drive_written_before_a_setting_existed_is_still_the_same_drive(tmp_path: Path):
+def test_a_drive_written_before_a_setting_existed_is_reused(tmp_path: Path):
     description = simulate(tmp_path, SMALL) / "simulation.json"
     older = json.loads(description.read_text())
     del older["config"]["driving"]
@@ -113,14 +115,14 @@ def test_a_drive_written_before_a_setting_existed_is_still_the_same_drive(tmp_pa
         simulate(tmp_path, SMALL.model_copy(update={"driving": "hard"}))
 
 
-def test_a_drive_of_a_given_length_is_that_long():
+def test_a_drive_has_the_requested_length():
     drive = plan(SMALL.model_copy(update={"seconds": None, "length_m": 150.0}))
     position = drive.path.poses(drive.scan_times_s)[:, :3, 3]
     assert np.linalg.norm(np.diff(position, axis=0), axis=1).sum() == pytest.approx(150.0, abs=3.0)
 
 
 @pytest.mark.parametrize(("seed", "scene"), [(3, "town"), (2, "field"), (9, "field")])
-def test_a_drive_in_loops_is_as_long_as_asked_and_does_not_wait_at_a_roads_end(seed: int, scene: str):
+def test_a_drive_with_loops_has_the_requested_length_without_waiting_at_the_end(seed: int, scene: str):
     settings = {"seed": seed, "scene": scene, "loops": True, "length_m": 600.0, "traffic_per_km": 0.0}
     drive = plan(SimulationConfig.model_validate(settings))
     position = drive.path.poses(drive.scan_times_s)[:, :3, 3]
@@ -129,12 +131,12 @@ def test_a_drive_in_loops_is_as_long_as_asked_and_does_not_wait_at_a_roads_end(s
     assert steps[-50:].sum() > 1.0
 
 
-def test_a_misspelt_or_impossible_setting_is_refused():
+def test_misspelt_or_impossible_settings_are_rejected():
     for wrong in ({"second": 3.0}, {"lidar": "vlp-17"}, {"seconds": -1.0}, {"scene": "moon"}, {"seed": -1}):
         with pytest.raises(ValidationError):
             SimulationConfig(**wrong)
 
 
-def test_a_missing_pose_file_is_named(tmp_path: Path):
+def test_a_missing_pose_file_is_named_in_the_error(tmp_path: Path):
     with pytest.raises(ConfigError, match=r"no pose file at .*nowhere\.txt"):
         simulate(tmp_path, SMALL.model_copy(update={"poses": Path("nowhere.txt")}))

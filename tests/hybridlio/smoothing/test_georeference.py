@@ -19,7 +19,7 @@ from hybridlio.core.trajectory_files import read_tum
 from hybridlio.datasets.imu_faults import filled_gaps, without_filled_gaps
 from hybridlio.record.odometry_noise import odometry_noise
 from hybridlio.record.record import Record
-from hybridlio.simulation.chain import make_chain
+from hybridlio.simulation.chain import ChainSettings, make_chain
 from hybridlio.smoothing.georeference import MAP, POSES_ENU, TABLE, georeference, write_georeferenced
 
 ORIGIN = GeodeticPoint(48.98, 8.39, 115.0)
@@ -30,7 +30,7 @@ SHIFT_S = -0.6
 
 @pytest.fixture(scope="module")
 def drive() -> Any:
-    return make_chain(77, steps=300)
+    return make_chain(77, ChainSettings(steps=300))
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +133,7 @@ def test_straight_lines_among_samples_are_found_and_taken_out(record: Record):
 @pytest.mark.parametrize("share", [0.05, 0.5])
 def test_an_odometrys_noise_is_found_from_its_imu(share: float):
     sigmas = np.r_[np.full(3, 3e-3), np.full(3, 0.05)]
-    drive = make_chain(9, steps=600, step_sigmas=sigmas, drift_share=share, T_imu_lidar=np.eye(4))
+    drive = make_chain(9, ChainSettings(steps=600, step_sigmas=sigmas, drift_share=share, T_imu_lidar=np.eye(4)))
     poses = [np.eye(4)]
     for step in drive.relative:
         poses.append(poses[-1] @ step.pose)

@@ -1,3 +1,5 @@
+"""Smooth paths: interpolation, exact derivatives, least squares."""
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -10,13 +12,13 @@ TIMES = np.linspace(0.0, 4.0, 81)
 
 
 def tumbling_poses() -> np.ndarray:
-    """Poses that pass through every attitude, the pitch of 90 degrees among them."""
+    """Poses through all attitudes, including a pitch of 90 degrees."""
     position = np.column_stack([3 * np.sin(TIMES), 2 * TIMES, np.cos(1.3 * TIMES)])
     attitude = Rotation.from_euler("zyx", np.column_stack([0.9 * TIMES, 1.5 * np.sin(TIMES), 0.4 * TIMES]))
     return se3.make((attitude * Rotation.from_rotvec([0.0, np.pi / 2, 0.0])).as_matrix(), position)
 
 
-def test_the_path_goes_through_the_poses_it_was_given():
+def test_an_interpolated_path_passes_the_poses():
     poses = tumbling_poses()
     np.testing.assert_allclose(SmoothPath.through(TIMES, poses).poses(TIMES), poses, atol=1e-10)
 
@@ -30,7 +32,7 @@ def test_velocity_and_acceleration_equal_numerical_derivatives():
     np.testing.assert_allclose(motion.acceleration_m_s2, second, atol=1e-5)
 
 
-def test_angular_velocity_and_acceleration_equal_numerical_derivatives_in_the_body_frame():
+def test_angular_velocity_and_acceleration_equal_numerical_derivatives():
     path, at, h = SmoothPath.through(TIMES, tumbling_poses()), np.linspace(0.3, 3.7, 57), 1e-4
     motion = path.motion(at)
     turn = se3.so3_log(np.swapaxes(path.poses(at - h)[:, :3, :3], 1, 2) @ path.poses(at + h)[:, :3, :3])
@@ -39,7 +41,7 @@ def test_angular_velocity_and_acceleration_equal_numerical_derivatives_in_the_bo
     np.testing.assert_allclose(motion.angular_acceleration_rad_s2, (after - before) / (2 * h), atol=1e-5)
 
 
-def test_a_turn_at_constant_rate_has_that_rate_and_the_centripetal_acceleration():
+def test_a_circle_has_constant_rate_and_centripetal_acceleration():
     rate, radius, times = 0.5, 20.0, np.linspace(0.0, 10.0, 201)
     attitude = Rotation.from_euler("z", rate * times[:, None]).as_matrix()
     position = radius * np.column_stack([np.sin(rate * times), 1 - np.cos(rate * times), 0 * times])
@@ -49,7 +51,7 @@ def test_a_turn_at_constant_rate_has_that_rate_and_the_centripetal_acceleration(
     np.testing.assert_allclose(body, np.tile([0, radius * rate**2, 0], (33, 1)), atol=1e-7)
 
 
-def test_a_least_squares_path_evens_out_noise(rng: np.random.Generator):
+def test_a_least_squares_path_averages_noise(rng: np.random.Generator):
     times, sigma = np.arange(0.0, 30.0, 0.1), 0.02
     truth = se3.make(np.eye(3), np.column_stack([8 * times, 5 * np.sin(0.3 * times), 0 * times]))
     noisy = truth.copy()
@@ -60,12 +62,12 @@ def test_a_least_squares_path_evens_out_noise(rng: np.random.Generator):
     assert np.abs(path.motion(times).acceleration_m_s2[10:-10]).max() < 3.0
 
 
-def test_a_time_outside_the_path_is_refused():
+def test_a_time_outside_the_path_is_rejected():
     path = SmoothPath.through(TIMES, tumbling_poses())
     with pytest.raises(DataError, match=r"defined from 0\.000 to 4\.000 s"):
         path.poses([4.1])
 
 
-def test_too_few_poses_are_refused():
-    with pytest.raises(DataError, match="6 poses or more"):
+def test_too_few_poses_are_rejected():
+    with pytest.raises(DataError, match="at least 6 poses"):
         SmoothPath.through([0.0, 1.0], tumbling_poses()[:2])

@@ -1,3 +1,5 @@
+"""Pose files to drive along."""
+
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +26,7 @@ def write_kitti(path: Path, poses: np.ndarray) -> Path:
     return path
 
 
-def test_a_camera_pose_file_gives_back_the_lidars_poses(tmp_path: Path):
+def test_camera_poses_are_read_as_lidar_poses(tmp_path: Path):
     lidar = curve()
     camera = T_CAMERA_LIDAR @ lidar @ se3.inverse(T_CAMERA_LIDAR)  # in the first camera's frame, as KITTI has it
     read = read_lidar_poses(write_kitti(tmp_path / "poses.txt", camera), "camera")
@@ -32,7 +34,7 @@ def test_a_camera_pose_file_gives_back_the_lidars_poses(tmp_path: Path):
     np.testing.assert_allclose(read[:, :3, 2].mean(axis=0), [0, 0, 1], atol=1e-6)
 
 
-def test_a_tum_file_is_brought_to_ten_scans_a_second(tmp_path: Path):
+def test_a_tum_file_is_interpolated_at_ten_scans_per_second(tmp_path: Path):
     lidar = curve()
     fine = path_along(lidar)
     times = np.arange(0.0, 10.0, 0.04)
@@ -49,17 +51,17 @@ def test_a_tum_file_is_brought_to_ten_scans_a_second(tmp_path: Path):
     [
         ("1 2 3\n" * 20, "row 1 has 3 columns; expected one of TUM"),
         ("a b\n", "row 1 has 2 columns"),
-        ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 9, "9 poses; a drive needs 10"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 9, "9 poses; a drive needs at least 10"),
         ("".join(f"{k} 0 0 0 0 0 0 0\n" for k in range(20)), "row 1: its quaternion"),
     ],
 )
-def test_a_file_of_something_else_is_refused(tmp_path: Path, text: str, message: str):
+def test_other_files_are_rejected(tmp_path: Path, text: str, message: str):
     (tmp_path / "x.txt").write_text(text)
     with pytest.raises(DataError, match=message):
         read_lidar_poses(tmp_path / "x.txt", "camera")
 
 
-def test_the_drive_passes_the_files_poses_at_their_times(tmp_path: Path):
+def test_the_drive_passes_the_poses_of_the_file_at_their_times(tmp_path: Path):
     file = write_kitti(tmp_path / "poses.txt", curve())
     drive = plan(SimulationConfig(poses=file, poses_frame="lidar", traffic_per_km=0.0))
     driven = drive.path.poses(drive.scan_times_s) @ T_IMU_LIDAR
@@ -67,13 +69,13 @@ def test_the_drive_passes_the_files_poses_at_their_times(tmp_path: Path):
     np.testing.assert_allclose(se3.between(driven[0], driven), curve(), atol=2e-3)
 
 
-def test_a_file_of_a_standing_car_gives_a_standing_drive(tmp_path: Path):
+def test_poses_of_a_standing_car_give_a_standing_drive(tmp_path: Path):
     file = write_kitti(tmp_path / "poses.txt", np.tile(np.eye(4), (30, 1, 1)))
     drive = plan(SimulationConfig(poses=file, poses_frame="lidar"))
     np.testing.assert_allclose(drive.path.motion(drive.scan_times_s).velocity_m_s, 0.0, atol=1e-9)
 
 
-def test_real_driving_is_followed_within_centimetres(kitti_odometry_root: Path):
+def test_a_recorded_path_is_followed_within_centimetres(kitti_odometry_root: Path):
     file = kitti_odometry_root / "poses" / "03.txt"  # comes back to nowhere, so its heights stay
     drive = plan(SimulationConfig(poses=file, traffic_per_km=0.0))
     truth = read_lidar_poses(file, "camera")
@@ -85,7 +87,7 @@ def test_real_driving_is_followed_within_centimetres(kitti_odometry_root: Path):
     assert np.abs(drive.path.motion(drive.scan_times_s).acceleration_m_s2).max() < 5.0
 
 
-def test_real_driving_with_loops_keeps_its_place_in_the_plane(kitti_odometry_root: Path):
+def test_a_recorded_path_with_loops_keeps_its_horizontal_positions(kitti_odometry_root: Path):
     file = kitti_odometry_root / "poses" / "00.txt"
     drive = plan(SimulationConfig(poses=file, traffic_per_km=0.0))
     lidar = drive.path.poses(drive.scan_times_s) @ T_IMU_LIDAR

@@ -1,9 +1,9 @@
-"""Moving cars keep out of the recording car's way."""
+"""Moving cars keep clear of the ego car."""
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from hybridlio.simulation.drive.traffic import traffic
+from hybridlio.simulation.drive.traffic import EgoDrive, traffic
 from hybridlio.simulation.world.ground import Ground
 from hybridlio.simulation.world.roads import LANE_OFFSET_M, Road
 
@@ -12,7 +12,7 @@ def level(xy: np.ndarray) -> np.ndarray:
     return np.zeros(len(xy))
 
 
-def test_no_lorry_drives_up_over_a_car_that_creeps():
+def test_no_moving_car_overlaps_a_slow_ego_car():
     x = np.arange(0.0, 400.0, 0.5)
     centreline = Road.through(np.column_stack([x, 0 * x]))
     lane = Road.through(np.column_stack([x, 0 * x - LANE_OFFSET_M]))
@@ -21,7 +21,7 @@ def test_no_lorry_drives_up_over_a_car_that_creeps():
     ego_s = 60.0 + np.interp(times, [0, 10, 25, 40], [0.0, 80.0, 88.0, 200.0])  # half a metre a second for a while
     ego_xy, followers = lane.at(ego_s), 0
     for seed in range(40):
-        for car in traffic(centreline, lane, ego_s, times, ego_xy, ground, 40.0, seed):
+        for car in traffic(centreline, EgoDrive(lane, times, ego_s, ego_xy), ground, 40.0, seed):
             there = np.array([car.present(t) for t in times])
             poses = car.poses(times[there])
             seen = np.einsum("nji,nj->ni", poses[:, :2, :2], ego_xy[there] - poses[:, :2, 3])

@@ -1,3 +1,5 @@
+"""The simulated IMU: consistency with the path, and its errors."""
+
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
@@ -13,7 +15,7 @@ SILENT = ImuNoise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def integrate(times: np.ndarray, gyro: np.ndarray, accel: np.ndarray, R0: Rotation, p0: np.ndarray, v0: np.ndarray):
-    """Attitude by fourth-order Magnus steps, velocity and position by quadrature, from the samples alone.
+    """Integrate samples: attitude by fourth-order Magnus steps, velocity and position by quadrature.
 
     Between the samples, rate and acceleration are taken as the cubic splines through them.
     """
@@ -35,7 +37,7 @@ def integrate(times: np.ndarray, gyro: np.ndarray, accel: np.ndarray, R0: Rotati
     [{"seed": 1}, {"seed": 2, "speed_m_s": 20.0}, {"seed": 3, "scene": "field"}, {"seed": 4, "start_moving": False}],
     ids=["town", "fast", "field", "from rest"],
 )
-def test_integrating_the_noise_free_imu_gives_the_path_back(settings: dict):
+def test_integrating_the_ideal_imu_reproduces_the_path(settings: dict):
     path = plan(SimulationConfig(seconds=12.0, **settings)).path
     times = 1.0 + np.arange(1001) / 100
     motion = path.motion(times)
@@ -46,7 +48,7 @@ def test_integrating_the_noise_free_imu_gives_the_path_back(settings: dict):
     assert np.degrees((attitude.inv() * truth).magnitude()).max() < 1e-3
 
 
-def test_an_imu_at_rest_reads_gravity_upwards_and_no_turn():
+def test_an_imu_at_rest_measures_gravity_and_no_rotation():
     path = plan(SimulationConfig(seconds=5.0, seed=4, start_moving=False)).path
     gyro, accel = ideal_imu(path, np.arange(0.0, 1.0, 0.01))
     np.testing.assert_allclose(np.linalg.norm(accel, axis=1), 9.81, atol=1e-3)
@@ -54,7 +56,7 @@ def test_an_imu_at_rest_reads_gravity_upwards_and_no_turn():
     assert np.abs(gyro).max() < 1e-3
 
 
-def test_no_noise_changes_nothing(rng: np.random.Generator):
+def test_zero_noise_changes_nothing(rng: np.random.Generator):
     gyro, accel = rng.normal(size=(2, 50, 3))
     noisy = add_noise(gyro, accel, SILENT, 100.0, rng)
     np.testing.assert_array_equal(noisy[0], gyro)
@@ -69,7 +71,7 @@ def test_white_noise_has_its_density_at_any_rate(rng: np.random.Generator):
         assert accel.std() == pytest.approx(3e-2 * np.sqrt(rate), rel=0.02)
 
 
-def test_a_bias_walks_by_its_density_times_the_root_of_time(rng: np.random.Generator):
+def test_a_bias_walk_grows_with_the_square_root_of_time(rng: np.random.Generator):
     noise = ImuNoise(0.0, 0.0, 1e-4, 5e-3, 0.0, 0.0)
     seconds, rate = 10.0, 100.0
     runs = [add_noise(*np.zeros((2, int(seconds * rate), 3)), noise, rate, rng) for _ in range(400)]
@@ -78,7 +80,7 @@ def test_a_bias_walks_by_its_density_times_the_root_of_time(rng: np.random.Gener
     assert ends[:, 1].std() == pytest.approx(5e-3 * np.sqrt(seconds), rel=0.08)
 
 
-def test_a_bias_starts_as_far_off_as_its_sigma_says(rng: np.random.Generator):
+def test_the_initial_bias_has_its_standard_deviation(rng: np.random.Generator):
     noise = ImuNoise(0.0, 0.0, 0.0, 0.0, 0.01, 0.1)
     runs = np.array([add_noise(*np.zeros((2, 4, 3)), noise, 100.0, rng) for _ in range(600)])
     np.testing.assert_array_equal(runs[:, :, 0], runs[:, :, -1])

@@ -1,3 +1,5 @@
+"""The simulated lidar: exact hits, the sweep, returns and noise."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -8,8 +10,8 @@ from hybridlio.core import se3
 from hybridlio.core.sensors import LIDAR_MODELS, NS_PER_S
 from hybridlio.simulation.drive.traffic import MovingCar
 from hybridlio.simulation.sensors.lidar import first_hits, measure, ray_pattern
+from hybridlio.simulation.world.rays import Hits, RayScene
 from hybridlio.simulation.world.shapes import boxes
-from hybridlio.simulation.world.world import Hits, RayScene
 
 MODEL = LIDAR_MODELS["16-beam"]
 NOISELESS = replace(MODEL, range_sigma_m=0.0, dropout=0.0)
@@ -22,14 +24,14 @@ def room() -> RayScene:
 
 
 def range_in_the_room(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Closed form: from inside a box, the nearest of the three walls that a ray runs towards."""
+    """Return ranges in closed form: the nearest of the three walls that a ray points to."""
     with np.errstate(divide="ignore"):
         towards = np.where(directions > 0, HIGH - origins, LOW - origins) / directions
     return np.where(directions == 0, np.inf, towards).min(axis=1)
 
 
 def out_of_the_room(points: np.ndarray) -> np.ndarray:
-    """Signed distance of points from the nearest wall's surface."""
+    """Return the signed distance of points to the nearest wall."""
     return np.minimum(points - LOW, HIGH - points).min(axis=1)
 
 
@@ -43,7 +45,7 @@ def test_a_scan_of_a_room_equals_the_closed_form(name: str):
     np.testing.assert_allclose(hits.range_m, range_in_the_room(origins, directions), atol=2e-5)
 
 
-def test_a_scan_of_the_ground_has_a_ring_for_each_beam_that_looks_down():
+def test_a_scan_of_the_ground_has_a_ring_per_downward_beam():
     ground = RayScene.of(boxes((-500, -500, -2.0), (500, 500, -1.5), 0.5), np.zeros(3))
     pattern = ray_pattern(MODEL)
     hits = first_hits(ground, [], pattern, np.eye(4)[None], AT_REST)
@@ -54,7 +56,7 @@ def test_a_scan_of_the_ground_has_a_ring_for_each_beam_that_looks_down():
     assert not np.isfinite(hits.range_m[elevation > 0]).any()
 
 
-def test_a_sweep_looks_ahead_at_its_stamp_and_turns_counter_clockwise():
+def test_a_sweep_points_forward_at_its_stamp_and_turns_counter_clockwise():
     pattern = ray_pattern(MODEL)
     assert np.allclose(np.linalg.norm(pattern.directions, axis=1), 1.0)
     azimuth = np.arctan2(pattern.directions[:, 1], pattern.directions[:, 0])
@@ -68,7 +70,7 @@ def moving_sweep(twist: list[float]) -> tuple[np.ndarray, np.ndarray]:
     return times, se3.exp(times[:, None] * np.array(twist))
 
 
-def test_a_distorted_scan_undistorted_with_the_true_path_shows_the_room_again(rng: np.random.Generator):
+def test_compensating_a_distorted_scan_with_the_true_path_restores_the_room(rng: np.random.Generator):
     pattern, model = ray_pattern(MODEL), replace(MODEL, dropout=0.0)
     times, poses = moving_sweep([0.1, 0.05, 1.0, 15.0, 0.5, 0.1])
     scan = measure(first_hits(room(), [], pattern, poses, times), pattern, model, 0, True, rng)
@@ -81,7 +83,7 @@ def test_a_distorted_scan_undistorted_with_the_true_path_shows_the_room_again(rn
     assert np.abs(out_of_the_room(scan.points)).max() > 0.4
 
 
-def test_without_motion_a_timed_sweep_is_the_instant_scan():
+def test_without_motion_a_sweep_equals_an_instantaneous_scan():
     pattern = ray_pattern(MODEL)
     times, poses = moving_sweep([0.0] * 6)
     swept = first_hits(room(), [], pattern, poses, times)
@@ -89,7 +91,7 @@ def test_without_motion_a_timed_sweep_is_the_instant_scan():
     np.testing.assert_allclose(swept.range_m, instant.range_m, atol=1e-6)
 
 
-def test_range_noise_and_dropouts_are_those_of_the_sensor(rng: np.random.Generator):
+def test_range_noise_and_dropouts_match_the_lidar_model(rng: np.random.Generator):
     pattern = ray_pattern(MODEL)
     hits = first_hits(room(), [], pattern, np.eye(4)[None], AT_REST)
     scan = measure(hits, pattern, replace(MODEL, dropout=0.2), 7, False, rng)
@@ -104,14 +106,14 @@ def test_range_noise_and_dropouts_are_those_of_the_sensor(rng: np.random.Generat
 
 
 def seen_at(range_m: float, cosine: float, rng: np.random.Generator) -> float:
-    """Share of returns of a grey surface."""
+    """Return the share of rays that a grey surface returns."""
     pattern = ray_pattern(NOISELESS)
     count = len(pattern.directions)
     hits = Hits(np.full(count, range_m), np.full(count, cosine), np.full(count, 0.25))
     return len(measure(hits, pattern, NOISELESS, 0, False, rng)) / count
 
 
-def test_grazing_and_far_rays_return_nothing(rng: np.random.Generator):
+def test_grazing_and_far_rays_have_no_return(rng: np.random.Generator):
     assert seen_at(30.0, 1.7 / 30.0, rng) > 0.99
     assert seen_at(99.0, 1.0, rng) > 0.99
     assert seen_at(95.0, 1.7 / 95.0, rng) < 0.05
@@ -120,7 +122,7 @@ def test_grazing_and_far_rays_return_nothing(rng: np.random.Generator):
     assert seen_at(np.inf, 0.0, rng) == 0.0
 
 
-def test_no_hit_at_all_gives_an_empty_scan(rng: np.random.Generator):
+def test_no_hits_give_an_empty_scan(rng: np.random.Generator):
     pattern = ray_pattern(MODEL)
     sky = Hits(*(np.full(len(pattern.directions), v) for v in (np.inf, 0.0, 0.0)))
     assert len(measure(sky, pattern, MODEL, 0, False, rng)) == 0
@@ -137,7 +139,7 @@ def rays_on(car: MovingCar, times: np.ndarray) -> Hits:
     return first_hits(empty, [car], ray_pattern(MODEL), poses, times)
 
 
-def test_a_moving_car_is_seen_where_it_is_at_that_time():
+def test_a_moving_car_is_seen_at_its_position_at_that_time():
     pattern = ray_pattern(MODEL)
     for time in (-1.0, 0.0, 1.5):
         hits = rays_on(straight_car(8.0), np.array([time]))
@@ -148,7 +150,7 @@ def test_a_moving_car_is_seen_where_it_is_at_that_time():
         assert points[:, 1].min() == pytest.approx(3.5 - 0.95, abs=0.25)
 
 
-def test_a_car_passing_during_the_sweep_is_stretched_by_its_own_motion():
+def test_a_car_passing_during_the_sweep_is_distorted_by_its_motion():
     pattern = ray_pattern(MODEL)
     times = pattern.column_offset_ns / NS_PER_S
     standing, passing = (rays_on(straight_car(v), times) for v in (0.0, 30.0))
@@ -160,7 +162,7 @@ def test_a_car_passing_during_the_sweep_is_stretched_by_its_own_motion():
     assert reach[1] < reach[0] - 0.2
 
 
-def test_what_stands_in_front_hides_a_car():
+def test_a_wall_hides_a_car_behind_it():
     wall = RayScene.of(boxes((-50, 2.0, -5), (50, 2.2, 5), 0.5), np.zeros(3))
     hits = first_hits(wall, [straight_car(0.0)], ray_pattern(MODEL), np.eye(4)[None], AT_REST)
     alone = first_hits(wall, [], ray_pattern(MODEL), np.eye(4)[None], AT_REST)

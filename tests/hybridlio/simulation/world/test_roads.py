@@ -1,3 +1,5 @@
+"""Roads and driving along them."""
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -9,7 +11,7 @@ from hybridlio.simulation.world.roads import Road, drive, generate_centreline
 
 @pytest.mark.parametrize("scene", ["town", "corridor", "field"])
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_road_is_long_enough_smooth_and_measured_in_metres(scene: str, seed: int):
+def test_a_road_is_long_enough_smooth_and_parametrised_by_arc_length(scene: str, seed: int):
     road = generate_centreline(np.random.default_rng(seed), 600.0, scene)
     assert road.length_m >= 600.0
     s = np.linspace(0.0, road.length_m, 3000)
@@ -17,7 +19,7 @@ def test_a_road_is_long_enough_smooth_and_measured_in_metres(scene: str, seed: i
     assert np.abs(road.curvature(s)).max() < 1 / 7.0
 
 
-def test_points_beside_a_circle_lie_on_the_circle_of_that_distance():
+def test_points_beside_a_circle_are_on_a_concentric_circle():
     angle = np.linspace(0.0, 3.0, 400)
     road = Road.through(30.0 * np.column_stack([np.cos(angle), np.sin(angle)]))
     s = np.linspace(5.0, 80.0, 40)
@@ -37,7 +39,7 @@ def test_the_driver_brakes_for_bends_and_never_reverses():
     assert np.abs(np.gradient(speed, times)).max() < 5.0
 
 
-def test_a_drive_starts_at_speed_or_from_rest_as_asked():
+def test_a_drive_starts_moving_or_at_rest():
     for start_moving in (True, False):
         path = plan(SimulationConfig(seconds=6.0, seed=8, start_moving=start_moving)).path
         speed = np.linalg.norm(path.motion([0.0, 1.0, 5.5]).velocity_m_s, axis=1)

@@ -1,3 +1,5 @@
+"""The simulated world: ground, objects, scans of it."""
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -8,7 +10,8 @@ from hybridlio.simulation.rig import LIDAR_HEIGHT_M, T_IMU_LIDAR
 from hybridlio.simulation.sensors.lidar import ray_pattern
 from hybridlio.simulation.simulate import scan_at
 from hybridlio.simulation.world.ground import CURB_HEIGHT_M, CURB_OFFSET_M, Ground, land_along, waves
-from hybridlio.simulation.world.world import TILE_M, RayScene, World
+from hybridlio.simulation.world.rays import RayScene
+from hybridlio.simulation.world.world import TILE_M, World
 
 
 @pytest.fixture(scope="module")
@@ -16,7 +19,7 @@ def town() -> Drive:
     return plan(SimulationConfig(seconds=20.0, seed=2))
 
 
-def test_waves_have_the_slope_they_are_asked_for(rng: np.random.Generator):
+def test_waves_have_the_given_slope(rng: np.random.Generator):
     xy, h = rng.uniform(-2000, 2000, (20000, 2)), 1e-3
     surface = waves(rng, 24, (20.0, 60.0), 0.03)
     slope = [(surface(xy + step) - surface(xy - step)) / (2 * h) for step in h * np.eye(2)]
@@ -45,7 +48,7 @@ def test_the_road_has_camber_and_a_curb():
     assert walk - edge == pytest.approx(CURB_HEIGHT_M, abs=0.01)
 
 
-def test_the_mesh_of_the_ground_lies_on_its_heights():
+def test_the_ground_mesh_has_the_grounds_heights():
     ground = flat_ground()
     patch = ground.patch(np.array([0.0, -8.0]), 16.0, 0.5)
     np.testing.assert_allclose(patch.vertices[:, 2], ground.height(patch.vertices[:, :2]), atol=1e-12)
@@ -55,7 +58,7 @@ def test_the_mesh_of_the_ground_lies_on_its_heights():
     assert normal[:, 2].sum() / 2 == pytest.approx(16.0**2)
 
 
-def test_nothing_stands_where_cars_drive(town: Drive):
+def test_nothing_stands_on_the_lane(town: Drive):
     poses = town.path.poses(town.scan_times_s[::4]) @ T_IMU_LIDAR
     directions = np.column_stack([np.cos(a := np.linspace(0, 2 * np.pi, 90)), np.sin(a), 0 * a])
     for pose in poses:
@@ -66,20 +69,20 @@ def test_nothing_stands_where_cars_drive(town: Drive):
             assert hits.range_m.min() > 1.3
 
 
-def test_the_lidar_is_at_its_height_above_the_ground(town: Drive):
+def test_the_lidar_is_at_its_mounting_height_above_the_ground(town: Drive):
     poses = town.path.poses(town.scan_times_s) @ T_IMU_LIDAR
     above = poses[:, 2, 3] - town.world.ground.height(poses[:, :2, 3])
     assert np.abs(above - LIDAR_HEIGHT_M).max() < 0.15
 
 
-def test_a_tile_has_the_same_shape_whenever_it_is_built(town: Drive):
+def test_rebuilding_a_tile_gives_the_same_mesh(town: Drive):
     fresh = World(town.world.ground, town.world.items, town.world.seed)
     tile = (int(town.world.items[3].x // TILE_M), int(town.world.items[3].y // TILE_M))
     fresh.tile_mesh((tile[0] + 1, tile[1]))
     np.testing.assert_array_equal(fresh.tile_mesh(tile).vertices, town.world.tile_mesh(tile).vertices)
 
 
-def test_a_scan_is_the_same_whatever_was_scanned_before(town: Drive):
+def test_a_scan_does_not_depend_on_earlier_scans(town: Drive):
     config = SimulationConfig(seconds=20.0, seed=2, lidar="16-beam")
     pattern = ray_pattern(config.lidar_model)
     for k in (0, 60):
@@ -88,7 +91,7 @@ def test_a_scan_is_the_same_whatever_was_scanned_before(town: Drive):
     np.testing.assert_array_equal(scan_at(town, 100, pattern, config).points, again.points)
 
 
-def test_a_scan_of_the_town_looks_like_an_hdl_64s(town: Drive):
+def test_a_scan_of_the_town_resembles_one_of_an_hdl_64e(town: Drive):
     config = SimulationConfig(seconds=20.0, seed=2)
     pattern = ray_pattern(config.lidar_model)
     for k in (0, 90, 199):
@@ -103,12 +106,12 @@ def test_a_scan_of_the_town_looks_like_an_hdl_64s(town: Drive):
         assert 0.1 < scan.intensity.mean() < 0.5
 
 
-def test_every_kind_of_thing_is_in_a_town(town: Drive):
+def test_a_town_has_every_kind_of_object(town: Drive):
     built = {getattr(item.build, "func", item.build).__name__ for item in town.world.items}
     assert {"house", "car", "tree", "bush", "pole", "sign"} <= built
 
 
-def test_a_corridor_hides_how_far_one_went_and_a_field_is_nearly_empty():
+def test_a_corridor_has_walls_and_a_field_is_nearly_empty():
     corridor, field = (plan(SimulationConfig(seconds=8.0, seed=1, scene=scene)) for scene in ("corridor", "field"))
     pose = (corridor.path.poses(4.0) @ T_IMU_LIDAR)[0]
     sideways = np.outer([1.0, -1.0], pose[:3, 1])
@@ -118,7 +121,7 @@ def test_a_corridor_hides_how_far_one_went_and_a_field_is_nearly_empty():
     assert isinstance(field.world.scene_around(pose[:3, 3]), RayScene)
 
 
-def test_moving_cars_move_and_keep_clear_of_the_recording_car(town: Drive):
+def test_moving_cars_move_and_keep_clear_of_the_ego_car(town: Drive):
     assert town.cars
     times = town.scan_times_s
     ego = town.path.poses(times)[:, :3, 3]
