@@ -7,15 +7,15 @@ matches.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.registration.icp import Fit, RegistrationSettings, fit_at, register
+from hybridlio.registration.icp import Fit, Registration, RegistrationSettings, fit_at, register
 from hybridlio.registration.surface import Surface
 
 # Candidates' speeds are 2.5 m/s apart: 0.25 m at 10 Hz and 0.5 m at 5 Hz. A kernel of that size reaches from one to the
@@ -27,10 +27,55 @@ _REFINED_CANDIDATES = 12  # of 18 speeds and 5 rates of turn by default: the bes
 _MIN_MATCHED_RATIO = 0.8  # to the most matches of any candidate; with few matches a low cost is easy to have
 
 
+@dataclass(frozen=True)
+class CoarseSearch:
+    """How many starts are refined, and how.
+
+    Attributes:
+        kernel_m: kernel that compares the starts, and that the refinement begins with.
+        iterations: Gauss-Newton steps of the refinement.
+        refined: number of starts that are refined, the best ones.
+    """
+
+    kernel_m: float
+    iterations: int
+    refined: int
+
+
 def motions(speeds_m_s: Iterable[float], rates_deg_s: Iterable[float], dt_s: float) -> list[Array]:
     """Return poses ``(4, 4)`` after ``dt_s`` seconds, for every forward speed with every rate of turn."""
     pairs = product(speeds_m_s, np.deg2rad(list(rates_deg_s)))
     return [se3.exp(np.array([0, 0, rate, speed, 0, 0]) * dt_s) for speed, rate in pairs]
+
+
+def by_cost(fits: Sequence[Fit]) -> list[int]:
+    """Return indices of the fits, the lowest cost first."""
+    return sorted(range(len(fits)), key=lambda i: fits[i].cost)
+
+
+def refine_best(
+    surface: Surface,
+    few: Array,
+    source: Array,
+    starts: Sequence[Array],
+    settings: RegistrationSettings,
+    search: CoarseSearch,
+    ranked: Callable[[Sequence[Fit]], list[int]] = by_cost,
+) -> list[Registration]:
+    """Compare starts by a few points, and register from the best of them.
+
+    Args:
+        surface: what the scan is registered to.
+        few: ``(K, 3)`` points for the comparison, scan frame.
+        source: ``(M, 3)`` points for the registration, scan frame.
+        starts: ``(4, 4)`` poses in the surface's frame.
+        settings: of the registration.
+        search: kernel and limits.
+        ranked: returns indices of the fits to consider, the best first.
+    """
+    fits = [fit_at(surface, few, T, search.kernel_m, settings.threads) for T in starts]
+    coarse = replace(settings, max_iterations=search.iterations)
+    return [register(surface, source, starts[i], coarse, search.kernel_m) for i in ranked(fits)[: search.refined]]
 
 
 def best_start(
@@ -47,9 +92,9 @@ def best_start(
         starts: ``(4, 4)`` poses in the surface's frame.
         settings: of the registration.
     """
-    fits = [fit_at(surface, source[::_JUDGED_STRIDE], T, COARSE_KERNEL_M, settings.threads) for T in starts]
-    coarse, candidates = replace(settings, max_iterations=_COARSE_ITERATIONS), _ranked(fits)[:_REFINED_CANDIDATES]
-    refined = [register(surface, source, starts[i], coarse, COARSE_KERNEL_M).pose for i in candidates]
+    search = CoarseSearch(COARSE_KERNEL_M, _COARSE_ITERATIONS, _REFINED_CANDIDATES)
+    few = source[::_JUDGED_STRIDE]
+    refined = [found.pose for found in refine_best(surface, few, source, starts, settings, search, _ranked)]
     max_distance_m = settings.max_distance_m
     fits = [fit_at(surface, points, T, settings.kernel_m, settings.threads, max_distance_m) for T in refined]
     return refined[_ranked(fits)[0]]

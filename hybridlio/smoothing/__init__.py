@@ -1,1 +1,1 @@
-"""Measurements made after the run: loop closures and GPS fixes."""
+"""Measurements made after the run, for smoothing: loop closures and the alignment of GPS fixes."""

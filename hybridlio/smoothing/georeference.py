@@ -1,4 +1,4 @@
-"""A trajectory on the map: placed on GPS fixes as a whole, and written for other programs."""
+"""Georeferencing: a trajectory aligned with GPS fixes as a whole, and written for other programs."""
 
 from __future__ import annotations
 
@@ -27,17 +27,19 @@ if TYPE_CHECKING:
 
 
 POSES_ENU, TABLE, MAP = "poses_enu_tum.txt", "georeferenced.csv", "georeferenced.geojson"
+# Of the mean specific force against the vertical: accelerations average out over a run, but an accelerometer bias of
+# 0.1 m/s² remains.
 _GRAVITY_SIGMA_RAD = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class Georeferenced:
-    """A trajectory in the fixes' frame.
+    """A trajectory in the frame of the fixes.
 
     Attributes:
         trajectory: lidar poses, east-north-up.
-        origin: where on Earth that frame has its origin; None where the fixes do not say.
-        alignment: how it was placed.
+        origin: of that frame on Earth; None if the fixes do not tell.
+        alignment: with the fixes.
     """
 
     trajectory: Trajectory
@@ -49,12 +51,12 @@ class Georeferenced:
         """``(N, 3)`` latitude and longitude in degrees, height in metres.
 
         Raises:
-            DataError: the origin is not known.
+            DataError: the origin is unknown.
         """
         if self.origin is None:
             raise DataError(
-                "the fixes are in a local frame whose origin on Earth is not known; give it as latitude, longitude "
-                "(degrees) and height (metres)"
+                "the fixes are in a local frame whose origin on Earth is not known; give the origin as latitude, "
+                "longitude (degrees) and height (metres)"
             )
         return geodetic_from_enu(self.trajectory.poses[:, :3, 3], self.origin)
 
@@ -67,14 +69,14 @@ def georeference(
     max_shift_s: float = MAX_SHIFT_S,
     origin: GeodeticPoint | None = None,
 ) -> Georeferenced:
-    """Place a run on its GPS fixes by one rigid motion and one shift of the clocks; its shape is not touched.
+    """Align a run with its GPS fixes by one rigid motion and one shift of the clocks, without changing its shape.
 
     Args:
         record: of the run.
-        trajectory: lidar poses to place, such as smoothed ones; by default the odometry's.
-        antenna_m: ``(3,)`` the antenna in the IMU's frame; by default the calibration's, or the IMU's own place.
-        max_shift_s: the clocks are no farther apart; 0 takes the stamps as they are.
-        origin: where on Earth the fixes' frame has its origin, where they do not say.
+        trajectory: lidar poses to align, such as smoothed ones; by default the odometry's.
+        antenna_m: ``(3,)`` the antenna in the IMU's frame; by default the calibration's, or else the IMU's origin.
+        max_shift_s: largest difference of the clocks; 0 takes the stamps as they are.
+        origin: of the fixes' frame on Earth, if the fixes do not tell.
 
     Raises:
         EstimationError: fewer than three fixes lie in the run's time.
@@ -93,7 +95,10 @@ def georeference(
 
 
 def _up_from_forces(record: Record, trajectory: Trajectory) -> Array:
-    """Up in the trajectory's frame: where the specific force points on average, less what speeding up adds."""
+    """Up in the trajectory's frame, of any length: the mean specific force less the mean acceleration.
+
+    The mean acceleration is the change of the velocity from the trajectory's first to its last pose, over the time.
+    """
     path = PosePath(trajectory.stamps_ns, trajectory.poses)
     inside = path.covers(record.imu.stamps_ns)
     stamps, force = record.imu.stamps_ns[inside], record.imu.accel_m_s2[inside]
@@ -105,10 +110,13 @@ def _up_from_forces(record: Record, trajectory: Trajectory) -> Array:
 
 
 def write_georeferenced(folder: Path, placed: Georeferenced) -> list[Path]:
-    """Write the poses as TUM in the fixes' frame and, where on Earth that is known, as CSV and GeoJSON.
+    """Write the poses as a TUM file in the frame of the fixes and, if its origin is known, as CSV and GeoJSON.
 
-    The CSV has a row a scan: stamp, latitude, longitude, height, east, north, up, heading (degrees from north,
-    clockwise). The GeoJSON is one line with heights.
+    The CSV has one row per scan: stamp, latitude, longitude, height, east, north, up, heading (degrees clockwise from
+    north). The GeoJSON is one line string with heights.
+
+    Returns:
+        The paths of the files.
 
     Raises:
         DataError: a file cannot be written.

@@ -1,4 +1,4 @@
-"""How GPS fixes are used in smoothing, and what comes of them."""
+"""GPS in smoothing: how fixes are used, and the result."""
 
 from __future__ import annotations
 
@@ -13,16 +13,19 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.setting_checks import check_not_negative, check_setting
 from hybridlio.smoothing.gps_alignment import MAX_SHIFT_S
 
+_REJECTED_WEIGHT = 0.1  # a fix of lower weight is listed as rejected; Cauchy gives it at 8.4 standard deviations
+
 
 @dataclass(frozen=True, eq=False)
 class GpsOptions:
     """How fixes are used.
 
     Attributes:
-        antenna_m: ``(3,)`` the antenna in the IMU's frame; None takes the calibration's, or the IMU's own place.
-        max_shift_s: the clocks are no farther apart (also the shift's prior); 0 takes the stamps as they are.
-        outages: times ``(start_ns, end_ns)`` whose fixes are left out.
-        robust: how to treat those that may be wrong.
+        antenna_m: ``(3,)`` the antenna in the IMU's frame; None takes the calibration's, or else the IMU's origin.
+        max_shift_s: largest difference of the clocks, also the standard deviation of the shift's prior; 0 takes the
+            stamps as they are.
+        outages: pairs ``(start_ns, end_ns)``; fixes stamped within are left out.
+        robust: method against wrong fixes: a kernel's name, ``gnc``, or None for no method.
 
     Raises:
         SettingError: an antenna of not three finite numbers, a negative shift, or an outage that ends before it starts.
@@ -42,16 +45,16 @@ class GpsOptions:
 
 @dataclass(frozen=True, eq=False)
 class GpsFit:
-    """What smoothing found of the fixes.
+    """The result of using fixes in smoothing.
 
     Attributes:
-        T_enu_world: ``(4, 4)``; maps the first scan's lidar frame into the fixes'.
+        T_enu_world: ``(4, 4)``; maps points of the first scan's lidar frame into the frame of the fixes.
         T_enu_world_covariance: ``(6, 6)`` of a right perturbation.
-        shift_s, shift_sigma_s: a fix stamped ``t`` shows the antenna at ``t + shift_s``, and how sure that is.
-        residuals_m: ``(M, 3)`` the antenna as smoothed less the fix; NaN where the run does not reach.
-        used: ``(M,)`` whether the run reaches, and the fix is in no outage.
-        weights: ``(M,)`` what counts of each, 0 to 1; 0 of those not used.
-        noise_scale: the fixes' standard deviations were taken so many times as large as they claim, as they scatter.
+        shift_s, shift_sigma_s: a fix stamped ``t`` is of the antenna at ``t + shift_s``; standard deviation of that.
+        residuals_m: ``(M, 3)`` smoothed antenna minus fix; NaN for fixes that are not used.
+        used: ``(M,)`` whether the fix lies in the run's time and in no outage.
+        weights: ``(M,)`` weight of each fix, 0 to 1; 0 for fixes that are not used.
+        noise_scale: factor on the claimed standard deviations of the fixes, from their scatter; at least 1.
     """
 
     T_enu_world: Array
@@ -65,22 +68,22 @@ class GpsFit:
 
     @property
     def rejected(self) -> NDArray[np.bool_]:
-        """``(M,)`` used fixes that count for less than a tenth."""
-        return self.used & (self.weights < 0.1)
+        """``(M,)`` used fixes whose weight is below a tenth."""
+        return self.used & (self.weights < _REJECTED_WEIGHT)
 
     @property
     def rmse_m(self) -> float:
-        """Root mean square distance from the fixes that are not rejected."""
+        """Root mean square distance to the used fixes that are not rejected; NaN if there are none."""
         kept = self.residuals_m[self.used & ~self.rejected]
         return float(np.sqrt((kept**2).sum(axis=1).mean())) if len(kept) else float("nan")
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether most of the fixes that the run reaches are rejected: then the others may be wrong as well."""
+        """Whether most used fixes are rejected; then the others may be wrong as well."""
         return bool(2 * self.rejected.sum() > self.used.sum())
 
     def to_json_dict(self) -> dict[str, Any]:
-        """The figures as plain values; None for an RMSE of no fix."""
+        """Return the figures as plain values; the RMSE of no fix is None."""
         return {
             "fixes": len(self.used),
             "used": int(self.used.sum()),
@@ -93,9 +96,9 @@ class GpsFit:
         }
 
     def summary(self) -> str:
-        """One line."""
-        shift = f"clocks {1e3 * self.shift_s:.0f} ± {1e3 * self.shift_sigma_s:.0f} ms apart"
-        scale = f", fixes taken {self.noise_scale:.1f} times less sure than they claim" if self.noise_scale > 1 else ""
+        """Return the figures on one line."""
+        shift = f"clock shift {1e3 * self.shift_s:.0f} ± {1e3 * self.shift_sigma_s:.0f} ms"
+        scale = f", claimed standard deviations scaled by {self.noise_scale:.1f}" if self.noise_scale > 1 else ""
         count = int((self.used & ~self.rejected).sum())
         return (
             f"{count} of {len(self.used)} fixes used, {int(self.rejected.sum())} rejected, "

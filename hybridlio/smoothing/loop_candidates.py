@@ -1,4 +1,4 @@
-"""Which pairs of keyframes may be of one place: those that odometry cannot rule out and that look most alike."""
+"""Candidate loops: pairs of keyframes that odometry cannot rule out and whose descriptors are most similar."""
 
 from __future__ import annotations
 
@@ -10,8 +10,17 @@ import numpy as np
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Index
 from hybridlio.core.setting_checks import check_fraction, check_not_negative, check_positive
-from hybridlio.smoothing.place_recognition import DescriptorSettings, compare, describe, ring_key, spectrum
+from hybridlio.smoothing.place_recognition import (
+    DescriptorSettings,
+    descriptor_distances,
+    descriptor_spectrum,
+    place_descriptor,
+    ring_key,
+)
 from hybridlio.smoothing.step_uncertainty import OdometryChain
+
+# Below these standard deviations odometry itself is a guess from which the verification, which searches ±3 m, succeeds.
+_SURE_M, _SURE_RAD = 2.0, 0.1
 
 
 @dataclass(frozen=True)
@@ -19,14 +28,15 @@ class CandidateSettings:
     """How candidates are chosen.
 
     Attributes:
-        min_path_m: places nearer along the path are no revisits.
-        reach_m: a place this near is worth a look, and as much farther as odometry is unsure.
-        odometry_sigmas: how many standard deviations odometry may be off by.
-        odometry_scale: how much larger its covariances are taken to be than they claim.
-        max_distance: pictures farther apart are of different places, unless odometry knows better.
-        per_keyframe: so many of the most alike are looked at closely.
-        apart_m: along the path, from one of these to the next.
-        compared: so many of the possible places, those of the nearest ring keys, are compared at every turn.
+        min_path_m: places nearer than this along the path are no revisits.
+        reach_m: places this near are possible, and farther ones by odometry's uncertainty.
+        odometry_sigmas: standard deviations by which odometry may be wrong.
+        odometry_scale: factor on odometry's covariances; see ``ConsistencySettings``.
+        max_distance: descriptors farther apart are of different places, unless odometry is sure.
+        per_keyframe: candidates of each keyframe, the most similar first.
+        apart_m: least distance along the path between the candidates of a keyframe.
+        compared: possible places, those of the nearest ring keys, whose descriptors are compared.
+        descriptor: how places are described.
 
     Raises:
         SettingError: a value is out of range.
@@ -54,8 +64,8 @@ class Candidate:
 
     Attributes:
         earlier, later: their numbers.
-        distance: between their pictures, 0 to 1.
-        guesses: ``(4, 4)`` poses ``T_earlier_later`` to look near.
+        distance: between their descriptors, 0 to 1.
+        guesses: ``(4, 4)`` poses ``T_earlier_later`` to start registration from.
     """
 
     earlier: int
@@ -64,11 +74,13 @@ class Candidate:
     guesses: tuple[Array, ...]
 
 
-_SURE_M, _SURE_RAD = 2.0, 0.1  # odometry is then a guess of its own
+def levelling_rotations(poses: Array, up: Array) -> Array:
+    """Return ``(K, 4, 4)`` rotations ``T_level_lidar`` that make ``up`` the z axis, by the smallest angle.
 
-
-def levelled(poses: Array, up: Array) -> Array:
-    """Turns ``(K, 4, 4)`` that make ``up`` ``(3,)``, of the world of the poses ``(K, 4, 4)``, the z axis of each."""
+    Args:
+        poses: ``(K, 4, 4)`` ``T_world_lidar``.
+        up: ``(3,)`` in world.
+    """
     local = poses[:, :3, :3].transpose(0, 2, 1) @ (up / np.linalg.norm(up))
     axis = np.cross(local, [0.0, 0.0, 1.0])
     sine, cosine = np.linalg.norm(axis, axis=1), local[:, 2]
@@ -78,13 +90,13 @@ def levelled(poses: Array, up: Array) -> Array:
 
 
 class CandidateFinder:
-    """Finds each keyframe's candidates among the earlier ones.
+    """Finds the candidates of each keyframe among the earlier ones.
 
     Args:
         chain: the run's odometry.
-        rows: ``(K,)`` which of its scans the keyframes are.
+        rows: ``(K,)`` rows of the run that are keyframes.
         up: ``(3,)`` in the first scan's frame.
-        surroundings: gives the points ``(N, 3)`` around a keyframe, in its frame.
+        surroundings: returns the points ``(N, 3)`` around a keyframe, in its frame.
         settings: limits.
     """
 
@@ -97,30 +109,30 @@ class CandidateFinder:
         settings: CandidateSettings,
     ) -> None:
         self._chain, self._rows, self._settings, self._surroundings = chain, rows, settings, surroundings
-        self._levels = levelled(chain.poses[rows], up)
+        self._levels = levelling_rotations(chain.poses[rows], up)
         descriptor = settings.descriptor
         self._spectra = np.empty((len(rows), descriptor.rings, descriptor.sectors // 2 + 1), np.complex64)
         self._keys = np.empty((len(rows), descriptor.rings), np.float32)
 
     def add(self, k: int) -> list[Candidate]:
-        """The candidates of keyframe ``k``; keyframes are added in order."""
+        """Add keyframe ``k`` and return its candidates; keyframes are added in order."""
         descriptor = self._settings.descriptor
         points = se3.transform(self._levels[k], self._surroundings(k))
         beside = [(0.0, left, 0.0) for left in descriptor.beside_m]
-        pictures = np.stack([describe(points - offset, descriptor) for offset in beside])
-        spectra = spectrum(pictures)
-        self._spectra[k], self._keys[k] = spectra[0], ring_key(pictures[0])
+        views = np.stack([place_descriptor(points - offset, descriptor) for offset in beside])
+        spectra = descriptor_spectrum(views)
+        self._spectra[k], self._keys[k] = spectra[0], ring_key(views[0])
         possible, sure = self._possible(k)
         if not len(possible):
             return []
         possible = self._nearest_keys(k, possible)
         distances, yaws = np.empty((2, len(spectra), len(possible)))
         for n, one in enumerate(spectra):
-            distances[n], yaws[n] = compare(one, self._spectra[possible], descriptor.sectors)
-        return self._most_alike(k, possible, sure, distances, yaws)
+            distances[n], yaws[n] = descriptor_distances(one, self._spectra[possible], descriptor.sectors)
+        return self._most_similar(k, possible, sure, distances, yaws)
 
     def _possible(self, k: int) -> tuple[Index, bool]:
-        """Earlier keyframes that may be near, and whether odometry itself knows where."""
+        """Earlier keyframes that may be nearby, and whether odometry is sure of its relative poses to all of them."""
         settings, row = self._settings, self._rows[k]
         travelled = self._chain.travelled_m
         earlier = np.flatnonzero(travelled[row] - travelled[self._rows[:k]] >= settings.min_path_m)
@@ -136,12 +148,14 @@ class CandidateFinder:
         return earlier[near], bool(sure)
 
     def _nearest_keys(self, k: int, possible: Index) -> Index:
+        """Those of the possible keyframes whose ring keys are nearest, in order."""
         if len(possible) <= self._settings.compared:
             return possible
         difference = np.linalg.norm(self._keys[possible] - self._keys[k], axis=1)
         return np.sort(possible[np.argpartition(difference, self._settings.compared)[: self._settings.compared]])
 
-    def _most_alike(self, k: int, possible: Index, sure: bool, distances: Array, yaws: Array) -> list[Candidate]:
+    def _most_similar(self, k: int, possible: Index, sure: bool, distances: Array, yaws: Array) -> list[Candidate]:
+        """Candidates by increasing distance of descriptors; ``distances`` and ``yaws`` are ``(views, possible)``."""
         settings, out = self._settings, list[Candidate]()
         travelled = self._chain.travelled_m[self._rows[possible]]
         left = np.ones(len(possible), bool)
@@ -156,6 +170,7 @@ class CandidateFinder:
         return out
 
     def _candidate(self, k: int, earlier: int, sure: bool, distance: float, yaw: float, view: int) -> Candidate:
+        """The candidate with guesses from yaw and view, and from odometry where that is sure."""
         beside = np.array([0.0, self._settings.descriptor.beside_m[view], 0.0])
         level = se3.make(se3.so3_exp((0.0, 0.0, yaw)), np.zeros(3)) @ se3.make(np.eye(3), -beside)
         guesses = [se3.inverse(self._levels[earlier]) @ level @ self._levels[k]]

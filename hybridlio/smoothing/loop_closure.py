@@ -1,7 +1,7 @@
-"""Loop closure: where a run comes back to a place it has been at, and how its two visits lie to each other.
+"""Loop closure: finds where a run returns to a place, and the relative pose of its two visits.
 
-Candidates that odometry allows and that look alike are verified by registration; of those verified, the ones that agree
-with odometry and with one another are kept. What is wrong all the same is left to a robust solve
+Candidates that odometry allows and whose descriptors are similar are verified by registration; the verified loops that
+agree with odometry and with one another are kept. Wrong loops that remain are left to the robust solve
 (:mod:`hybridlio.graph.run.loop_factors`).
 """
 
@@ -22,11 +22,11 @@ from hybridlio.record.record import Record
 from hybridlio.smoothing.loop_candidates import Candidate, CandidateFinder, CandidateSettings
 from hybridlio.smoothing.loop_consistency import (
     ConsistencySettings,
-    MeasuredLoops,
-    largest_agreeing,
+    LoopArrays,
+    largest_consistent_set,
     odometry_chi2,
     pairwise_chi2,
-    witnessed,
+    supported,
 )
 from hybridlio.smoothing.loop_verification import Verdict, VerificationSettings, Verifier
 from hybridlio.smoothing.loops import Loop, LoopSearch, RejectedLoop
@@ -35,7 +35,13 @@ from hybridlio.smoothing.step_uncertainty import OdometryChain
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """How loops are found: one part a stage."""
+    """Settings of loop closure, by stage.
+
+    Attributes:
+        candidates: which keyframes are compared.
+        verification: which registrations are accepted.
+        consistency: which of the verified loops are kept.
+    """
 
     candidates: CandidateSettings = field(default_factory=CandidateSettings)
     verification: VerificationSettings = field(default_factory=VerificationSettings)
@@ -46,9 +52,9 @@ def find_loops(record: Record, settings: LoopSettings | None = None, progress: P
     """Find the loops of a run from its record alone.
 
     Args:
-        record: with keyframes.
+        record: of the run, with keyframes.
         settings: limits of each stage.
-        progress: called with ``loops``, keyframes done and keyframes in all.
+        progress: called with ``loops``, the keyframes done and the keyframes in total.
 
     Raises:
         DataError: the record has no keyframes, or they do not belong to it.
@@ -71,32 +77,37 @@ def find_loops(record: Record, settings: LoopSettings | None = None, progress: P
         if progress is not None:
             progress("loops", k + 1, len(keyframes))
     began = time.perf_counter()
-    verified, rejected = _sorted(found, rows)
-    loops, inconsistent = consistent(verified, chain, settings.consistency)
+    verified, rejected = _by_verdict(found, rows)
+    loops, inconsistent = select_consistent(verified, chain, settings.consistency)
     seconds["consistency"] = time.perf_counter() - began
     return LoopSearch(len(keyframes), len(found), len(verified), loops, (*rejected, *inconsistent), seconds)
 
 
-def consistent(
+def select_consistent(
     verified: list[Loop], chain: OdometryChain, settings: ConsistencySettings
 ) -> tuple[tuple[Loop, ...], tuple[RejectedLoop, ...]]:
-    """Those loops that agree with odometry and with one another, and the others with the reason."""
+    """Return the loops that agree with odometry and with one another, and the others with the reason.
+
+    A loop must also be supported by another one nearby: a single wrong loop often agrees with uncertain odometry.
+    """
     bound = chi_square_quantile(settings.inlier_share, 6)
     chi2 = odometry_chi2(_arrays(verified), chain, settings.odometry_scale) if verified else np.empty(0)
     rejected = [
-        _inconsistent(one, f"against odometry (χ² {x:.0f})") for one, x in zip(verified, chi2, strict=True) if x > bound
+        _inconsistent(one, f"contradicts odometry (χ² {x:.0f})")
+        for one, x in zip(verified, chi2, strict=True)
+        if x > bound
     ]
     left = [one for one, x in zip(verified, chi2, strict=True) if x <= bound]
     if not left:
         return (), tuple(rejected)
     arrays = _arrays(left)
     agree = pairwise_chi2(arrays, chain, settings.odometry_scale) <= bound
-    seen = witnessed(arrays, agree, chain.travelled_m, settings)
+    has_support = supported(arrays, agree, chain.travelled_m, settings)
     kept = np.zeros(len(left), bool)
-    kept[seen] = largest_agreeing(agree[np.ix_(seen, seen)])
-    for one, has_witness, is_kept in zip(left, seen, kept, strict=True):
+    kept[has_support] = largest_consistent_set(agree[np.ix_(has_support, has_support)])
+    for one, is_supported, is_kept in zip(left, has_support, kept, strict=True):
         if not is_kept:
-            why = "other loops disagree" if has_witness else "no other loop nearby agrees"
+            why = "contradicts other loops" if is_supported else "no other loop nearby agrees"
             rejected.append(_inconsistent(one, why))
     return tuple(one for one, is_kept in zip(left, kept, strict=True) if is_kept), tuple(rejected)
 
@@ -107,18 +118,18 @@ def _keyframes_of(record: Record) -> LoopKeyframes:
         raise DataError("the record has no keyframes, which loop closure needs; run the odometry again")
     stamps = record.online.stamps_ns
     if len(keyframes) and (keyframes.rows[-1] >= len(stamps) or (stamps[keyframes.rows] != keyframes.stamps_ns).any()):
-        raise DataError("the keyframes are of another run than the record; run the odometry again")
+        raise DataError("the keyframes do not belong to this record: they are of another run; run the odometry again")
     return keyframes
 
 
 def _up(record: Record) -> Array:
-    """``(3,)`` in the first scan's frame; the lidar's z where no inertial data tell."""
+    """Up ``(3,)`` in the first scan's frame; the lidar's z axis without inertial data."""
     if not record.start.has_imu:
         return np.array([0.0, 0.0, 1.0])
     return np.asarray(record.calibration.T_imu_lidar[:3, :3].T @ -record.start.gravity_m_s2)
 
 
-def _sorted(found: list[tuple[Candidate, Verdict]], rows: Index) -> tuple[list[Loop], list[RejectedLoop]]:
+def _by_verdict(found: list[tuple[Candidate, Verdict]], rows: Index) -> tuple[list[Loop], list[RejectedLoop]]:
     loops, rejected = [], []
     for candidate, verdict in found:
         earlier, later = int(rows[candidate.earlier]), int(rows[candidate.later])
@@ -133,8 +144,8 @@ def _inconsistent(loop: Loop, reason: str) -> RejectedLoop:
     return RejectedLoop(loop.earlier, loop.later, "consistency", reason)
 
 
-def _arrays(loops: list[Loop]) -> MeasuredLoops:
-    return MeasuredLoops(
+def _arrays(loops: list[Loop]) -> LoopArrays:
+    return LoopArrays(
         np.array([one.earlier for one in loops], np.int64),
         np.array([one.later for one in loops], np.int64),
         se3.orthonormalise(np.array([one.pose for one in loops])),

@@ -1,9 +1,10 @@
-"""Which places look alike: a polar picture of the heights around each keyframe, compared at every turn.
+"""Place recognition: a descriptor of the heights around each keyframe, compared over all headings.
 
-After scan context (Kim, Kim, IROS 2018): rings by distance, sectors by direction, in each cell the highest point. A
-turn of the sensor shifts the sectors, so that all turns are compared at once by a circular correlation, and the rings'
-means are the same whatever the turn. Two departures: the pictures are of several merged scans, so that a lidar of few
-beams sees enough, and each place is also drawn from positions beside the path, as the other lane would see it.
+After scan context (Kim, Kim, "Scan Context: Egocentric Spatial Descriptor for Place Recognition within 3D Point Cloud
+Map", IROS 2018): rings by distance, sectors by direction, the highest point in each cell. Rotating the sensor shifts
+the sectors, so a circular correlation compares all headings at once, and the mean of each ring (the ring key) does not
+depend on the heading. Two departures from the paper: descriptors are of several merged scans, so that a lidar with few
+beams sees enough; and each place is also described from positions beside the path, as seen from the other lane.
 """
 
 from __future__ import annotations
@@ -16,16 +17,19 @@ from numpy.typing import NDArray
 from hybridlio.core.arrays import Array, Floats
 from hybridlio.core.setting_checks import check_positive, check_setting
 
+_GROUND_PERCENTILE = 5.0  # of heights; the ground is the lowest surface, but reflections put a few points below it
+_EMPTY_SECTOR = 1e-6  # length below which a sector is empty: heights are fractions of height_m
+
 
 @dataclass(frozen=True)
 class DescriptorSettings:
-    """How places are drawn.
+    """How places are described.
 
     Attributes:
-        rings, sectors: cells by distance and by direction.
+        rings, sectors: number of cells by distance and by direction; as in the paper.
         range_m: points farther away are left out.
         height_m: heights above the ground count up to here.
-        beside_m: positions to the left of the path that a place is drawn from too.
+        beside_m: positions left of the path (negative: right) from which a place is described; 3.5 m is a lane.
 
     Raises:
         SettingError: a value is out of range.
@@ -42,46 +46,57 @@ class DescriptorSettings:
         check_setting(self, "beside_m", len(self.beside_m) > 0, "one position at least")
 
 
-def describe(points: Array, settings: DescriptorSettings) -> Floats:
-    """The picture ``(rings, sectors)`` of points ``(N, 3)`` in metres, z up, seen from the origin; 0 in empty cells."""
+def place_descriptor(points: Array, settings: DescriptorSettings) -> Floats:
+    """Return the heights ``(rings, sectors)`` above ground, 0 to 1, around the origin; 0 in empty cells.
+
+    Args:
+        points: ``(N, 3)`` metres, z up.
+        settings: cells and ranges.
+    """
     distance = np.hypot(points[:, 0], points[:, 1])
     near = distance < settings.range_m
     points, distance = points[near], distance[near]
-    picture = np.zeros(settings.rings * settings.sectors, np.float32)
+    heights = np.zeros(settings.rings * settings.sectors, np.float32)
     if not len(points):
-        return picture.reshape(settings.rings, settings.sectors)
-    ground = np.percentile(points[:, 2], 5.0)
+        return heights.reshape(settings.rings, settings.sectors)
+    ground = np.percentile(points[:, 2], _GROUND_PERCENTILE)
     height = np.clip(points[:, 2] - ground, 0.0, settings.height_m) / settings.height_m
     ring = (distance / settings.range_m * settings.rings).astype(np.intp)
     angle = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
     sector = np.floor(angle * settings.sectors).astype(np.intp) % settings.sectors
-    np.maximum.at(picture, ring * settings.sectors + sector, height.astype(np.float32))
-    return picture.reshape(settings.rings, settings.sectors)
+    np.maximum.at(heights, ring * settings.sectors + sector, height.astype(np.float32))
+    return heights.reshape(settings.rings, settings.sectors)
 
 
-def ring_key(pictures: Floats) -> Floats:
-    """``(…, rings)``: what of pictures ``(…, rings, sectors)`` no turn changes."""
-    return np.asarray(pictures.mean(axis=-1))
+def ring_key(descriptors: Floats) -> Floats:
+    """Return the mean of each ring ``(…, rings)`` of descriptors ``(…, rings, sectors)``, invariant to the heading."""
+    return np.asarray(descriptors.mean(axis=-1))
 
 
-def spectrum(pictures: Floats) -> NDArray[np.complex64]:
-    """Pictures ``(…, rings, sectors)`` made ready to :func:`compare`: sectors of unit length, Fourier transformed."""
-    length = np.linalg.norm(pictures, axis=-2, keepdims=True)
-    seen = np.maximum((length > 1e-6).sum(axis=-1, keepdims=True), 1)
-    units = pictures / np.maximum(length, 1e-6) / np.sqrt(seen)
+def descriptor_spectrum(descriptors: Floats) -> NDArray[np.complex64]:
+    """Return descriptors ``(…, rings, sectors)`` prepared for :func:`descriptor_distances`.
+
+    Each sector is scaled to unit length and the whole by its number of occupied sectors, so that the correlation of
+    two descriptors is their mean cosine similarity; then the sectors are Fourier transformed.
+    """
+    length = np.linalg.norm(descriptors, axis=-2, keepdims=True)
+    occupied = np.maximum((length > _EMPTY_SECTOR).sum(axis=-1, keepdims=True), 1)
+    units = descriptors / np.maximum(length, _EMPTY_SECTOR) / np.sqrt(occupied)
     return np.fft.rfft(units, axis=-1).astype(np.complex64)
 
 
-def compare(query: NDArray[np.complex64], others: NDArray[np.complex64], sectors: int) -> tuple[Floats, Floats]:
-    """How unlike a place is to others, at the turn at which they are most alike.
+def descriptor_distances(
+    query: NDArray[np.complex64], others: NDArray[np.complex64], sectors: int
+) -> tuple[Floats, Floats]:
+    """Compare a place with others, each at the heading of greatest similarity.
 
     Args:
-        query: ``(R, F)`` from :func:`spectrum`.
+        query: ``(R, F)`` from :func:`descriptor_spectrum`.
         others: ``(C, R, F)``.
-        sectors: of the pictures.
+        sectors: of the descriptors.
 
     Returns:
-        distances ``(C,)`` between 0 (the same) and 1, and yaws ``(C,)`` in radians: the query's heading in the other's
+        distances ``(C,)`` between 0 (equal) and 1, and yaws ``(C,)`` in radians: the query's heading in the other's
         frame.
     """
     correlation = np.fft.irfft((np.conj(query) * others).sum(axis=-2), n=sectors, axis=-1)

@@ -1,4 +1,4 @@
-"""Drives through towns of boxes that come back to their streets: no ray is cast, so that they take a second."""
+"""Drives through towns of boxes that return to their streets; no rays are cast, so a drive takes a second."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from hybridlio.smoothing.loops import Loop, LoopSearch
 
 @dataclass(frozen=True, eq=False)
 class LoopDrive:
-    """A drive through a town of boxes that comes back to its streets, without IMU; odometry has the noise it claims."""
+    """A drive that returns to its streets, without IMU; odometry has the noise that its covariances claim."""
 
     record: Record
     truth: Trajectory
 
     def error_of(self, loop: Loop) -> tuple[float, float]:
-        """How far a loop is off, in metres and degrees."""
+        """Error of a loop in metres and degrees."""
         poses = self.truth.poses
         wrong = se3.log(se3.between(loop.pose, se3.between(poses[loop.earlier], poses[loop.later])))
         return float(np.linalg.norm(wrong[3:])), float(np.rad2deg(np.linalg.norm(wrong[:3])))
@@ -61,8 +61,8 @@ def _town(rng: np.random.Generator, path: np.ndarray) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def _way(corners: Sequence[tuple[float, float]]) -> np.ndarray:
-    """Lidar poses ``(N, 4, 4)`` every metre along a way whose corners are rounded off."""
+def _path(corners: Sequence[tuple[float, float]]) -> np.ndarray:
+    """Lidar poses ``(N, 4, 4)`` every metre along a path with rounded corners."""
     points = np.array(corners, dtype=np.float64)
     s = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
     even = np.arange(0.0, s[-1], 0.25)
@@ -78,9 +78,9 @@ def _way(corners: Sequence[tuple[float, float]]) -> np.ndarray:
 def make_loop_drive(
     seed: int, corners: Sequence[tuple[float, float]], drift: float = 1.0, clouds: bool = True
 ) -> LoopDrive:
-    """A drive along a way of ``corners``; ``drift`` scales odometry's noise, of 1 cm and 0.05° a metre at 1."""
+    """A drive along a path of ``corners``; ``drift`` scales odometry's noise of 1 cm and 0.05° per metre."""
     rng = np.random.default_rng(seed)
-    poses = _way(corners)
+    poses = _path(corners)
     town = _town(rng, poses[:, :2, 3]) if clouds else None
     stamps = 10**18 + np.arange(len(poses)) * 10**8
     maker = LoopKeyframeSelector(LoopKeyframeSettings(spacing_m=3.5))
@@ -108,13 +108,13 @@ def make_loop_drive(
 
 @pytest.fixture(scope="session")
 def loop_drive() -> Callable[..., LoopDrive]:
-    """Makes drives that come back: see :func:`make_loop_drive`."""
+    """Return :func:`make_loop_drive`, which makes drives with loops."""
     return make_loop_drive
 
 
 @pytest.fixture(scope="session")
 def round_trip() -> LoopDrive:
-    """Round a block, on along its first street, and back through it in the other lane: 20 revisits each way."""
+    """Around a block, again along its first street, and back in the other lane: 20 revisits in each direction."""
     there = [(0, 0), (90, 0), (90, 60), (0, 60), (0, 0), (75, 0), (75, 3.5), (0, 3.5)]
     return make_loop_drive(3, there, drift=2.0)
 

@@ -35,7 +35,7 @@ def drive() -> Any:
 
 @pytest.fixture(scope="module")
 def record(drive: Any) -> Record:
-    """Fixes without noise of the true path, one far off; their frame is the drive's, level, turned and moved."""
+    """Fixes without noise, one of them wrong, in a frame that is the drive's levelled, rotated and moved."""
     down = drive.gravity / np.linalg.norm(drive.gravity)
     level, _ = Rotation.align_vectors([[0.0, 0.0, -1.0]], [down])
     T_enu_world = ENU @ se3.make(level.as_matrix(), np.zeros(3))
@@ -50,20 +50,20 @@ def record(drive: Any) -> Record:
     return replace(plain, gps=fixes, calibration=mount)
 
 
-def test_latitudes_go_to_metres_and_back():
+def test_geodetic_coordinates_convert_to_metres_and_back():
     positions = np.array([[0.0, 0.0, 0.0], [1500.0, -700.0, 30.0]])
     points = geodetic_from_enu(positions, ORIGIN)
     np.testing.assert_allclose(enu_from_geodetic(points, ORIGIN), positions, atol=1e-6)
     np.testing.assert_allclose(origin_of(positions[1], GeodeticPoint(*points[1])), ORIGIN, atol=1e-9)
 
 
-def test_a_run_is_placed_without_being_bent(record: Record):
+def test_georeferencing_keeps_the_shape_of_the_run(record: Record):
     placed = georeference(record)
     steps = [se3.between(t.poses[:-1], t.poses[1:]) for t in (placed.trajectory, record.online)]
     np.testing.assert_allclose(steps[0], steps[1], atol=1e-9)
 
 
-def test_the_placed_path_lies_on_the_fixes_and_the_shift_is_found(record: Record):
+def test_the_alignment_fits_the_fixes_and_finds_shift_and_outlier(record: Record):
     fit = georeference(record).alignment
     assert np.flatnonzero(~fit.inliers).tolist() == [9]
     assert fit.rmse_m < 0.02
@@ -71,7 +71,7 @@ def test_the_placed_path_lies_on_the_fixes_and_the_shift_is_found(record: Record
 
 
 @pytest.mark.parametrize(("most_s", "shift_s"), [(0.01, 0.004), (0.012, -0.008), (0.07, 0.06), (0.12, -0.11)])
-def test_a_shift_within_any_bound_is_found(record: Record, most_s: float, shift_s: float):
+def test_a_shift_is_found_within_any_bound(record: Record, most_s: float, shift_s: float):
     later = round((SHIFT_S - shift_s) * 1e9)
     fixes = tuple(replace(fix, stamp_ns=fix.stamp_ns + later) for fix in record.gps)
     fit = georeference(replace(record, gps=fixes), max_shift_s=most_s).alignment
@@ -79,14 +79,14 @@ def test_a_shift_within_any_bound_is_found(record: Record, most_s: float, shift_
 
 
 @pytest.mark.parametrize("apart_s", [18.0, -18.0])
-def test_the_clock_of_gps_which_is_18_s_before_utc_is_found_where_so_much_is_allowed(record: Record, apart_s: float):
+def test_a_shift_of_18_s_as_of_gps_time_is_found_if_the_bound_allows_it(record: Record, apart_s: float):
     fixes = tuple(replace(fix, stamp_ns=fix.stamp_ns + round(apart_s * 1e9)) for fix in record.gps)
     fit = georeference(replace(record, gps=fixes), max_shift_s=20.0).alignment
     assert fit.shift_s == pytest.approx(SHIFT_S - apart_s, abs=0.005)
     assert fit.inliers.sum() == len(fixes) - 1
 
 
-def test_what_is_written_is_read_again_and_lies_where_the_fixes_do(record: Record, tmp_path: Path):
+def test_written_files_contain_the_aligned_poses(record: Record, tmp_path: Path):
     placed = georeference(record)
     assert [path.name for path in write_georeferenced(tmp_path, placed)] == [POSES_ENU, TABLE, MAP]
     np.testing.assert_allclose(read_tum(tmp_path / POSES_ENU).poses, placed.trajectory.poses, atol=1e-9)
@@ -101,7 +101,7 @@ def test_what_is_written_is_read_again_and_lies_where_the_fixes_do(record: Recor
     assert np.abs(np.median(off)) < 10  # the lidar is mounted 3 degrees off
 
 
-def test_without_an_origin_there_are_no_latitudes(record: Record, tmp_path: Path):
+def test_without_an_origin_there_are_no_geodetic_coordinates(record: Record, tmp_path: Path):
     local = replace(record, gps=tuple(replace(fix, origin=None) for fix in record.gps))
     placed = georeference(local)
     assert [path.name for path in write_georeferenced(tmp_path, placed)] == [POSES_ENU]
@@ -110,14 +110,14 @@ def test_without_an_origin_there_are_no_latitudes(record: Record, tmp_path: Path
     assert georeference(local, origin=ORIGIN).origin == ORIGIN
 
 
-def test_a_record_keeps_antenna_and_origin(record: Record, tmp_path: Path):
+def test_a_saved_record_keeps_antenna_and_origin(record: Record, tmp_path: Path):
     record.save(tmp_path / "odometry.npz")
     again = Record.load(tmp_path / "odometry.npz")
     assert again.origin == ORIGIN
     np.testing.assert_array_equal(again.calibration.antenna_imu_m, LEVER)
 
 
-def test_straight_lines_among_samples_are_found_and_taken_out(record: Record):
+def test_linearly_filled_gaps_of_samples_are_found_and_removed(record: Record):
     imu = record.imu
     gyro, accel = imu.gyro_rad_s.copy(), imu.accel_m_s2.copy()
     first, last = 500, 650
@@ -131,7 +131,7 @@ def test_straight_lines_among_samples_are_found_and_taken_out(record: Record):
 
 
 @pytest.mark.parametrize("share", [0.05, 0.5])
-def test_an_odometrys_noise_is_found_from_its_imu(share: float):
+def test_noise_of_an_odometry_is_estimated_from_the_imu(share: float):
     sigmas = np.r_[np.full(3, 3e-3), np.full(3, 0.05)]
     drive = make_chain(9, ChainSettings(steps=600, step_sigmas=sigmas, drift_share=share, T_imu_lidar=np.eye(4)))
     poses = [np.eye(4)]
@@ -146,7 +146,7 @@ def test_an_odometrys_noise_is_found_from_its_imu(share: float):
     np.testing.assert_allclose(drift[:3], np.sqrt(share) * sigmas[:3], rtol=0.5)
 
 
-def test_records_of_other_odometries_say_what_does_not_fit(drive: Any):
+def test_invalid_inputs_of_a_record_are_errors(drive: Any):
     stamps = np.array([frame.scan.stamp_ns for frame in drive.frames])
     with pytest.raises(DataError, match="at least two poses"):
         Record.from_odometry(Trajectory(stamps[:1], np.eye(4)[None]))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hybridlio.core import se3
-from hybridlio.smoothing.loop_candidates import Candidate, CandidateFinder, CandidateSettings, levelled
+from hybridlio.smoothing.loop_candidates import Candidate, CandidateFinder, CandidateSettings, levelling_rotations
 from hybridlio.smoothing.loop_verification import VerificationSettings, Verifier
 from hybridlio.smoothing.step_uncertainty import OdometryChain
 
@@ -31,7 +31,7 @@ def true_pose(drive: Any, one: Candidate) -> np.ndarray:
     return se3.between(drive.truth.poses[rows[one.earlier]], drive.truth.poses[rows[one.later]])
 
 
-def test_most_candidates_are_of_one_place_and_their_guesses_are_near(round_trip: Any, found: list[Candidate]):
+def test_most_candidates_are_correct_and_have_a_guess_nearby(round_trip: Any, found: list[Candidate]):
     right = 0
     for one in found:
         gaps = [se3.log(se3.between(guess, true_pose(round_trip, one))) for guess in one.guesses]
@@ -39,13 +39,13 @@ def test_most_candidates_are_of_one_place_and_their_guesses_are_near(round_trip:
     assert right > 0.85 * len(found)
 
 
-def test_the_other_lane_the_other_way_is_a_candidate_too(round_trip: Any, found: list[Candidate]):
+def test_candidates_include_the_opposite_direction_in_the_other_lane(round_trip: Any, found: list[Candidate]):
     headings = [true_pose(round_trip, one)[0, 0] for one in found]
     assert sum(heading < -0.9 for heading in headings) >= 15
     assert sum(heading > 0.9 for heading in headings) >= 10
 
 
-def test_what_is_near_along_the_path_is_no_candidate(round_trip: Any, found: list[Candidate]):
+def test_keyframes_near_along_the_path_are_no_candidates(round_trip: Any, found: list[Candidate]):
     rows = round_trip.record.keyframes.rows
     travelled = OdometryChain(round_trip.record.online, round_trip.record.relative).travelled_m
     assert min(travelled[rows[one.later]] - travelled[rows[one.earlier]] for one in found) >= 40.0
@@ -54,19 +54,19 @@ def test_what_is_near_along_the_path_is_no_candidate(round_trip: Any, found: lis
     assert min(farther) >= 200
 
 
-def test_a_place_that_odometry_rules_out_is_no_candidate_however_alike(round_trip: Any):
+def test_a_similar_place_that_odometry_rules_out_is_no_candidate(round_trip: Any):
     record = round_trip.record
     poses = record.online.poses.copy()
-    poses[200:, :3, 3] += np.array([0.0, 300.0, 0.0])  # as if the second round were in another street
+    poses[200:, :3, 3] += np.array([0.0, 300.0, 0.0])  # moves the second round to another street
     away = replace(record, online=replace(record.online, poses=poses))
     rows = record.keyframes.rows
     across = [one for one in candidates(away) if rows[one.earlier] < 200 <= rows[one.later]]
     assert across == []
 
 
-def test_where_odometry_is_vague_looks_alone_find_the_place(round_trip: Any):
-    vague = tuple(replace(step, covariance=1e4 * step.covariance) for step in round_trip.record.relative)
-    record = replace(round_trip.record, relative=vague)
+def test_with_uncertain_odometry_descriptors_alone_find_the_place(round_trip: Any):
+    uncertain = tuple(replace(step, covariance=1e4 * step.covariance) for step in round_trip.record.relative)
+    record = replace(round_trip.record, relative=uncertain)
     rows = record.keyframes.rows
     best = {one.later: one for one in reversed(candidates(record))}  # the first of each keyframe
     again = [one for one in best.values() if rows[one.later] >= 296]
@@ -76,17 +76,17 @@ def test_where_odometry_is_vague_looks_alone_find_the_place(round_trip: Any):
     assert np.mean(near) > 0.8
 
 
-def test_no_keyframe_has_more_candidates_than_asked_for(round_trip: Any, found: list[Candidate]):
+def test_a_keyframe_has_at_most_the_requested_number_of_candidates(round_trip: Any, found: list[Candidate]):
     _, counts = np.unique([one.later for one in found], return_counts=True)
     assert counts.max() <= 2
     assert len(candidates(round_trip.record, CandidateSettings(per_keyframe=1))) == len(counts)
 
 
-def test_a_levelled_pose_has_up_as_z(rng: np.random.Generator):
+def test_levelling_makes_up_the_z_axis(rng: np.random.Generator):
     poses = se3.exp(rng.normal(size=(20, 6)))
     up = rng.normal(size=3)
-    turns = levelled(poses, up)
+    turns = levelling_rotations(poses, up)
     in_level = turns[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1) @ (up / np.linalg.norm(up))
     np.testing.assert_allclose(in_level, np.tile([0.0, 0.0, 1.0], (20, 1)), atol=1e-12)
     level = se3.make(se3.so3_exp([0.0, 0.0, 0.7]), np.zeros(3))
-    np.testing.assert_allclose(levelled(level[None], UP)[0], np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(levelling_rotations(level[None], UP)[0], np.eye(4), atol=1e-12)

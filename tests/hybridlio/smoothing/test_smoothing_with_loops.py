@@ -33,14 +33,14 @@ def smoothed(round_trip: Any) -> Smoothed:
     return hl.smooth(round_trip.record, loops=True)
 
 
-def test_loops_take_most_of_the_drift_away(round_trip: Any, smoothed: Smoothed):
+def test_loops_remove_most_of_the_drift(round_trip: Any, smoothed: Smoothed):
     before = hl.evaluate(round_trip.truth, hl.smooth(round_trip.record).trajectory)
     after = hl.evaluate(round_trip.truth, smoothed.trajectory)
     assert before.ate_m > 0.5
     assert after.ate_m < 0.3 * before.ate_m
 
 
-def test_positions_are_surer_with_loops(round_trip: Any, smoothed: Smoothed):
+def test_loops_reduce_the_covariances_of_positions(round_trip: Any, smoothed: Smoothed):
     alone = hl.smooth(round_trip.record).trajectory.covariances
     assert alone is not None
     assert smoothed.trajectory.covariances is not None
@@ -48,36 +48,36 @@ def test_positions_are_surer_with_loops(round_trip: Any, smoothed: Smoothed):
     assert traces[1] < 0.2 * traces[0]
 
 
-def test_what_became_of_every_candidate_is_said(smoothed: Smoothed):
+def test_every_candidate_is_kept_or_listed_as_rejected(smoothed: Smoothed):
     closed: ClosedLoops = smoothed.found["loops"]
     assert closed.search.candidates == len(closed.kept) + len(closed.rejected)
     assert closed.summary() == (
         f"{closed.search.candidates} candidates, {closed.search.verified} verified, "
         f"{len(closed.search.loops)} consistent, {len(closed.kept)} kept"
     )
-    told = json.loads(json.dumps(closed.to_json_dict(first=7)))
-    assert told["kept"] == len(closed.kept) == len(told["scans"])
-    assert told["scans"][0] == [7 + closed.kept[0].earlier, 7 + closed.kept[0].later]
-    assert sum(told["rejected_by_stage"].values()) == len(told["rejected"]) == len(closed.rejected)
-    assert all(one["reason"] and one["later"] >= 7 for one in told["rejected"])
+    plain = json.loads(json.dumps(closed.to_json_dict(first=7)))
+    assert plain["kept"] == len(closed.kept) == len(plain["scans"])
+    assert plain["scans"][0] == [7 + closed.kept[0].earlier, 7 + closed.kept[0].later]
+    assert sum(plain["rejected_by_stage"].values()) == len(plain["rejected"]) == len(closed.rejected)
+    assert all(one["reason"] and one["later"] >= 7 for one in plain["rejected"])
 
 
 @pytest.mark.parametrize("robust", [None, "gnc"])
-def test_a_false_loop_that_got_through_is_rejected_in_the_solve(
+def test_a_false_loop_is_rejected_in_the_solve(
     round_trip: Any, closed_round_trip: LoopSearch, smoothed: Smoothed, robust: str | None
 ):
     loops = list(closed_round_trip.loops)
     for k in (3, 17):
         loops[k] = replace(loops[k], pose=loops[k].pose @ se3.exp(np.array([0, 0, 0.1, 5.0, -2.0, 0])))
-    spoilt = smoothed_with(round_trip, replace(closed_round_trip, loops=tuple(loops)), robust)
-    closed: ClosedLoops = spoilt.found["loops"]
+    with_false_loops = smoothed_with(round_trip, replace(closed_round_trip, loops=tuple(loops)), robust)
+    closed: ClosedLoops = with_false_loops.found["loops"]
     solve = {(one.earlier, one.later) for one in closed.rejected if one.stage == "solve"}
     assert solve >= {(loops[k].earlier, loops[k].later) for k in (3, 17)}
     good = hl.evaluate(round_trip.truth, smoothed.trajectory).ate_m
-    assert hl.evaluate(round_trip.truth, spoilt.trajectory).ate_m < 1.5 * good
+    assert hl.evaluate(round_trip.truth, with_false_loops.trajectory).ate_m < 1.5 * good
 
 
-def test_loops_are_between_lidars_wherever_the_imu_sits(round_trip: Any, closed_round_trip: LoopSearch):
+def test_loops_are_between_lidars_for_any_mount_of_the_imu(round_trip: Any, closed_round_trip: LoopSearch):
     T_imu_lidar = se3.exp(np.array([0.3, -0.2, 0.5, 1.0, -0.4, 0.8]))
     calibration = replace(round_trip.record.calibration, T_imu_lidar=T_imu_lidar)
     moved = replace(round_trip, record=replace(round_trip.record, calibration=calibration))
@@ -100,7 +100,7 @@ def test_a_smoothed_run_has_its_loops_in_graph_metrics_and_report(round_trip: An
     assert smoothed.found["loops"].summary() in report
 
 
-def test_a_finished_run_is_smoothed_with_loops_on_the_command_line(tiny_drive: Path, tmp_path: Path):
+def test_the_command_smooths_a_finished_run_with_loops(tiny_drive: Path, tmp_path: Path):
     run = tmp_path / "run"
     done = CliRunner().invoke(app, ["odometry", str(tiny_drive), "-o", str(run)])
     assert done.exit_code == 0, done.output
@@ -116,7 +116,7 @@ def test_a_finished_run_is_smoothed_with_loops_on_the_command_line(tiny_drive: P
     assert CliRunner().invoke(app, ["smooth", str(run)]).exit_code == 0
 
 
-def test_a_run_from_python_carries_its_keyframes(tiny_drive: Path):
+def test_a_record_from_python_has_keyframes(tiny_drive: Path):
     odometry = hl.Odometry()
     for frame in hl.open_sequence(tiny_drive):
         odometry.step(frame)
