@@ -63,10 +63,10 @@ def of_recording(path: Path) -> Case:
 
 def of_seed(config: hl.SimulationConfig) -> Case:
     """Loop keyframes of a simulated drive, and exact odometry; noise is added by :func:`drifted`."""
+    from hybridlio.simulation.measurements import scan_at
     from hybridlio.simulation.plan import plan
     from hybridlio.simulation.rig import T_IMU_LIDAR
     from hybridlio.simulation.sensors.lidar import ray_pattern
-    from hybridlio.simulation.simulate import scan_at
 
     drive, pattern, settings = plan(config), ray_pattern(config.lidar_model), LoopKeyframeSettings()
     poses = drive.path.poses(drive.scan_times_s) @ T_IMU_LIDAR

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridlio.core.sensors import ImuSamples
+from hybridlio.core.sensors import NS_PER_S, ImuSamples
 from hybridlio.datasets.gyro_lag import SLOW_ROWS_S
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.oxts import OxtsRows, read_oxts
@@ -47,7 +47,7 @@ def drive_imu(drive: Path, oxts: OxtsRows | None, notes: Notes) -> ImuSamples:
     if oxts is None:
         notes.add(f"no inertial data: neither {drive / 'oxts'} nor {fast} exists")
         return ImuSamples.empty()
-    rate = 1e9 / float(np.median(np.diff(oxts.stamps_ns))) if len(oxts) > 1 else 0.0
+    rate = NS_PER_S / float(np.median(np.diff(oxts.stamps_ns))) if len(oxts) > 1 else 0.0
     if rate < 1 / SLOW_ROWS_S:
         notes.add(_SLOW_IMU.format(rate=rate, folder=drive / "oxts", extract=fast.parent.name))
     return _without_lag(oxts, notes)

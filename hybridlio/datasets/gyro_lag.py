@@ -11,9 +11,12 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from hybridlio.core.arrays import Array, Stamps
+from hybridlio.core.sensors import NS_PER_S
 
 # Rows farther apart are slow: KITTI's synchronised rows have 10 Hz, its unsynchronised recordings 100 Hz.
 SLOW_ROWS_S = 0.02
+
+_NS_PER_MS = NS_PER_S // 1000
 
 _STEP_S = 0.1  # between compared attitudes: long enough for rotations to exceed the attitudes' noise
 _GRID_S = np.arange(0.0, 0.121, 0.01)  # lags that are tried: up to twice KITTI's
@@ -43,7 +46,7 @@ def gyro_lag_ns(stamps_ns: Stamps, attitude_rad: Array, gyro_rad_s: Array) -> in
     """
     if len(stamps_ns) < _MIN_STEPS or not np.ptp(attitude_rad, axis=0).any():
         return 0
-    seconds = (stamps_ns - stamps_ns[0]) / 1e9
+    seconds = (stamps_ns - stamps_ns[0]) / NS_PER_S
     period = float(np.median(np.diff(seconds)))
     rows = np.arange(0, len(seconds), max(1, round(_STEP_S / period)))
     start, stop = seconds[rows[:-1]], seconds[rows[1:]]
@@ -72,4 +75,4 @@ def _best_lag_ns(errors: Array, rotations: Array) -> int:
         return 0
     before, here, after = cost[k - 1 : k + 2]
     vertex = (before - after) / (2 * (before - 2 * here + after))  # of the parabola through the three costs
-    return round(1e3 * float(_GRID_S[k] + vertex * (_GRID_S[1] - _GRID_S[0]))) * 1_000_000
+    return round(1e3 * float(_GRID_S[k] + vertex * (_GRID_S[1] - _GRID_S[0]))) * _NS_PER_MS

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from hybridlio.core.arrays import Mask
+from hybridlio.core.arrays import Mask, Stamps
 from hybridlio.core.sensors import NS_PER_S, ImuSamples
 
 _MEDIAN_WINDOW = 5  # samples: outvotes two spikes in a row
@@ -36,7 +36,7 @@ def spikes(imu: ImuSamples) -> NDArray[np.intp]:
     return found if len(found) <= max(1, _MAX_SPIKE_SHARE * len(imu)) else found[:0]
 
 
-def without_spikes(imu: ImuSamples) -> tuple[ImuSamples, NDArray[np.int64]]:
+def without_spikes(imu: ImuSamples) -> tuple[ImuSamples, Stamps]:
     """Return the samples without :func:`spikes`, and the stamps of the spikes."""
     rows = spikes(imu)
     return _at_rows(imu, np.delete(np.arange(len(imu)), rows)) if len(rows) else imu, imu.stamps_ns[rows]

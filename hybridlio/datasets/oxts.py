@@ -54,7 +54,7 @@ class OxtsRows:
         stamps, shifted = self.stamps_ns, self.stamps_ns - gyro_lag_ns
         if len(self) > 1 and np.median(np.diff(stamps)) > SLOW_ROWS_S * NS_PER_S:
             stamps = np.union1d(stamps, shifted[shifted >= stamps[0]])
-        at, accel_at, gyro_at = ((t - self.stamps_ns[0]) / 1e9 for t in (stamps, self.stamps_ns, shifted))
+        at, accel_at, gyro_at = ((t - self.stamps_ns[0]) / NS_PER_S for t in (stamps, self.stamps_ns, shifted))
         gyro = [np.interp(at, gyro_at, column) for column in self.values[:, _GYRO].T]
         accel = [np.interp(at, accel_at, column) for column in self.values[:, _ACCEL].T]
         return ImuSamples(stamps, np.column_stack(gyro), np.column_stack(accel))
@@ -91,7 +91,7 @@ class OxtsRows:
         known = np.isfinite(speed)
         if not known.any() or (self.with_positions is None and not speed[known].any()):
             return None
-        at, seconds = ((t - self.stamps_ns[0]) / 1e9 for t in (stamps_ns, self.stamps_ns[known]))
+        at, seconds = ((t - self.stamps_ns[0]) / NS_PER_S for t in (stamps_ns, self.stamps_ns[known]))
         return np.asarray(np.interp(at, seconds, speed[known]))
 
 

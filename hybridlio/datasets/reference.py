@@ -6,6 +6,7 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Stamps
+from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.notes import Notes
 
@@ -35,7 +36,9 @@ def poses_at(at_ns: Stamps, stamps_ns: Stamps, poses: Array, what: str, notes: N
     distance_ns = np.minimum(np.abs(at_ns - before), np.abs(at_ns - after))
     if distance_ns.max() > _MAX_DISTANCE_NS:
         far = int(distance_ns.argmax())
-        notes.add(f"no reference poses: scan {far} is {distance_ns[far] / 1e9:.2f} s from the nearest of the {what}")
+        notes.add(
+            f"no reference poses: scan {far} is {distance_ns[far] / NS_PER_S:.2f} s from the nearest of the {what}"
+        )
         return None
     fraction = (at_ns - before) / (after - before)
     return Trajectory(at_ns, se3.interpolate(poses[right - 1], poses[right], fraction)).from_first()

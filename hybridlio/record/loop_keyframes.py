@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.cloud.voxel import voxel_average
-from hybridlio.core.arrays import Array
+from hybridlio.core.arrays import Array, Floats, Index, Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.files import UNREADABLE_NPZ, atomic_path
 from hybridlio.core.packed_arrays import PackedCloud
@@ -73,8 +73,8 @@ class LoopKeyframes:
         DataError: lengths differ, rows do not ascend, or a cloud has another shape or type.
     """
 
-    rows: NDArray[np.int64]
-    stamps_ns: NDArray[np.int64]
+    rows: Index
+    stamps_ns: Stamps
     clouds: tuple[NDArray[np.int16], ...]
 
     def __post_init__(self) -> None:
@@ -174,7 +174,7 @@ class LoopKeyframeSelector:
         return LoopKeyframes(rows, stamps, tuple(cloud.cloud() for _, _, cloud in self._kept))
 
 
-def compress(points: NDArray[np.float32], settings: LoopKeyframeSettings) -> NDArray[np.int16]:
+def compress(points: Floats, settings: LoopKeyframeSettings) -> NDArray[np.int16]:
     """Average the points ``(N, 3)`` within range by voxel; ``(n, 3)`` int16 in units of :data:`RESOLUTION_M`."""
     some = points[:: max(1, len(points) // _AVERAGED_POINTS)]
     some = some[np.einsum("ij,ij->i", some, some) < np.float32(settings.max_range_m) ** 2]

@@ -10,10 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridlio.core import se3
-from hybridlio.core.arrays import Array
+from hybridlio.core.arrays import Array, Mask, Stamps
 from hybridlio.core.pose_interpolation import PosePath
 from hybridlio.core.sensors import NS_PER_S, Calibration, ImuSamples
 from hybridlio.core.trajectory import Trajectory
@@ -89,7 +88,7 @@ def odometry_noise(trajectory: Trajectory, imu: ImuSamples, calibration: Calibra
     return OdometryNoise(drifts + scatters, drifts, tuple(measured))
 
 
-def _whole_steps(stamps_ns: NDArray[np.int64], imu: ImuSamples) -> NDArray[np.bool_]:
+def _whole_steps(stamps_ns: Stamps, imu: ImuSamples) -> Mask:
     """Return ``(N-1,)``, true for steps without a gap in the samples."""
     gaps = np.flatnonzero(np.diff(imu.stamps_ns) > _LONGEST_GAP_S * NS_PER_S)
     starts, ends = imu.stamps_ns[gaps], imu.stamps_ns[gaps + 1]
@@ -99,7 +98,7 @@ def _whole_steps(stamps_ns: NDArray[np.int64], imu: ImuSamples) -> NDArray[np.bo
     return np.asarray(reached & (overlapping <= 0))
 
 
-def _integral(stamps_ns: NDArray[np.int64], values: Array, at_ns: NDArray[np.int64]) -> Array:
+def _integral(stamps_ns: Stamps, values: Array, at_ns: Stamps) -> Array:
     """Integrate ``(S, 3)`` values, linear between samples, from the first stamp to each of ``at_ns``; ``(M, 3)``."""
     times, at = (stamps_ns - stamps_ns[0]) / NS_PER_S, (at_ns - stamps_ns[0]) / NS_PER_S
     intervals = (values[1:] + values[:-1]) / 2 * np.diff(times)[:, None]
@@ -107,9 +106,7 @@ def _integral(stamps_ns: NDArray[np.int64], values: Array, at_ns: NDArray[np.int
     return np.column_stack([np.interp(at, times, column) for column in integral.T])
 
 
-def _rotation(
-    stamps_ns: NDArray[np.int64], poses: Array, imu: ImuSamples, length_m: float
-) -> tuple[Array, Array] | None:
+def _rotation(stamps_ns: Stamps, poses: Array, imu: ImuSamples, length_m: float) -> tuple[Array, Array] | None:
     """Return scatter ``(3,)`` in rad and drift ``(3,)`` in rad per root metre, IMU axes; None with too few samples.
 
     ``length_m`` is the typical length of a step.
@@ -135,7 +132,7 @@ def _rotation(
     return scatter, np.sqrt(drift / length_m)
 
 
-def _translation(stamps_ns: NDArray[np.int64], poses: Array, imu: ImuSamples) -> Array | None:
+def _translation(stamps_ns: Stamps, poses: Array, imu: ImuSamples) -> Array | None:
     """Return the scatter ``(3,)`` of positions in m, IMU axes; None with too few samples."""
     if len(imu) < 2 or len(stamps_ns) <= _WINDOW_STEPS:
         return None

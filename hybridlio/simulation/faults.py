@@ -15,6 +15,7 @@ from hybridlio.core.errors import ConfigError
 from hybridlio.core.sensors import NS_PER_S, ImuNoise, ImuSamples, Scan
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.evaluation.ate_rpe import select
+from hybridlio.simulation.random_streams import RandomStream
 
 
 def drop_scans(sequence: Sequence, share: float, seed: int = 0) -> Sequence:
@@ -26,7 +27,9 @@ def drop_scans(sequence: Sequence, share: float, seed: int = 0) -> Sequence:
     if not 0 <= share < 1:
         raise ConfigError(f"dropped scans: the share must be 0 or more and below 1, got {share}")
     count = round(share * (len(sequence) - 1))
-    lost = np.random.default_rng([seed, 11]).choice(np.arange(1, len(sequence)), count, replace=False)
+    lost = np.random.default_rng([seed, RandomStream.DROPPED_SCANS]).choice(
+        np.arange(1, len(sequence)), count, replace=False
+    )
     rows = np.setdiff1d(np.arange(len(sequence)), lost)
     reference, speed = sequence.reference, sequence.forward_speed_m_s
     return replace(
@@ -92,7 +95,7 @@ def imu_bias(sequence: Sequence, sigmas: float, seed: int = 0) -> Sequence:
     The standard deviations are those of the recording's :class:`~hybridlio.core.sensors.ImuNoise`, else the defaults.
     """
     noise = sequence.imu_noise or ImuNoise()
-    signs = np.random.default_rng([seed, 12]).choice([-1.0, 1.0], (2, 3))
+    signs = np.random.default_rng([seed, RandomStream.IMU_BIAS]).choice([-1.0, 1.0], (2, 3))
     gyro, accel = signs * sigmas * np.array([[noise.gyro_bias_sigma_rad_s], [noise.accel_bias_sigma_m_s2]])
     imu = sequence.imu
     biased = ImuSamples(imu.stamps_ns, imu.gyro_rad_s + gyro, imu.accel_m_s2 + accel)

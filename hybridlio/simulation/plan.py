@@ -16,6 +16,7 @@ from hybridlio.simulation.drive.revisits import level_revisits
 from hybridlio.simulation.drive.rises import without_false_rises
 from hybridlio.simulation.drive.traffic import EgoDrive, MovingCar, traffic
 from hybridlio.simulation.drive.vehicle import FINE_S, drive_path, lane_of
+from hybridlio.simulation.random_streams import RandomStream
 from hybridlio.simulation.rig import LIDAR_HEIGHT_M, SCAN_RATE_HZ, T_IMU_LIDAR
 from hybridlio.simulation.world.ground import CAMBER, Ground, Height, land_along, waves
 from hybridlio.simulation.world.layout import lay_out
@@ -63,7 +64,7 @@ def plan(config: SimulationConfig) -> Drive:
 
 
 def _ground(land: Height, centreline: Road, config: SimulationConfig) -> Ground:
-    rng = np.random.default_rng([config.seed, 2])
+    rng = np.random.default_rng([config.seed, RandomStream.GROUND])
     points = centreline.at(np.arange(0.0, centreline.length_m, STEP_M))
     roughness = waves(rng, *_ROUGHNESS)
     bumps, cracks = waves(rng, *_BUMPS), waves(rng, *_CRACKS)
@@ -94,12 +95,12 @@ def _driven(config: SimulationConfig, length: float, stretch: float, times: Arra
     ``length`` is the distance to drive. Rounded corners shorten the road by an amount that depends on its bends;
     ``stretch`` makes it longer.
     """
-    rng = np.random.default_rng([config.seed, 1])
+    rng = np.random.default_rng([config.seed, RandomStream.ROAD])
     round_trip = float(np.clip(_ROUND_TRIP_SHARE * length, *_ROUND_TRIP_M)) if config.loops else None
     centreline = generate_centreline(rng, stretch * length + _BEHIND_M + _AHEAD_M, config.scene, round_trip)
     count, lengths, slope = _LAND
     flat = _CORRIDOR_SHARE if config.scene == "corridor" else 1.0
-    land = waves(np.random.default_rng([config.seed, 3]), count, lengths, slope * flat)
+    land = waves(np.random.default_rng([config.seed, RandomStream.LAND]), count, lengths, slope * flat)
     ground = _ground(land, centreline, config)
     lane = lane_of(centreline, rng)
     manner = MANNERS[config.driving]
@@ -145,7 +146,13 @@ def _road_below(points: Array, ahead: Array) -> Road:
 def _with_world(
     config: SimulationConfig, path: SmoothPath, centreline: Road, lane: Road, ground: Ground, seconds: float
 ) -> Drive:
-    items = lay_out(centreline, ground.centre, config.scene, config.parked, np.random.default_rng([config.seed, 4]))
+    items = lay_out(
+        centreline,
+        ground.centre,
+        config.scene,
+        config.parked,
+        np.random.default_rng([config.seed, RandomStream.LAYOUT]),
+    )
     scans = np.arange(max(round(seconds * SCAN_RATE_HZ), 2)) / SCAN_RATE_HZ
     times = np.arange(-0.5, scans[-1] + 0.6, _EGO_STEP_S)
     ego_xy = path.poses(times)[:, :2, 3]

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridlio.core.errors import DataError
 from hybridlio.core.files import locked, write_atomically
 from hybridlio.core.geodesy import origin_of
 from hybridlio.core.progress import Progress
-from hybridlio.core.sensors import NS_PER_S, LidarModel, Scan
+from hybridlio.core.sensors import NS_PER_S
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.kitti_writer import (
     FIRST_PLACE,
@@ -28,14 +27,22 @@ from hybridlio.simulation.kitti_writer import (
     write_oxts,
     write_scan,
 )
+from hybridlio.simulation.measurements import (
+    IMU_PER_SCAN,
+    LEAD_TICKS,
+    imu_samples,
+    imu_ticks,
+    lidar_poses,
+    scan_at,
+    scan_stamps_ns,
+)
 from hybridlio.simulation.plan import Drive, plan
-from hybridlio.simulation.rig import IMU_RATE_HZ, SCAN_RATE_HZ, T_IMU_LIDAR
+from hybridlio.simulation.random_streams import RandomStream
+from hybridlio.simulation.rig import IMU_RATE_HZ
 from hybridlio.simulation.sensors.gps import gps_csv, gps_fixes
-from hybridlio.simulation.sensors.imu import add_noise, ideal_imu
-from hybridlio.simulation.sensors.lidar import RayPattern, first_hits, measure, ray_pattern
+from hybridlio.simulation.sensors.lidar import ray_pattern
 
 FORMAT_VERSION = 1
-_LEAD_S = 0.2  # of the IMU before the first scan's stamp and after the last: more than a sweep
 
 
 def simulate(out: Path, config: SimulationConfig, progress: Progress | None = None) -> Path:
@@ -121,24 +128,19 @@ def _completed(found: Any) -> Any:
 
 def _write_measurements(folders: DriveFolders, drive: Drive, config: SimulationConfig) -> None:
     """Write everything except scans and calibration: stamps, navigation rows, ground truth, GPS."""
-    scan_stamps = START_NS + np.round(drive.scan_times_s * NS_PER_S).astype(np.int64)
-    lead = round(_LEAD_S * IMU_RATE_HZ)
-    per_scan = IMU_RATE_HZ // SCAN_RATE_HZ
-    ticks = np.arange(-lead, (len(scan_stamps) - 1) * per_scan + lead + 1)
-    times = ticks / IMU_RATE_HZ
-    rng = np.random.default_rng([config.seed, 6])
-    gyro, accel = add_noise(*ideal_imu(drive.path, times), config.imu_noise, IMU_RATE_HZ, rng)
+    scan_stamps, imu = scan_stamps_ns(drive), imu_samples(drive, config)
     origin = drive.path.poses(0.0)[0, :3, 3]
-    rows = oxts_rows(drive.path.motion(times), origin, gyro, accel)
-    write_oxts(folders.extract / "oxts", START_NS + ticks * (NS_PER_S // IMU_RATE_HZ), rows)
-    write_oxts(folders.sync / "oxts", scan_stamps, rows[lead : len(rows) - lead : per_scan])
+    motion = drive.path.motion(imu_ticks(drive) / IMU_RATE_HZ)
+    rows = oxts_rows(motion, origin, imu.gyro_rad_s, imu.accel_m_s2)
+    write_oxts(folders.extract / "oxts", imu.stamps_ns, rows)
+    write_oxts(folders.sync / "oxts", scan_stamps, rows[LEAD_TICKS : len(rows) - LEAD_TICKS : IMU_PER_SCAN])
     half_turn = round(NS_PER_S / config.lidar_model.rate_hz / 2) if config.motion_distortion else 0
     for name, shift in (("timestamps", 0), ("timestamps_start", -half_turn), ("timestamps_end", half_turn)):
         write_atomically(folders.velodyne / f"{name}.txt", stamps_text(scan_stamps + shift))
-    write_atomically(folders.sync / "poses.txt", pose_rows(drive.path.poses(drive.scan_times_s) @ T_IMU_LIDAR))
+    write_atomically(folders.sync / "poses.txt", pose_rows(lidar_poses(drive)))
     if config.gps:
         fix_times = np.arange(0.0, drive.scan_times_s[-1] + 1e-9, 1.0 / config.gps_rate_hz)
-        noise = np.random.default_rng([config.seed, 8])
+        noise = np.random.default_rng([config.seed, RandomStream.GPS])
         place = origin_of(origin, FIRST_PLACE)
         fixes = gps_fixes(drive.path, fix_times, START_NS, config.gps_sigma_m, noise, place)
         write_atomically(folders.sync / "gps.csv", gps_csv(fixes))
@@ -151,22 +153,3 @@ def _write_scans(folders: DriveFolders, drive: Drive, config: SimulationConfig, 
             write_scan(folders.velodyne, k, scan_at(drive, k, pattern, config))
         if progress is not None:
             progress("", k + 1, total)
-
-
-def scan_at(
-    drive: Drive, index: int, pattern: RayPattern, config: SimulationConfig, lidar: LidarModel | None = None
-) -> Scan:
-    """Return scan ``index`` of a drive, with noise. The same whatever was scanned before.
-
-    ``lidar`` replaces the configured sensor; ``pattern`` holds its rays.
-    """
-    stamp_s = float(drive.scan_times_s[index])
-    offsets_s: NDArray[np.float64] = np.zeros(1)
-    if config.motion_distortion:
-        offsets_s = pattern.column_offset_ns / NS_PER_S
-    poses = drive.path.poses(stamp_s + offsets_s) @ T_IMU_LIDAR
-    scene = drive.world.scene_around(drive.path.poses(stamp_s)[0, :3, 3])
-    hits = first_hits(scene, drive.cars, pattern, poses, stamp_s + offsets_s)
-    rng = np.random.default_rng([config.seed, 9, index])
-    stamp_ns = START_NS + round(stamp_s * NS_PER_S)
-    return measure(hits, pattern, lidar or config.lidar_model, stamp_ns, config.motion_distortion, rng)

@@ -10,6 +10,7 @@ from scipy.interpolate import CubicSpline
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
+from hybridlio.simulation.random_streams import RandomStream
 from hybridlio.simulation.world import street
 from hybridlio.simulation.world.ground import Ground
 from hybridlio.simulation.world.rays import RayScene
@@ -93,7 +94,7 @@ def traffic(centreline: Road, ego: EgoDrive, ground: Ground, per_km: float, seed
         per_km: cars per kilometre.
         seed: of the drive.
     """
-    rng = np.random.default_rng([seed, 5])
+    rng = np.random.default_rng([seed, RandomStream.TRAFFIC])
     cars = []
     times_s = ego.times_s
     driven = float(ego.s[-1] - ego.s[0])

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hybridlio.core.arrays import Array
+from hybridlio.simulation.random_streams import RandomStream
 from hybridlio.simulation.world.ground import SIDEWALK_END_M, Ground
 from hybridlio.simulation.world.items import Item
 from hybridlio.simulation.world.rays import RayScene
@@ -69,6 +70,6 @@ class World:
         parts = [self.ground.patch(low, TILE_M, FINE_CELL_M if fine else COARSE_CELL_M)]
         for index in self._by_tile.get(tile, ()):
             item = self.items[index]
-            rng = np.random.default_rng([self.seed, 7, index])
+            rng = np.random.default_rng([self.seed, RandomStream.ITEM, index])
             parts.append(item.build(rng).placed(item.x, item.y, float(self._item_z[index]), item.yaw))
         return merge(parts)

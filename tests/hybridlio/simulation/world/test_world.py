@@ -5,10 +5,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 from hybridlio.simulation.config import SimulationConfig
+from hybridlio.simulation.measurements import scan_at
 from hybridlio.simulation.plan import Drive, plan
 from hybridlio.simulation.rig import LIDAR_HEIGHT_M, T_IMU_LIDAR
 from hybridlio.simulation.sensors.lidar import ray_pattern
-from hybridlio.simulation.simulate import scan_at
 from hybridlio.simulation.world.ground import CURB_HEIGHT_M, CURB_OFFSET_M, Ground, land_along, waves
 from hybridlio.simulation.world.rays import RayScene
 from hybridlio.simulation.world.world import TILE_M, World
