@@ -1,4 +1,34 @@
-"""Lidar-inertial odometry that joins a learned front end with a factor graph."""
+"""Lidar-inertial odometry that joins a learned front end with a factor graph.
+
+Estimate the trajectory of a recording (KITTI, or a folder of scans):
+
+    import hybridlio as hl
+    odometry = hl.Odometry(initial_pose="preintegration", residual="scan-matching")
+    estimates = [odometry.step(frame) for frame in hl.open_sequence("2011_09_26_drive_0005_sync")]
+
+Recordings:
+    open_sequence      open a recording; find_recordings finds those below a folder
+    Sequence           a recording: one Frame per scan, with its Scan, ImuSamples and GpsFix objects
+    simulate           simulate a drive as KITTI raw data, as SimulationConfig says
+
+Estimation:
+    Odometry           estimates frame by frame; Config has its settings
+    Estimate           the result of a step: pose, covariance and how they came about
+    smooth             smooth a finished run (odometry.record()) over its whole length, with loops and GPS
+    run_batch          run many recordings in parallel, as BatchOptions says; each is a Recording, the result a Batch
+
+Results:
+    Trajectory         stamped lidar poses with covariances
+    evaluate           drift, ATE, RPE and consistency against a reference
+
+Sources of your own:
+    RelativePose       what a source returns; hybridlio.core.estimates has the protocols
+    State              what the backend returns
+    Calibration        extrinsics; ImuNoise has the IMU's noise densities
+
+Poses are float64 (4, 4) arrays, T_a_b maps points of frame b into frame a. Covariances are (6, 6), rotation first, rad²
+and m². Time is int64 nanoseconds. Errors descend from HybridLioError. Pose graphs are in hybridlio.graph (PoseGraph).
+"""
 
 from importlib import import_module
 from typing import TYPE_CHECKING

@@ -67,7 +67,11 @@ class Sequence:
             raise DataError(f"{self.name}: GPS fixes are not in order of time; sort them by stamp")
 
     def __repr__(self) -> str:
-        return f"Sequence({self.name!r}, {len(self)} scans, {len(self.imu)} inertial samples)"
+        reference = "" if self.reference is None else ", with reference"
+        return (
+            f"Sequence({self.name!r}, {len(self)} scans in {self.duration_s:.1f} s, {len(self.imu)} IMU samples, "
+            f"{len(self.gps)} GPS fixes{reference})"
+        )
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

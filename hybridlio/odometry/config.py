@@ -1,4 +1,4 @@
-"""The configuration: a tree that mirrors the objects it sets up; unknown keys are errors."""
+"""The configuration: a tree of settings that mirrors the objects it configures. Unknown keys are errors."""
 
 from __future__ import annotations
 
@@ -24,19 +24,20 @@ if TYPE_CHECKING:
 
 
 class Config(BaseModel):
-    """Everything that an odometry run can be told.
+    """All settings of an odometry run.
 
     Attributes:
-        initial_pose: a name of :data:`hybridlio.odometry.registry.INITIAL_POSE_SOURCES`.
-        residual: a name of :data:`hybridlio.odometry.registry.RESIDUAL_SOURCES`.
-        backend: a name of :data:`hybridlio.odometry.registry.BACKENDS`.
-        imu_noise: the IMU's noise; without it the recording's own, where it says so, else an industrial MEMS unit's.
+        initial_pose: a name in :data:`hybridlio.odometry.registry.INITIAL_POSE_SOURCES`.
+        residual: a name in :data:`hybridlio.odometry.registry.RESIDUAL_SOURCES`.
+        backend: a name in :data:`hybridlio.odometry.registry.BACKENDS`.
+        imu_noise: the IMU's noise densities. By default the recording's, or those of an industrial MEMS unit if the
+            recording does not state any.
         scan_matching: settings of the classical residual source.
-        recent_scans: how many earlier scans each is compared with, by ``network`` and by ``scan-matching`` to the last
-            scan; a local map is made of keyframes already.
+        recent_scans: which recent scans each scan is compared with, by ``network``, and by ``scan-matching`` with the
+            target ``last-scan``. A local map holds several scans already.
         lstm: settings of the learned initial-pose source.
         network: settings of the learned residual source.
-        keyframes: which clouds are kept for closing loops.
+        keyframes: which clouds are kept for loop closure.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -53,40 +54,44 @@ class Config(BaseModel):
 
 
 def config_to_yaml(config: Config) -> str:
-    """The configuration as YAML text that :func:`load_config` reads back."""
+    """Return the configuration as YAML text for :func:`load_config`."""
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
 
 
 def load_config(path: Path) -> Config:
-    """Read a YAML configuration; what it leaves out keeps its default.
+    """Read a YAML configuration; settings that it leaves out keep their defaults.
 
     Raises:
-        ConfigError: no such file, not YAML, an unknown key or a value out of range; names each.
+        ConfigError: the file is missing or not YAML, or has unknown keys or values out of range; names each.
     """
     return parse_config(read_yaml(path, ConfigError) or {}, str(path))
 
 
 def parse_config(tree: object, where: str) -> Config:
-    """The configuration of a tree of plain values; ``where`` names its origin in errors.
+    """Return the configuration from a tree of plain values.
+
+    Args:
+        tree: names and values as in the YAML file.
+        where: where they come from, for error messages.
 
     Raises:
-        ConfigError: an unknown key or a value out of range.
+        ConfigError: unknown keys or values out of range.
     """
     try:
         return Config.model_validate(tree)
     except ValidationError as error:
-        wrong = "; ".join(map(_complaint, error.errors()))
+        wrong = "; ".join(map(_describe, error.errors()))
         raise ConfigError(f"{where}: {wrong}. `hybridlio config` prints all keys with their defaults") from None
 
 
-def _complaint(error: ErrorDetails) -> str:
-    """What is wrong with one key, and which one may have been meant."""
+def _describe(error: ErrorDetails) -> str:
+    """Say what is wrong with one key, and which key may have been meant."""
     *above, last = map(str, error["loc"] or ("",))
     path = ".".join((*above, last))
     if not path:
-        return f"expected settings, each with its key, got {error['input']!r:.40}"
+        return f"expected keys with values, got {error['input']!r:.40}"
     cause = error.get("ctx", {}).get("error")
-    if isinstance(cause, SettingError):  # settings check themselves, and do not know where they stand
+    if isinstance(cause, SettingError):  # raised by a settings class, which does not know its path in the file
         return f"{path}.{cause.name}: {cause.complaint}"
     if error["type"] not in ("extra_forbidden", "unexpected_keyword_argument"):
         return f"{path}: {error['msg'].lower()}"
@@ -94,7 +99,7 @@ def _complaint(error: ErrorDetails) -> str:
     beside = {key.rsplit(".", 1)[-1]: key for key in every if key.split(".")[:-1] == above}
     meant = [beside[name] for name in difflib.get_close_matches(last, beside, n=1)]
     meant = meant or [key for key in every if key.rsplit(".", 1)[-1] == last]
-    return f"{path}: unknown key{f'; did you mean {meant[0]}?' if meant else ''}"
+    return f"{path}: unknown key{f' (did you mean {meant[0]}?)' if meant else ''}"
 
 
 def _keys(tree: dict[str, Any], above: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:

@@ -59,6 +59,13 @@ class Record:
     imu_noise: ImuNoise
     keyframes: LoopKeyframes | None = None
 
+    def __repr__(self) -> str:
+        keyframes = "no" if self.keyframes is None else len(self.keyframes)
+        return (
+            f"Record({len(self.online)} scans, {self.online.length_m:.1f} m, {len(self.imu.stamps_ns)} IMU samples, "
+            f"{len(self.gps)} GPS fixes, {keyframes} loop keyframes)"
+        )
+
     @classmethod
     def from_odometry(
         cls,

@@ -1,4 +1,4 @@
-"""What every implementation of a seam is given and held to along a simulated drive."""
+"""Inputs and checks for contract tests of the seams' implementations along a simulated drive."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def start_of(frames: list[Frame]) -> State:
 
 
 def true_state(sequence: Sequence, k: int, start: State) -> State:
-    """What a backend would know at scan k: nearly everything."""
+    """Return the true state at scan k, with a small covariance."""
     assert sequence.reference is not None
     T = sequence.calibration.T_imu_lidar
     poses = T @ sequence.reference.poses @ se3.inverse(T)
@@ -41,7 +41,7 @@ def true_state(sequence: Sequence, k: int, start: State) -> State:
 
 
 def bytes_of(value: Any) -> list[bytes]:
-    """Every array and number in a tree of dataclasses, to see whether one has changed."""
+    """Return every array and number in a tree of dataclasses as bytes, to detect changes."""
     if isinstance(value, np.ndarray):
         return [value.tobytes()]
     if is_dataclass(value):
@@ -61,6 +61,6 @@ def check(relative: RelativePose, names: set[str]) -> None:
 
 
 def guess(sequence: Sequence, k: int) -> RelativePose:
-    """The true step, 20 cm and a third of a degree off."""
+    """Return an initial pose 20 cm and a third of a degree off the true step."""
     pose = true_step(sequence, k - 1, k).pose @ se3.exp(np.array([0.003, -0.002, 0.005, 0.15, -0.1, 0.05]))
     return RelativePose(pose, np.diag(np.r_[np.full(3, 0.01), np.full(3, 0.2)] ** 2), "guess")

@@ -1,4 +1,4 @@
-"""Frames whose scans stand for what is prepared already, and a step between them."""
+"""Frames with placeholder scans for tests that look prepared scans up by stamp, and a step between them."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ FEW = NetworkResidualSettings(min_cells=200)
 
 
 def frame(k: int, imu: bool = True) -> Frame:
-    """Frame ``k`` of 10 Hz; its scan stands for what is looked up by its stamp."""
+    """Return frame ``k`` at 10 Hz with a placeholder scan."""
     stamps = np.arange(11) * 10**7 + (k - 1) * 10**8
     rows = np.full((11, 3), 0.1)
     samples = ImuSamples(stamps, rows, rows + np.array([0, 0, 9.8])) if imu else ImuSamples.empty()

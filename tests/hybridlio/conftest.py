@@ -1,4 +1,4 @@
-"""A simulated drive as everybody looks at it, and what tests of whole runs share."""
+"""Fixtures: a simulated drive, its frames, and a finished run over it."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ def sequence(tiny_drive: Path) -> Sequence:
 
 @pytest.fixture(scope="session")
 def frames(sequence: Sequence) -> list[Frame]:
-    """All 25; read them, do not change them."""
+    """All 25 frames; do not modify them."""
     return list(sequence)
 
 
 @pytest.fixture(scope="session")
 def first_frames(frames: list[Frame]) -> list[Frame]:
-    """Eight, which are enough for a contract."""
+    """Eight frames, enough for contract tests."""
     return frames[:8]
 
 
 @pytest.fixture(scope="session")
 def learned_config(untrained_weights: Path) -> Config:
-    """What the learned sources need for the drive's lidar: the shipped weights are for another one."""
+    """A configuration with weights for the drive's lidar; the shipped ones are for another lidar."""
     path = str(untrained_weights)
     return Config(lstm=LstmSettings(path, "cpu"), network=NetworkResidualSettings(path, "cpu", min_cells=200))
 
@@ -48,13 +48,13 @@ def setup(sequence: Sequence, learned_config: Config) -> Setup:
 
 @pytest.fixture
 def without_pages(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spare the test the report and its pictures, which take a second."""
+    """Skip the report and its plots, which take a second."""
     monkeypatch.setattr("hybridlio.runs.write.write_pages", lambda *_: None)
 
 
 @pytest.fixture(scope="session")
 def finished_run(tiny_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a run over the whole drive, without its pages; read it, do not change it."""
+    """The folder of a run over the whole drive, without its report; do not modify it."""
     folder = tmp_path_factory.mktemp("cli") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hybridlio.runs.write.write_pages", lambda *_: None)
@@ -64,7 +64,7 @@ def finished_run(tiny_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 @pytest.fixture
 def plain_logging() -> Iterator[None]:
-    """The commands set the library's logger up; leave it as other tests expect it."""
+    """Reset the library's logger, which the commands configure."""
     yield
     logger = logging.getLogger("hybridlio")
     logger.handlers.clear()

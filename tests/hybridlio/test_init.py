@@ -19,18 +19,22 @@ def names_seen_by_type_checkers() -> dict[str, str]:
     return {alias.name: str(node.module) for node in imports for alias in node.names}
 
 
-def test_type_checkers_see_the_names_that_load_at_run_time_from_the_same_modules():
+def test_type_checkers_see_every_lazily_loaded_name_in_its_module():
     assert names_seen_by_type_checkers() == hybridlio._HOME_OF
     assert set(hybridlio.__all__) == {*hybridlio._HOME_OF, "__version__"}
 
 
+def test_the_docstring_names_everything_public():
+    assert [name for name in hybridlio.__all__ if name != "__version__" and name not in (hybridlio.__doc__ or "")] == []
+
+
 @pytest.mark.parametrize("name", sorted(hybridlio.__all__))
-def test_every_public_name_is_its_modules_own(name):
+def test_every_public_name_is_that_of_its_module(name):
     home = importlib.import_module(hybridlio._HOME_OF.get(name, "hybridlio"))
     assert getattr(hybridlio, name) is getattr(home, name)
     assert name in dir(hybridlio)
 
 
-def test_a_name_that_is_not_there_is_an_attribute_error_that_names_it():
+def test_an_unknown_name_raises_an_attribute_error_that_names_it():
     with pytest.raises(AttributeError, match="open_squence"):
         _ = hybridlio.open_squence

@@ -22,12 +22,12 @@ STEP = se3.exp(np.array([0.01, -0.02, 0.1, 1.0, 0.2, -0.1]))
     ],
     ids=["shape", "infinite", "singular", "negative", "asymmetric"],
 )
-def test_what_is_no_covariance_is_refused_by_name(covariance: np.ndarray, what: str):
+def test_an_invalid_covariance_is_refused_by_name(covariance: np.ndarray, what: str):
     with pytest.raises(DataError, match=f"wheel odometry: .*{what}"):
         check_covariance(covariance, "wheel odometry")
 
 
-def test_rounding_is_evened_out(rng: np.random.Generator):
+def test_asymmetry_from_rounding_is_averaged_out(rng: np.random.Generator):
     root = rng.normal(size=(6, 6)) * np.r_[np.full(3, 1e-4), np.full(3, 1e-2)][:, None]
     covariance = root @ root.T
     rounded = covariance * (1 + 1e-9 * rng.normal(size=(6, 6)))
@@ -41,7 +41,7 @@ def test_small_variances_beside_large_ones_are_kept():
     np.testing.assert_array_equal(check_covariance(covariance, "step"), covariance)
 
 
-def test_a_relative_pose_is_checked_where_it_enters_and_names_its_source():
+def test_a_relative_pose_is_checked_when_made_and_its_source_named():
     good = np.eye(6) * 1e-4
     with pytest.raises(DataError, match=r"my-source: relative pose.*not a rigid transform"):
         RelativePose(np.diag([2.0, 1.0, 1.0, 1.0]), good, "my-source")
@@ -51,20 +51,20 @@ def test_a_relative_pose_is_checked_where_it_enters_and_names_its_source():
         RelativePose(STEP, -good, "my-source")
 
 
-def test_rounded_rotations_are_made_rotations_again():
+def test_rounded_rotations_are_orthonormalised():
     rounded = np.round(STEP, 5)
     rounded[3] = [0, 0, 0, 1]
     R = RelativePose(rounded, np.eye(6), "file").pose[:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
 
 
-def test_a_relative_pose_does_not_change():
+def test_a_relative_pose_is_immutable():
     step = RelativePose(STEP, np.eye(6), "test")
     with pytest.raises(FrozenInstanceError):
         step.ok = False  # type: ignore[misc]
 
 
-def test_drift_is_a_part_of_the_covariance():
+def test_drift_must_not_exceed_the_covariance():
     covariance = np.diag([1e-6, 1e-6, 1e-6, 1e-4, 1e-4, 1e-4])
     step = RelativePose(STEP, covariance, "map", drift=0.02 * covariance)
     np.testing.assert_array_equal(step.drift, 0.02 * covariance)
@@ -74,11 +74,11 @@ def test_drift_is_a_part_of_the_covariance():
         RelativePose(STEP, covariance, "map", drift=0 * covariance)
 
 
-def test_a_failed_steps_drift_is_that_of_the_path_not_of_the_pose_that_bridges():
-    """A good IMU bridges more precisely than a map is known."""
+def test_the_drift_of_a_failed_step_may_exceed_the_covariance_of_its_bridge():
+    """A good IMU bridges a step more precisely than the map is known."""
     precise, path = np.eye(6) * 1e-12, np.eye(6) * 1e-6
     assert not RelativePose(STEP, precise, "imu", ok=False, drift=path).ok
 
 
-def test_without_directions_nothing_is_degenerate():
+def test_a_relative_pose_has_no_degenerate_directions_by_default():
     assert RelativePose(STEP, np.eye(6), "test").degenerate.shape == (0, 6)

@@ -8,7 +8,7 @@ from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.files import atomic_path, read_yaml, write_atomically
 
 
-def test_text_and_bytes_are_written_as_given_and_folders_are_made(tmp_path: Path) -> None:
+def test_text_and_bytes_are_written_unchanged_and_folders_made(tmp_path: Path) -> None:
     write_atomically(tmp_path / "a" / "b" / "text.txt", "σ\r\n1\n")
     write_atomically(tmp_path / "raw.bin", b"\x00\xff")
     assert (tmp_path / "a" / "b" / "text.txt").read_bytes() == "σ\r\n1\n".encode()
@@ -23,7 +23,7 @@ def test_nothing_but_the_file_is_left_in_the_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
-def test_a_failed_or_interrupted_write_keeps_the_old_file_and_leaves_no_rest(
+def test_a_failed_or_interrupted_write_keeps_the_old_file_and_nothing_else(
     tmp_path: Path, error: type[BaseException]
 ) -> None:
     path = tmp_path / "a.txt"
@@ -48,13 +48,13 @@ def test_the_temporary_name_keeps_folder_and_suffix_so_that_savez_writes_where_a
     assert np.load(tmp_path / "a.npz")["x"].tolist() == [0, 1, 2]
 
 
-def test_the_file_has_the_rights_that_a_plain_write_gives(tmp_path: Path) -> None:
+def test_the_file_has_the_permissions_of_a_plain_write(tmp_path: Path) -> None:
     (tmp_path / "plain").write_text("")
     write_atomically(tmp_path / "whole", "")
     assert stat.S_IMODE((tmp_path / "whole").stat().st_mode) == stat.S_IMODE((tmp_path / "plain").stat().st_mode)
 
 
-def test_a_place_that_cannot_be_written_is_named_with_the_reason(tmp_path: Path) -> None:
+def test_a_path_that_cannot_be_written_is_named_with_the_reason(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match=r"file/a\.txt.*(Not a directory|exists)"):
         write_atomically(tmp_path / "file" / "a.txt", "1")
@@ -63,7 +63,7 @@ def test_a_place_that_cannot_be_written_is_named_with_the_reason(tmp_path: Path)
         write_atomically(tmp_path / "folder", "1")
 
 
-def test_trouble_with_another_file_inside_the_block_keeps_its_own_error(tmp_path: Path) -> None:
+def test_an_error_about_another_file_passes_unchanged(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="elsewhere"), atomic_path(tmp_path / "a.txt"):
         (tmp_path / "elsewhere").read_text()
 
@@ -76,7 +76,7 @@ def test_trouble_with_another_file_inside_the_block_keeps_its_own_error(tmp_path
         (None, r"my\.yaml: cannot be read \(No such file"),
     ],
 )
-def test_what_is_not_yaml_is_named_in_one_line(tmp_path: Path, content: bytes | None, words: str) -> None:
+def test_invalid_yaml_is_named_in_one_line(tmp_path: Path, content: bytes | None, words: str) -> None:
     if content is not None:
         (tmp_path / "my.yaml").write_bytes(content)
     for error in (DataError, ConfigError):

@@ -17,7 +17,7 @@ from hybridlio.record.loop_keyframes import LoopKeyframeSettings, compress
     ],
     ids=lambda array: f"{array.dtype.kind}{array.shape}",
 )
-def test_an_array_comes_back_as_it_was(array: np.ndarray):
+def test_an_array_is_restored_bit_for_bit(array: np.ndarray):
     back = unpack_arrays(pack_arrays({"a": array}))["a"]
     assert back.dtype == array.dtype
     np.testing.assert_array_equal(back, array)
@@ -32,7 +32,7 @@ def test_covariances_take_less_memory(rng: np.random.Generator):
 
 @pytest.mark.parametrize("step", [1, 140, 256])
 @pytest.mark.parametrize("count", [0, 1, 500])
-def test_a_cloud_comes_back_as_it_was_to_the_farthest_that_it_can_hold(rng: np.random.Generator, step: int, count: int):
+def test_a_cloud_is_restored_bit_for_bit_over_the_full_range(rng: np.random.Generator, step: int, count: int):
     cloud = rng.integers(-32768, 32768, (count, 3)).astype(np.int16)
     for row in range(min(count, 2)):
         cloud[row] = ([-32768, 32767, 0], [32767, -32768, -1])[row]

@@ -1,4 +1,4 @@
-"""SE(3) as a group: laws rather than examples, near the identity and near half a turn, with GTSAM as an oracle."""
+"""Group laws of SE(3), including near the identity and near half a turn, and agreement with GTSAM."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COUNT = 20
 
 
 def tangents(angle: float, seed: int = 0) -> Array:
-    """Twists whose rotation has this angle, with translations of a few metres."""
+    """Return twists with this rotation angle and translations of a few metres."""
     rng = np.random.default_rng([seed, int(angle * 1e15) % 2**31])
     axes = rng.normal(size=(COUNT, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
@@ -33,7 +33,7 @@ def poses(angle: float, seed: int = 0) -> Array:
 
 
 def as_turned(xi: Array, like: Array) -> Array:
-    """The twists, but about the opposite axis where ``like`` turns so: at half a turn both lead to the same pose."""
+    """Return the twists with axes flipped to those of ``like``; at half a turn both give the same pose."""
     other_t = se3.so3_left_jacobian(xi[:, :3]) @ xi[:, 3:, None]
     other = np.hstack([-xi[:, :3], np.linalg.solve(se3.so3_left_jacobian(-xi[:, :3]), other_t)[..., 0]])
     opposed = (xi[:, :3] * like[:, :3]).sum(axis=1) < 0
@@ -52,16 +52,16 @@ class TestLaws:
         close(R @ np.swapaxes(R, 1, 2), np.broadcast_to(np.eye(3), R.shape), atol=1e-14)
         close(np.linalg.det(R), 1.0, atol=1e-14)
 
-    def test_log_undoes_exp(self, angle: float) -> None:
+    def test_log_is_the_inverse_of_exp(self, angle: float) -> None:
         xi, back = tangents(angle), se3.log(poses(angle))
         close(back, as_turned(xi, back) if angle == np.pi else xi, atol=1e-12)
         assert np.linalg.norm(back[:, :3], axis=1).max() <= np.pi + 1e-14
 
-    def test_exp_undoes_log_even_at_half_a_turn(self, angle: float) -> None:
+    def test_exp_is_the_inverse_of_log_even_at_half_a_turn(self, angle: float) -> None:
         T = poses(angle)
         close(se3.exp(se3.log(T)), T, atol=1e-12)
 
-    def test_products_may_be_bracketed_either_way_and_the_identity_changes_nothing(self, angle: float) -> None:
+    def test_products_are_associative_with_the_identity_as_neutral_element(self, angle: float) -> None:
         A = poses(angle)
         for other in ANGLES:
             B, C = poses(other, seed=1), poses(angle, seed=2)
@@ -70,7 +70,7 @@ class TestLaws:
         close(A @ se3.exp(np.zeros(6)), A, atol=0)
         close(se3.exp(np.zeros(6)) @ A, A, atol=0)
 
-    def test_inverse_is_inverse_on_both_sides_and_is_the_exponential_of_the_negative(self, angle: float) -> None:
+    def test_the_inverse_is_two_sided_and_the_exponential_of_the_negative_twist(self, angle: float) -> None:
         T = poses(angle)
         identity = np.broadcast_to(np.eye(4), T.shape)
         close(T @ se3.inverse(T), identity, atol=1e-13)
@@ -81,7 +81,7 @@ class TestLaws:
         A, B = poses(angle), poses(1.3, seed=1)
         close(se3.inverse(A @ B), se3.inverse(B) @ se3.inverse(A), atol=1e-12)
 
-    def test_turns_about_one_axis_add_up(self, angle: float) -> None:
+    def test_rotations_about_one_axis_add_up(self, angle: float) -> None:
         xi = tangents(angle)
         close(se3.exp(0.3 * xi) @ se3.exp(0.7 * xi), se3.exp(xi), atol=1e-12)
 
@@ -120,7 +120,7 @@ class TestLaws:
         third, half = (se3.interpolate(A, B, np.full(COUNT, f)) for f in (1 / 3, 2 / 3))
         close(se3.between(A, third), se3.between(third, half), atol=1e-9)
 
-    def test_it_agrees_with_gtsam(self, angle: float) -> None:
+    def test_exp_log_and_adjoint_agree_with_gtsam(self, angle: float) -> None:
         gtsam = pytest.importorskip("gtsam")
         tolerance = 1e-6  # GTSAM's logarithm loses digits at half a turn; ours gives the twist back to 1e-12 there
         logs = se3.log(poses(angle))
@@ -139,14 +139,14 @@ def test_hat_is_the_cross_product(rng: np.random.Generator) -> None:
 
 
 def test_a_screw_motion_follows_its_closed_form() -> None:
-    # a quarter turn to the left along a circle of radius 2 with a climb of 3
+    # a quarter turn left on a circle of radius 2 m, climbing 3 m
     xi = np.array([0, 0, np.pi / 2, np.pi, 0, 3])
     expected = [[0, -1, 0, 2], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
     close(se3.exp(xi), expected, atol=1e-14)
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (2, 3), (0,)])
-def test_every_function_takes_batches_and_answers_as_it_does_one_by_one(shape: tuple[int, ...]) -> None:
+def test_every_function_gives_the_same_for_batches_and_single_inputs(shape: tuple[int, ...]) -> None:
     rng = np.random.default_rng(1)
     xi, eta = rng.normal(size=(2, *shape, 6))
     T, U = se3.exp(xi), se3.exp(eta)
@@ -204,7 +204,7 @@ def test_covariance_of_a_product_agrees_with_monte_carlo(rng: np.random.Generato
     close(seen / scale, expected / scale, atol=5 * np.sqrt(2 / n))
 
 
-def test_covariance_seen_from_another_frame_agrees_with_monte_carlo(rng: np.random.Generator) -> None:
+def test_covariance_in_another_frame_agrees_with_monte_carlo(rng: np.random.Generator) -> None:
     T_a_b, X = se3.exp([0.5, 0.2, -1.0, 1.0, -0.5, 2.0]), se3.exp([0.1, 0.0, 0.2, 1.0, 0.0, 0.0])
     cov, n = random_covariance(rng, 1e-6), 100_000
     draws = X @ se3.exp(rng.multivariate_normal(np.zeros(6), cov, size=n))
@@ -214,7 +214,7 @@ def test_covariance_seen_from_another_frame_agrees_with_monte_carlo(rng: np.rand
     close(seen / scale, expected / scale, atol=5 * np.sqrt(2 / n))
 
 
-def test_check_pose_takes_rounded_poses_and_makes_them_exact() -> None:
+def test_check_pose_makes_rounded_poses_exact() -> None:
     rounded = np.round(se3.exp([0.3, 0.2, 0.1, 1, 2, 3]), 5)
     R = se3.check_pose(rounded, "T")[:3, :3]
     close(R @ R.T, np.eye(3), atol=1e-14)
@@ -232,6 +232,6 @@ def test_check_pose_takes_rounded_poses_and_makes_them_exact() -> None:
     ],
     ids=["shape", "not finite", "reflection", "scaled", "singular", "last row"],
 )
-def test_check_pose_refuses_what_is_not_rigid_and_names_it(wrong: Array) -> None:
+def test_check_pose_refuses_and_names_poses_that_are_not_rigid(wrong: Array) -> None:
     with pytest.raises(DataError, match="T_imu_lidar"):
         se3.check_pose(wrong, "T_imu_lidar")

@@ -1,4 +1,4 @@
-"""What sensors deliver: laws of slicing time, and checks where values enter."""
+"""Sensor data: properties of time slices, and checks of values on construction."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hybridlio.core import se3
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import LIDAR_MODELS, Calibration, GpsFix, ImuSamples, Scan
 
-START_NS = 1_317_042_272_335_337_762  # nanoseconds since 1970 do not fit a float64
+START_NS = 1_317_042_272_335_337_762  # nanoseconds since 1970 exceed the precision of a float64
 MS = 1_000_000
 
 
@@ -24,7 +24,7 @@ def recording(count: int = 200, seed: int = 0) -> ImuSamples:
 
 
 def between_by_definition(imu: ImuSamples, start: int, end: int) -> tuple[list[int], np.ndarray]:
-    """The samples strictly inside and the interpolated ends, found by looking at every sample, in exact integers."""
+    """Return the samples inside and the interpolated ends by a linear search in exact integers."""
     stamps = imu.stamps_ns.tolist()
     wanted = {t for t in stamps if start < t < end} | {t for t in (start, end) if stamps[0] <= t <= stamps[-1]}
     values = []
@@ -37,7 +37,7 @@ def between_by_definition(imu: ImuSamples, start: int, end: int) -> tuple[list[i
 
 
 class TestImuSamplesBetween:
-    def test_it_is_what_its_definition_says_wherever_the_ends_lie(self, rng: np.random.Generator) -> None:
+    def test_a_slice_equals_its_definition_for_any_ends(self, rng: np.random.Generator) -> None:
         imu = recording(40)
         edges = np.concatenate([imu.stamps_ns[[0, 1, 7, 38, 39]], START_NS + rng.integers(-30 * MS, 430 * MS, 15)])
         for start in edges.tolist():
@@ -47,7 +47,7 @@ class TestImuSamplesBetween:
                 assert got.stamps_ns.tolist() == stamps
                 np.testing.assert_allclose(np.hstack([got.gyro_rad_s, got.accel_m_s2]), values, atol=1e-9)
 
-    def test_neighbouring_slices_share_their_end_and_together_are_the_whole(self) -> None:
+    def test_neighbouring_slices_share_their_end_and_cover_all_samples(self) -> None:
         imu = recording()
         cuts = START_NS + np.array([50, 153, 153 + 7, 900, 1500]) * MS
         parts = [imu.between(int(a), int(b)) for a, b in pairwise(cuts)]
@@ -58,7 +58,7 @@ class TestImuSamplesBetween:
         whole = imu.stamps_ns[(imu.stamps_ns > cuts[0]) & (imu.stamps_ns < cuts[-1])]
         assert inside == set(whole.tolist()) - set(cuts.tolist())
 
-    def test_it_keeps_the_integral_of_a_signal_that_is_linear_between_samples(self) -> None:
+    def test_slices_keep_the_integral_of_a_piecewise_linear_signal(self) -> None:
         imu = recording()
         a, b, c = (START_NS + ms * MS for ms in (101, 555, 1203))
 
@@ -68,7 +68,7 @@ class TestImuSamplesBetween:
         parts = integral(imu.between(a, b)) + integral(imu.between(b, c))
         np.testing.assert_allclose(parts, integral(imu.between(a, c)), atol=1e-12)
 
-    def test_it_does_not_extrapolate(self) -> None:
+    def test_slices_do_not_extrapolate(self) -> None:
         imu = recording()
         first, last = int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])
         assert imu.between(first - 10**9, first + 50 * MS).stamps_ns[0] == first
@@ -76,7 +76,7 @@ class TestImuSamplesBetween:
         assert len(imu.between(first - 10**9, first - 1)) == 0
         assert len(imu.between(last + 1, last + 10**9)) == 0
 
-    def test_nothing_comes_of_no_samples_or_an_end_before_the_start(self) -> None:
+    def test_a_slice_is_empty_without_samples_or_if_it_ends_before_its_start(self) -> None:
         assert len(ImuSamples.empty().between(0, 10)) == 0
         assert len(recording().between(START_NS + 500 * MS, START_NS + 400 * MS)) == 0
 
@@ -98,7 +98,7 @@ def test_bad_imu_samples_are_refused_with_the_row(stamps: list[int], gyro: objec
 
 
 @pytest.mark.parametrize("broken", [np.inf, 1e30, -1e4])
-def test_a_scan_drops_points_that_nothing_can_have_measured_with_their_intensity_and_time(broken: float) -> None:
+def test_a_scan_drops_invalid_points_with_their_intensity_and_time(broken: float) -> None:
     points = np.arange(12.0).reshape(4, 3)
     points[1, 2], points[3, 0] = np.nan, broken
     scan = Scan(7, points, intensity=np.arange(4.0), time_offsets_ns=np.arange(4) * 100)
@@ -125,7 +125,7 @@ def test_scans_of_wrong_shapes_are_refused_with_their_stamp(wrong: dict[str, np.
         Scan(123, **wrong)  # type: ignore[arg-type]
 
 
-def test_calibration_takes_rounded_extrinsics_and_refuses_what_is_not_rigid() -> None:
+def test_calibration_accepts_rounded_extrinsics_and_refuses_others() -> None:
     T = se3.exp([0.01, -0.02, 1.5, 0.8, -0.3, 0.8])
     calibration = Calibration(np.round(T, 6), np.round(se3.inverse(T), 6))
     np.testing.assert_allclose(calibration.T_imu_lidar, T, atol=1e-5)
@@ -146,7 +146,7 @@ def test_calibration_takes_rounded_extrinsics_and_refuses_what_is_not_rigid() ->
         ([0.0, 0.0, 0.0], np.full((3, 3), np.inf), "covariance"),
     ],
 )
-def test_a_fix_that_says_nothing_of_a_place_is_refused_with_its_stamp(position, covariance, says) -> None:
+def test_an_invalid_fix_is_refused_with_its_stamp(position, covariance, says) -> None:
     with pytest.raises(DataError, match=f"GPS fix at 7 ns.*{says}"):
         GpsFix(7, np.array(position), covariance)
 
@@ -167,6 +167,6 @@ def test_beams_of_each_lidar_go_from_the_top_down(name: str) -> None:
         (1, [0.0, 0.05], "integer nanoseconds"),
     ],
 )
-def test_times_in_seconds_are_refused_where_nanoseconds_are_meant(stamp, offsets, says) -> None:
+def test_times_in_seconds_are_refused(stamp, offsets, says) -> None:
     with pytest.raises(DataError, match=says):
         Scan(stamp, np.zeros((2, 3), np.float32), time_offsets_ns=None if offsets is None else np.array(offsets))

@@ -16,13 +16,13 @@ def samples(force: np.ndarray, seconds: float = 0.2) -> ImuSamples:
 
 
 def tilted(roll_deg: float, pitch_deg: float) -> np.ndarray:
-    """Gravity as an IMU so mounted has it."""
+    """Return gravity in the frame of an IMU with this rotation."""
     R = Rotation.from_euler("xyz", [roll_deg, pitch_deg, 0.0], degrees=True)
     return R.inv().apply([0.0, 0.0, -GRAVITY_M_S2])
 
 
 @pytest.mark.parametrize("angles", [(0, 0), (5, -3), (90, 0), (180, 0), (-30, 60)])
-def test_at_rest_gravity_points_where_the_force_does_not(angles: tuple[float, float]):
+def test_at_rest_gravity_is_opposite_to_the_specific_force(angles: tuple[float, float]):
     gravity = tilted(*angles)
     state = start_state(0, samples(-gravity), NOISE)
     np.testing.assert_allclose(state.gravity_m_s2, gravity, atol=1e-12)
@@ -34,7 +34,7 @@ def test_at_rest_gravity_points_where_the_force_does_not(angles: tuple[float, fl
     [(2.0, 0.0, 0.0), (-3.0, 0.0, 0.0), (0.0, 3.0, 0.0), (1.5, -2.0, 0.5)],
     ids=["off", "braking", "bend", "all"],
 )
-def test_under_acceleration_gravity_is_off_by_no_more_than_is_claimed(acceleration: tuple[float, float, float]):
+def test_under_acceleration_gravitys_error_is_within_its_covariance(acceleration: tuple[float, float, float]):
     gravity = tilted(2.0, -1.0)
     state = start_state(0, samples(np.array(acceleration) - gravity), NOISE)
     off = state.gravity_m_s2 - gravity
@@ -42,7 +42,7 @@ def test_under_acceleration_gravity_is_off_by_no_more_than_is_claimed(accelerati
     assert np.sqrt(off @ np.linalg.solve(state.gravity_covariance, off)) < 3
 
 
-def test_its_magnitude_is_gravitys_whatever_the_force():
+def test_gravity_has_its_magnitude_whatever_the_specific_force():
     state = start_state(0, samples(np.array([6.0, 0.0, 9.81])), NOISE)
     assert np.linalg.norm(state.gravity_m_s2) == pytest.approx(GRAVITY_M_S2)
 
@@ -54,12 +54,12 @@ def test_noisy_samples_are_averaged(rng: np.random.Generator):
     assert np.linalg.norm(state.gravity_m_s2 - gravity) < 0.2
 
 
-def test_speed_is_unknown_and_biases_are_as_unsure_as_the_sensor_is():
+def test_speed_is_unknown_and_biases_have_the_sensors_uncertainty():
     noise = ImuNoise(gyro_bias_sigma_rad_s=0.03, accel_bias_sigma_m_s2=0.4)
     state = start_state(7, samples(np.array([0.0, 0.0, 9.81])), noise)
     sigmas = np.sqrt(np.diag(state.covariance))
     assert (sigmas[:6] < 1e-5).all()
-    assert (sigmas[6:9] >= 15).all()  # a motorway's 40 m/s is within three
+    assert (sigmas[6:9] >= 15).all()  # 40 m/s, on a motorway, is within 3 σ
     np.testing.assert_allclose(sigmas[9:], np.r_[np.full(3, 0.4), np.full(3, 0.03)])
     for zero in (state.velocity_m_s, state.accel_bias_m_s2, state.gyro_bias_rad_s):
         np.testing.assert_array_equal(zero, 0.0)
@@ -67,7 +67,7 @@ def test_speed_is_unknown_and_biases_are_as_unsure_as_the_sensor_is():
     assert state.stamp_ns == 7
 
 
-def test_without_samples_the_state_says_that_it_has_no_imu():
+def test_without_samples_the_state_has_no_imu():
     state = start_state(0, ImuSamples.empty(), NOISE)
     assert not state.has_imu
     assert np.isfinite(state.gravity_m_s2).all()
@@ -80,6 +80,6 @@ def test_the_covariances_are_positive_definite():
         np.linalg.cholesky(state.gravity_covariance)
 
 
-def test_an_imu_without_an_accelerometer_is_refused_rather_than_divided_by():
+def test_an_imu_without_an_accelerometer_is_refused():
     with pytest.raises(DataError, match="averages to 0 m/s²"):
         start_state(0, samples(np.zeros(3)), NOISE)

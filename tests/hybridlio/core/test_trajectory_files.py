@@ -30,7 +30,16 @@ def trajectory() -> Trajectory:
     return Trajectory(stamps, poses)
 
 
-def test_tum_files_give_stamps_back_exactly_and_poses_to_a_nanometre(tmp_path: Path, trajectory: Trajectory) -> None:
+def test_a_trajectorys_repr_is_one_line() -> None:
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = [0.0, 1.0, 3.0]
+    stamps = np.arange(3) * 100_000_000
+    assert repr(Trajectory(stamps, poses)) == "Trajectory(3 poses, 0.2 s, 3.0 m)"
+    assert repr(Trajectory(stamps, poses, np.tile(np.eye(6), (3, 1, 1)))).endswith("3.0 m, with covariances)")
+    assert repr(Trajectory(stamps[:0], poses[:0])) == "Trajectory(0 poses)"
+
+
+def test_tum_files_keep_stamps_exactly_and_poses_to_a_nanometre(tmp_path: Path, trajectory: Trajectory) -> None:
     write_tum(tmp_path / "t.txt", trajectory)
     back = read_tum(tmp_path / "t.txt")
     assert (back.stamps_ns == trajectory.stamps_ns).all()
@@ -38,15 +47,13 @@ def test_tum_files_give_stamps_back_exactly_and_poses_to_a_nanometre(tmp_path: P
 
 
 @given(st.integers(-(2**62), 2**62))
-def test_a_stamp_survives_its_text_whatever_its_size(stamp_ns: int) -> None:
+def test_a_stamp_of_any_size_survives_formatting(stamp_ns: int) -> None:
     seconds, decimals = _format_stamp(stamp_ns).split(".")
     assert len(decimals) == 9
     assert int(seconds + decimals) == stamp_ns
 
 
-def test_kitti_files_give_poses_back_in_the_lidar_and_in_the_camera_frame(
-    tmp_path: Path, trajectory: Trajectory
-) -> None:
+def test_kitti_files_keep_poses_in_the_lidar_and_in_the_camera_frame(tmp_path: Path, trajectory: Trajectory) -> None:
     for T in (None, T_CAMERA_LIDAR):
         write_kitti(tmp_path / "t.txt", trajectory, T)
         back = read_kitti(tmp_path / "t.txt", trajectory.stamps_ns, T)
@@ -75,14 +82,14 @@ def test_evo_opens_our_files_and_reads_the_same_numbers(tmp_path: Path, trajecto
     np.testing.assert_allclose(tum.timestamps, trajectory.stamps_ns / 1e9, rtol=1e-15)
 
 
-def test_what_evo_writes_is_read(tmp_path: Path, trajectory: Trajectory) -> None:
+def test_files_written_by_evo_are_read(tmp_path: Path, trajectory: Trajectory) -> None:
     write_tum(tmp_path / "tum.txt", trajectory)
     theirs = file_interface.read_tum_trajectory_file(str(tmp_path / "tum.txt"))
     file_interface.write_tum_trajectory_file(str(tmp_path / "evo.txt"), theirs)
     np.testing.assert_allclose(read_trajectory(tmp_path / "evo.txt").poses, trajectory.poses, atol=1e-6)
 
 
-def test_the_format_is_told_from_the_columns(tmp_path: Path, trajectory: Trajectory) -> None:
+def test_the_format_is_recognised_by_its_columns(tmp_path: Path, trajectory: Trajectory) -> None:
     write_tum(tmp_path / "tum.txt", trajectory)
     write_kitti(tmp_path / "kitti.txt", trajectory)
     assert (read_trajectory(tmp_path / "tum.txt").stamps_ns == trajectory.stamps_ns).all()
@@ -90,7 +97,7 @@ def test_the_format_is_told_from_the_columns(tmp_path: Path, trajectory: Traject
 
 
 @pytest.mark.parametrize("stamped", ["reference", "estimate"])
-def test_of_two_files_the_one_without_stamps_borrows_them(tmp_path: Path, trajectory: Trajectory, stamped: str) -> None:
+def test_a_file_without_stamps_gets_those_of_the_other(tmp_path: Path, trajectory: Trajectory, stamped: str) -> None:
     for name in ("reference", "estimate"):
         (write_tum if name == stamped else write_kitti)(tmp_path / name, trajectory)
     reference, estimate = read_pair(tmp_path / "reference", tmp_path / "estimate")
@@ -126,7 +133,7 @@ def test_a_malformed_file_is_named_with_the_row_and_the_reason(tmp_path: Path, t
         read_trajectory(path)
 
 
-def test_missing_and_binary_files_and_missing_stamps_are_named(tmp_path: Path) -> None:
+def test_missing_files_binary_files_and_missing_stamps_are_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"none\.txt: cannot be read"):
         read_trajectory(tmp_path / "none.txt")
     (tmp_path / "scan.bin").write_bytes(b"\xff\xfe\x00\x80")
@@ -137,7 +144,7 @@ def test_missing_and_binary_files_and_missing_stamps_are_named(tmp_path: Path) -
         read_trajectory(tmp_path / "kitti.txt", np.array([0, 1]))
 
 
-def test_a_file_of_four_decimals_still_counts_as_rotations(tmp_path: Path, trajectory: Trajectory) -> None:
+def test_rotations_rounded_to_four_decimals_are_accepted(tmp_path: Path, trajectory: Trajectory) -> None:
     (tmp_path / "short.txt").write_text(
         "\n".join(" ".join(f"{v:.4f}" for v in row) for row in trajectory.poses[:, :3].reshape(-1, 12))
     )

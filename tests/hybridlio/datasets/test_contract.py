@@ -158,3 +158,9 @@ def test_a_truncated_scan_raises_on_access_and_the_others_still_load(
     with pytest.raises(DataError, match=rf"frame {frame}: .*{scan.name}"):
         sequence[frame]
     assert len(sequence[0].scan) > 0
+
+
+def test_a_sequences_repr_is_one_line(tiny_drive: Path):
+    assert repr(open_sequence(tiny_drive)).endswith(
+        ", 25 scans in 2.4 s, 281 IMU samples, 0 GPS fixes, with reference)"
+    )

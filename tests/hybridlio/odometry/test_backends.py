@@ -1,4 +1,4 @@
-"""Backends. Every implementation is held to the same contract: a new one is tested by being listed."""
+"""Backends. Every registered implementation is tested against the same contract."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_a_backend_follows_true_steps(
 
 
 @pytest.mark.parametrize("name", BACKEND)
-def test_a_backend_leaves_its_input_as_it_was(name: str, setup: Setup, sequence: Sequence, first_frames: list[Frame]):
+def test_a_backend_does_not_modify_its_input(name: str, setup: Setup, sequence: Sequence, first_frames: list[Frame]):
     backend, start, step = BACKENDS[name](setup), start_of(first_frames), true_step(sequence, 0, 1)
     before = [bytes_of(x) for x in (start, first_frames[1], step)]
     backend.start(start)

@@ -21,7 +21,7 @@ from hybridlio.sources.scan_matching_settings import ScanMatchingSettings
 
 
 def leaves(settings: Any, above: str = "") -> Iterator[tuple[str, float]]:
-    """Every number in a tree of dataclasses, with its path."""
+    """Yield every number in a tree of dataclasses with its path."""
     for f in fields(settings):
         value = getattr(settings, f.name)
         if is_dataclass(value):
@@ -60,14 +60,14 @@ def test_changed_settings_round_trip_through_yaml(tmp_path: Path):
     assert again != Config()
 
 
-def test_the_yaml_names_every_setting_in_plain_values():
+def test_the_yaml_holds_every_setting_as_a_plain_value():
     tree = yaml.safe_load(config_to_yaml(Config()))
     assert set(tree) == set(Config.model_fields)
     assert tree["scan_matching"]["registration"]["max_iterations"] == Config().scan_matching.registration.max_iterations
     assert tree["scan_matching"]["local_map"]["voxel_m"] > 0
 
 
-def test_what_a_file_leaves_out_keeps_its_default(tmp_path: Path):
+def test_settings_missing_in_a_file_keep_their_defaults(tmp_path: Path):
     (tmp_path / "part.yaml").write_text("scan_matching:\n  registration:\n    kernel_m: 0.3\n")
     config = load_config(tmp_path / "part.yaml")
     assert config.scan_matching.registration.kernel_m == 0.3
@@ -75,7 +75,7 @@ def test_what_a_file_leaves_out_keeps_its_default(tmp_path: Path):
     assert config.initial_pose == Config().initial_pose
 
 
-def test_an_empty_file_is_the_defaults(tmp_path: Path):
+def test_an_empty_file_gives_the_defaults(tmp_path: Path):
     for text in ("", "# nothing\n", "{}\n"):
         (tmp_path / "empty.yaml").write_text(text)
         assert load_config(tmp_path / "empty.yaml") == Config()
@@ -94,7 +94,7 @@ def test_an_empty_file_is_the_defaults(tmp_path: Path):
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_an_unknown_key_at_any_level_is_an_error_that_gives_its_path(tmp_path: Path, tree: dict, path: str):
+def test_an_unknown_key_is_named_with_its_path(tmp_path: Path, tree: dict, path: str):
     (tmp_path / "my.yaml").write_text(yaml.safe_dump(tree))
     with pytest.raises(ConfigError) as error:
         load_config(tmp_path / "my.yaml")
@@ -115,18 +115,18 @@ def test_an_unknown_key_at_any_level_is_an_error_that_gives_its_path(tmp_path: P
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_a_value_of_the_wrong_kind_is_an_error_that_gives_its_path(tree: dict, path: str):
+def test_a_value_of_the_wrong_type_is_named_with_its_path(tree: dict, path: str):
     with pytest.raises(ConfigError, match=rf"here: {path}"):
         parse_config(tree, "here")
 
 
-def test_two_mistakes_are_both_named():
+def test_every_mistake_is_named():
     with pytest.raises(ConfigError, match=r"one: .*two: "):
         parse_config({"one": 1, "two": 2}, "here")
 
 
 @pytest.mark.parametrize("tree", [["a", "list"], "a word", 7])
-def test_a_file_that_is_no_tree_of_settings_is_refused(tree: object):
+def test_a_file_without_named_settings_is_refused(tree: object):
     with pytest.raises(ConfigError, match="here: "):
         parse_config(tree, "here")
 
@@ -137,7 +137,7 @@ def test_a_file_that_is_not_yaml_is_named(tmp_path: Path):
         load_config(tmp_path / "broken.yaml")
 
 
-def test_a_file_of_bytes_is_named(tmp_path: Path):
+def test_a_binary_file_is_named(tmp_path: Path):
     (tmp_path / "bytes.yaml").write_bytes(b"\xff\xfe\x00binary")
     with pytest.raises(ConfigError, match=r"bytes\.yaml"):
         load_config(tmp_path / "bytes.yaml")
@@ -148,7 +148,7 @@ def test_a_missing_file_is_named(tmp_path: Path):
         load_config(tmp_path / "nowhere.yaml")
 
 
-def test_settings_do_not_change_once_made():
+def test_settings_are_immutable():
     with pytest.raises((ValueError, AttributeError)):
         Config().backend = "none"  # type: ignore[misc]
 
@@ -161,8 +161,8 @@ def test_settings_do_not_change_once_made():
         ({"scan_matching": {"kernel_m": 1.0}}, "scan_matching.registration.kernel_m"),
     ],
 )
-def test_a_misspelt_or_misplaced_key_is_told_what_it_may_have_meant(tree: dict, meant: str):
-    with pytest.raises(ConfigError, match=rf"unknown key; did you mean {re.escape(meant)}\?"):
+def test_a_misspelt_or_misplaced_key_gets_a_suggestion(tree: dict, meant: str):
+    with pytest.raises(ConfigError, match=rf"unknown key \(did you mean {re.escape(meant)}\?\)"):
         parse_config(tree, "here")
 
 
@@ -173,7 +173,7 @@ SETTINGS = {
 
 @pytest.mark.parametrize("value", [-1, float("nan")])
 @pytest.mark.parametrize("path", [f"{above}.{path}" for above, tree in SETTINGS.items() for path, _ in leaves(tree)])
-def test_no_number_may_be_negative_or_none_and_its_path_is_given(path: str, value: float):
+def test_a_negative_or_missing_number_is_named_with_its_path(path: str, value: float):
     tree: dict | float = value
     for key in reversed(path.split(".")):
         tree = {key: tree}
@@ -201,7 +201,7 @@ def test_no_number_may_be_negative_or_none_and_its_path_is_given(path: str, valu
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_numbers_out_of_range_are_refused_and_all_of_them_named(changed: dict, wanted: str):
+def test_all_numbers_out_of_range_are_named(changed: dict, wanted: str):
     with pytest.raises(ConfigError, match=wanted):
         parse_config(changed, "here")
 
@@ -225,7 +225,7 @@ def test_numbers_out_of_range_are_refused_and_all_of_them_named(changed: dict, w
         ),
     ],
 )
-def test_settings_made_in_python_are_checked_alike(make: Callable[[], object], wanted: str):
+def test_settings_made_in_python_are_checked_too(make: Callable[[], object], wanted: str):
     with pytest.raises(ConfigError, match=re.escape(wanted)) as error:
         make()
-    assert str(pickle.loads(pickle.dumps(error.value))) == str(error.value)  # as from a batch's processes
+    assert str(pickle.loads(pickle.dumps(error.value))) == str(error.value)  # as between the processes of a batch

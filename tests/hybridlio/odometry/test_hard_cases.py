@@ -1,4 +1,4 @@
-"""What goes wrong in practice, on a short drive: each is gone through with bounded error, or said."""
+"""Faults that occur in practice, on a short drive: the error stays bounded, or the covariance reports it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def ran(sequence: Sequence, **names: str) -> Run:
 
 
 def farthest_off_m(run: Run) -> float:
-    """Across the ground: height is the 16 beams' own weakness."""
+    """Return the largest horizontal error; 16 beams observe height badly even without faults."""
     assert run.sequence.reference is not None
     errors = se3.log(se3.between(run.trajectory.poses, run.sequence.reference.poses))
     return float(np.linalg.norm(errors[:, 3:5], axis=1).max())
@@ -54,13 +54,13 @@ FAULTS: dict[str, Callable[[Sequence], Sequence]] = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_is_gone_through_with_hardly_more_error(fault: str, sequence: Sequence, normal_m: float):
+def test_a_fault_adds_little_error(fault: str, sequence: Sequence, normal_m: float):
     run = ran(FAULTS[fault](sequence))
     assert farthest_off_m(run) < 2 * normal_m + 0.03
     assert run.bridged == []
 
 
-def test_without_scans_and_samples_the_covariance_says_what_is_not_known(sequence: Sequence):
+def test_without_scans_and_samples_the_covariance_grows_with_the_error(sequence: Sequence):
     dark = block_sector(imu_gap(sequence, 1.0, 1.5), 1.0, 1.5, width_deg=360.0)
     run = ran(dark)
     assert run.bridged == [10, 11, 12, 13, 14]
@@ -78,8 +78,8 @@ def thinned(frame: Frame) -> ThinnedScan:
     return source.current_scan
 
 
-def test_between_smooth_walls_the_corners_along_the_ground_turn_no_scan(tmp_path: Path):
-    """They stay where they are in every scan: what roll they pretend adds up, and gravity with it to a wrong speed."""
+def test_corners_along_the_ground_between_smooth_walls_cause_no_roll(tmp_path: Path):
+    """Such corners look the same in every scan: roll from them would add up and, by gravity, falsify the speed."""
     corridor = open_scenario("corridor", tmp_path, seed=1, length_m=16.0)
     assert corridor.reference is not None
     steps = se3.between(corridor.reference.poses[:-1], corridor.reference.poses[1:])
@@ -90,10 +90,12 @@ def test_between_smooth_walls_the_corners_along_the_ground_turn_no_scan(tmp_path
     assert abs(np.mean(turns_rad)) < 5e-5
 
 
-# ----------------------------------------------------------------------------------- what an initial pose may cost
+# ----------------------------------------------------------------------------------- initial poses that know little
 
 
-def test_who_guesses_no_motion_costs_one_search_at_the_start(sequence: Sequence, monkeypatch: pytest.MonkeyPatch):
+def test_an_initial_pose_source_without_motion_costs_one_search_at_the_start(
+    sequence: Sequence, monkeypatch: pytest.MonkeyPatch
+):
     searches = []
 
     def counted(*given: Any) -> np.ndarray:
@@ -106,7 +108,7 @@ def test_who_guesses_no_motion_costs_one_search_at_the_start(sequence: Sequence,
     assert farthest_off_m(run) < 0.05
 
 
-def test_after_a_scan_that_failed_the_motion_is_searched_anew(sequence: Sequence, monkeypatch: pytest.MonkeyPatch):
+def test_the_motion_is_searched_again_after_a_rejected_scan(sequence: Sequence, monkeypatch: pytest.MonkeyPatch):
     searches = []
     monkeypatch.setattr(scan_matching, "best_start", lambda _, __, ___, starts, *____: searches.append(1) or starts[0])
     matching = ScanMatching()
@@ -123,8 +125,8 @@ def guess(pose: np.ndarray, sigma_rad: float = 0.01, sigma_m: float = 0.1) -> Re
     return RelativePose(pose, np.diag(np.r_[np.full(3, sigma_rad), np.full(3, sigma_m)] ** 2), "guess")
 
 
-def test_scans_are_found_on_from_where_they_were_though_the_imu_leads_elsewhere(sequence: Sequence):
-    """Their steps contradict a wrong IMU, and are left out; the map is not lost for that."""
+def test_scans_are_found_from_the_last_motion_when_the_imu_is_wrong(sequence: Sequence):
+    """The gate rejects steps that contradict a wrong IMU. The next scans must still be found in the map."""
     assert sequence.reference is not None
     true, matching, whole = sequence.reference.poses, ScanMatching(), np.eye(4)
     matching.start(sequence[0])
@@ -141,7 +143,7 @@ def test_scans_are_found_on_from_where_they_were_though_the_imu_leads_elsewhere(
         whole = whole @ wrong
 
 
-def test_a_search_among_motions_under_which_nothing_matches_ends_without_one(sequence: Sequence):
+def test_a_search_fails_when_the_scan_matches_under_no_motion(sequence: Sequence):
     matching, frame = ScanMatching(), sequence[1]
     matching.start(sequence[0])
     far = Scan(frame.scan.stamp_ns, frame.scan.points / 30 + np.array([0.0, 0.0, 60.0], np.float32))

@@ -1,4 +1,4 @@
-"""Initial-pose sources. Every implementation is held to the same contract: a new one is tested by being listed."""
+"""Initial-pose sources. Every registered implementation is tested against the same contract."""
 
 from __future__ import annotations
 
@@ -33,20 +33,18 @@ def test_an_initial_pose_source_predicts_and_learns_along_a_drive(
         off.append(np.sqrt(error @ np.linalg.solve(predicted.covariance, error)))
         source.correct(first_frames[k], truth)
         state = true_state(sequence, k, state)
-    assert max(off) < 5  # six dimensions: 4.6 is passed once in a thousand times
+    assert max(off) < 5  # Mahalanobis distance in six dimensions; 4.6 is exceeded once in a thousand
 
 
 @pytest.mark.parametrize("name", INITIAL)
-def test_at_the_start_an_initial_pose_source_admits_that_it_knows_no_speed(
-    name: str, setup: Setup, first_frames: list[Frame]
-):
+def test_an_initial_pose_source_starts_with_an_unknown_speed(name: str, setup: Setup, first_frames: list[Frame]):
     predicted = INITIAL_POSE_SOURCES[name](setup).predict(first_frames[1], start_of(first_frames))
     assert np.linalg.norm(predicted.pose[:3, 3]) < 0.5
-    assert 3 * np.sqrt(predicted.covariance[3, 3]) > 3.0  # 30 m/s for a tenth of a second
+    assert 3 * np.sqrt(predicted.covariance[3, 3]) > 3.0  # 30 m/s for 0.1 s
 
 
 @pytest.mark.parametrize("name", INITIAL)
-def test_an_initial_pose_source_keeps_up_when_scans_are_missing(
+def test_an_initial_pose_source_predicts_over_missing_scans(
     name: str, setup: Setup, sequence: Sequence, first_frames: list[Frame]
 ):
     source, state, at = INITIAL_POSE_SOURCES[name](setup), start_of(first_frames), 0
@@ -67,7 +65,7 @@ def test_an_initial_pose_source_keeps_up_when_scans_are_missing(
 
 
 @pytest.mark.parametrize("name", INITIAL)
-def test_an_initial_pose_source_leaves_its_input_as_it_was(name: str, setup: Setup, first_frames: list[Frame]):
+def test_an_initial_pose_source_does_not_modify_its_input(name: str, setup: Setup, first_frames: list[Frame]):
     source, state = INITIAL_POSE_SOURCES[name](setup), start_of(first_frames)
     step = RelativePose(np.eye(4), np.eye(6) * 1e-4, "test")
     before = [bytes_of(x) for x in (first_frames[1], state, step)]
@@ -77,7 +75,9 @@ def test_an_initial_pose_source_leaves_its_input_as_it_was(name: str, setup: Set
 
 
 @pytest.mark.parametrize("name", INITIAL)
-def test_an_initial_pose_source_repeats_itself(name: str, setup: Setup, sequence: Sequence, first_frames: list[Frame]):
+def test_an_initial_pose_source_is_deterministic(
+    name: str, setup: Setup, sequence: Sequence, first_frames: list[Frame]
+):
     def drive() -> list[bytes]:
         source, state, out = INITIAL_POSE_SOURCES[name](setup), start_of(first_frames), []
         for k in range(1, 5):
@@ -90,9 +90,7 @@ def test_an_initial_pose_source_repeats_itself(name: str, setup: Setup, sequence
 
 
 @pytest.mark.parametrize("name", INITIAL)
-def test_an_initial_pose_sources_answer_knows_whether_the_imu_was_in_it(
-    name: str, setup: Setup, first_frames: list[Frame]
-):
-    """What came from the samples must not be counted beside them: without samples nothing is from them."""
+def test_an_initial_pose_is_marked_if_it_comes_from_the_imu(name: str, setup: Setup, first_frames: list[Frame]):
+    """The graph must not count inertial data twice; without samples a prediction cannot contain any."""
     frame = replace(first_frames[1], imu=ImuSamples.empty())
     assert not INITIAL_POSE_SOURCES[name](setup).predict(frame, start_of(first_frames)).from_imu

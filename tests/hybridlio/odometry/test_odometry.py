@@ -26,7 +26,7 @@ def driven(frames: list[Frame]) -> tuple[Odometry, list[Estimate]]:
 
 
 def quick() -> Odometry:
-    """Without looking at scans: for what has nothing to do with them."""
+    """Return an odometry that ignores scans, for tests that do not need them."""
     return Odometry(residual="none")
 
 
@@ -37,13 +37,13 @@ def test_a_tiny_drive_is_followed_to_a_few_centimetres(driven: tuple[Odometry, l
     assert sequence.reference is not None
     errors = se3.log(se3.between(np.array([e.pose for e in driven[1]]), sequence.reference.poses))
     assert sequence.reference.length_m > 15
-    # 16 beams tell little of pitch: most of the error is in height
+    # 16 beams hardly observe pitch, so most of the error is in height
     assert np.linalg.norm(errors[:, 3:5], axis=1).max() < 0.05
     assert np.abs(errors[:, 5]).max() < 0.2
     assert np.degrees(np.linalg.norm(errors[:, :3], axis=1).max()) < 0.5
 
 
-def test_errors_lie_within_what_the_covariances_claim(driven: tuple[Odometry, list[Estimate]], sequence: Sequence):
+def test_errors_are_within_the_covariances(driven: tuple[Odometry, list[Estimate]], sequence: Sequence):
     assert sequence.reference is not None
     errors = se3.log(se3.between(np.array([e.pose for e in driven[1]]), sequence.reference.poses))
     sigmas = np.sqrt([np.diag(e.covariance) for e in driven[1]])
@@ -59,7 +59,7 @@ def test_every_covariance_is_symmetric_and_positive_definite(driven: tuple[Odome
                 np.linalg.cholesky(part.covariance)
 
 
-def test_the_residual_moves_the_initial_pose_to_the_relative_one(driven: tuple[Odometry, list[Estimate]]):
+def test_the_residual_times_the_initial_pose_is_the_relative_pose(driven: tuple[Odometry, list[Estimate]]):
     for estimate in driven[1][1:]:
         assert estimate.initial is not None
         assert estimate.relative is not None
@@ -67,7 +67,7 @@ def test_the_residual_moves_the_initial_pose_to_the_relative_one(driven: tuple[O
     assert np.linalg.norm(driven[1][1].residual[:3, 3]) > 0.5  # the unknown speed
 
 
-def test_the_first_estimate_is_the_origin_with_nothing_before_it(driven: tuple[Odometry, list[Estimate]]):
+def test_the_first_estimate_is_the_origin_without_a_step(driven: tuple[Odometry, list[Estimate]]):
     first = driven[1][0]
     np.testing.assert_array_equal(first.pose, np.eye(4))
     np.testing.assert_array_equal(first.residual, np.eye(4))
@@ -75,7 +75,7 @@ def test_the_first_estimate_is_the_origin_with_nothing_before_it(driven: tuple[O
     assert np.sqrt(np.diag(first.covariance)).max() < 1e-5
 
 
-def test_estimates_say_whose_they_are_and_what_they_cost(driven: tuple[Odometry, list[Estimate]], frames: list[Frame]):
+def test_estimates_carry_index_stamp_and_time_spent(driven: tuple[Odometry, list[Estimate]], frames: list[Frame]):
     for estimate, frame in zip(driven[1], frames, strict=True):
         assert (estimate.index, estimate.stamp_ns) == (frame.index, frame.scan.stamp_ns)
     stages = driven[1][5].seconds
@@ -83,13 +83,21 @@ def test_estimates_say_whose_they_are_and_what_they_cost(driven: tuple[Odometry,
     assert all(seconds >= 0 for seconds in stages.values())
 
 
-def test_steps_multiply_to_the_newest_pose_when_nothing_past_is_moved(driven: tuple[Odometry, list[Estimate]]):
+def test_an_estimates_repr_is_one_line(driven: tuple[Odometry, list[Estimate]], frames: list[Frame]):
+    assert repr(driven[1][0]) == "Estimate(frame 0, position (0.00, 0.00, 0.00) m ± 1.7e-06 m, untested)"
+    assert repr(driven[1][-1]).startswith(f"Estimate(frame {len(frames) - 1}, position (")
+    odometry = Odometry()
+    odometry.step(frames[0])
+    assert repr(odometry.step(blind(frames[1]))).endswith("untested, bridged)")
+
+
+def test_the_last_step_leads_from_the_pose_before_to_the_newest(driven: tuple[Odometry, list[Estimate]]):
     before, last = driven[1][-2:]
     assert last.step is not None
     assert np.linalg.norm(se3.between(before.pose @ last.step.pose, last.pose)[:3, 3]) < 0.05
 
 
-def test_the_same_frames_give_the_same_bytes(driven: tuple[Odometry, list[Estimate]], frames: list[Frame]):
+def test_the_same_frames_give_identical_results(driven: tuple[Odometry, list[Estimate]], frames: list[Frame]):
     again = Odometry()
     for frame, first in zip(frames[:8], driven[1], strict=False):
         estimate = again.step(frame)
@@ -112,7 +120,7 @@ def test_scans_without_points_are_bridged_by_the_imu(frames: list[Frame], sequen
 # ------------------------------------------------------------------------------------------------- the record
 
 
-def test_the_record_holds_what_the_run_was(
+def test_the_record_holds_all_steps_and_samples_of_the_run(
     driven: tuple[Odometry, list[Estimate]], frames: list[Frame], sequence: Sequence, tmp_path: Path
 ):
     odometry, estimates = driven
@@ -123,6 +131,8 @@ def test_the_record_holds_what_the_run_was(
         e.relative.pose.tobytes() for e in estimates[1:] if e.relative
     ]
     assert len(record.initial) == len(frames) - 1
+    assert repr(record).startswith(f"Record({len(frames)} scans, ")
+    assert "0 GPS fixes" in repr(record)
     assert record.imu.stamps_ns[0] <= frames[0].scan.stamp_ns
     assert record.imu.stamps_ns[-1] == frames[-1].scan.stamp_ns
     np.testing.assert_allclose(np.diff(record.imu.stamps_ns), 10_000_000, atol=2)
@@ -132,14 +142,14 @@ def test_the_record_holds_what_the_run_was(
     np.testing.assert_allclose(saved.trajectory.poses, smooth(record).trajectory.poses, atol=1e-9)
 
 
-def test_smoothing_the_record_keeps_to_the_truth(driven: tuple[Odometry, list[Estimate]], sequence: Sequence):
+def test_smoothing_the_record_stays_near_the_truth(driven: tuple[Odometry, list[Estimate]], sequence: Sequence):
     assert sequence.reference is not None
     smoothed = smooth(driven[0].record()).trajectory
     off = np.linalg.norm(smoothed.poses[:, :3, 3] - sequence.reference.poses[:, :3, 3], axis=1)
     assert off.max() < 0.2
 
 
-def test_a_record_of_fewer_than_two_frames_is_an_error_that_says_what_to_do(frames: list[Frame]):
+def test_a_record_of_fewer_than_two_frames_is_an_error(frames: list[Frame]):
     odometry = quick()
     with pytest.raises(EstimationError, match="at least two frames"):
         odometry.record()
@@ -158,7 +168,7 @@ def test_fixes_are_kept_up_to_the_last_scan(frames: list[Frame]):
     assert [fix.stamp_ns for fix in odometry.record().gps] == [f.scan.stamp_ns - 1 for f in frames[:4]]
 
 
-def test_a_step_that_failed_leaves_what_was_there_and_can_be_tried_again(frames: list[Frame]):
+def test_a_step_that_raises_can_be_repeated(frames: list[Frame]):
     class Faulty(NoResidual):
         broken = False
 
@@ -184,11 +194,11 @@ def test_a_step_that_failed_leaves_what_was_there_and_can_be_tried_again(frames:
     assert odometry.record().imu.stamps_ns[-1] == frames[5].scan.stamp_ns
 
 
-# --------------------------------------------------------------------------------------------- what is refused
+# --------------------------------------------------------------------------------------------- invalid input
 
 
 @pytest.mark.parametrize("second", [0, 1], ids=["backwards", "repeated"])
-def test_frames_out_of_order_are_refused_by_number(second: int, frames: list[Frame]):
+def test_frames_out_of_order_are_refused_with_their_index(second: int, frames: list[Frame]):
     odometry = quick()
     for k in (0, 1):
         odometry.step(frames[k])
@@ -207,7 +217,7 @@ def test_samples_without_extrinsics_are_refused(first_has_imu: bool, frames: lis
         odometry.step(second if not first_has_imu else first)
 
 
-def test_an_empty_first_scan_is_refused_and_another_may_follow(frames: list[Frame]):
+def test_after_an_unusable_first_scan_the_next_one_can_be_the_first(frames: list[Frame]):
     odometry = Odometry()
     with pytest.raises(DataError, match="frame 0: only 0 points"):
         odometry.step(blind(frames[0]))
@@ -216,6 +226,6 @@ def test_an_empty_first_scan_is_refused_and_another_may_follow(frames: list[Fram
 
 @pytest.mark.parametrize("kind", ["initial_pose", "residual", "backend"])
 @pytest.mark.parametrize("by", ["argument", "config"])
-def test_an_unknown_name_is_refused_at_once(kind: str, by: str):
+def test_an_unknown_name_is_refused_before_the_first_frame(kind: str, by: str):
     with pytest.raises(ConfigError, match=r"unknown .* 'lidar-dreams'; choose one of"):
         Odometry(**{kind: "lidar-dreams"}) if by == "argument" else Odometry(config=Config(**{kind: "lidar-dreams"}))

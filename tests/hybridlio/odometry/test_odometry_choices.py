@@ -1,4 +1,4 @@
-"""Sources, backends and settings of one's own in the odometry."""
+"""Users' own sources, backends and settings in the odometry."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from hybridlio.sources.constant_velocity import Identity
 
 
 class Truth:
-    """An initial pose from the reference; knows the future."""
+    """Predicts from the reference."""
 
     name = "truth"
 
@@ -39,7 +39,7 @@ class Truth:
         self.learnt.append(frame.index)
 
 
-def test_an_initial_pose_source_of_ones_own_is_used_and_told_each_step(frames: list[Frame], sequence: Sequence):
+def test_a_users_initial_pose_source_is_used_and_corrected(frames: list[Frame], sequence: Sequence):
     source = Truth(sequence)
     odometry = Odometry(initial_pose=source)
     estimates = [odometry.step(frame) for frame in frames[:6]]
@@ -49,7 +49,7 @@ def test_an_initial_pose_source_of_ones_own_is_used_and_told_each_step(frames: l
     assert np.linalg.norm(estimates[-1].pose[:3, 3] - sequence.reference.poses[5, :3, 3]) < 0.05
 
 
-def test_a_guess_that_was_not_refined_is_nothing_to_learn_from(frames: list[Frame], sequence: Sequence):
+def test_a_bridged_step_does_not_correct_the_initial_pose_source(frames: list[Frame], sequence: Sequence):
     source = Truth(sequence)
     odometry = Odometry(initial_pose=source)
     for frame in frames[:6]:
@@ -57,7 +57,7 @@ def test_a_guess_that_was_not_refined_is_nothing_to_learn_from(frames: list[Fram
     assert source.learnt == [1, 2, 5]
 
 
-def test_a_backend_of_ones_own_is_used(frames: list[Frame]):
+def test_a_users_backend_is_used(frames: list[Frame]):
     class Chained:
         name = "chained"
 
@@ -80,7 +80,7 @@ def test_a_backend_of_ones_own_is_used(frames: list[Frame]):
     assert estimate.step is estimate.relative
 
 
-def test_names_given_go_before_those_in_the_configuration(frames: list[Frame]):
+def test_arguments_take_precedence_over_the_configuration(frames: list[Frame]):
     config = Config(initial_pose="identity", residual="none")
     both = [Odometry(config=config), Odometry(initial_pose="constant-velocity", config=config)]
     for odometry in both:
@@ -89,7 +89,7 @@ def test_names_given_go_before_those_in_the_configuration(frames: list[Frame]):
     assert [source.source for source in sources if source] == ["identity", "constant-velocity"]
 
 
-def test_the_noise_is_the_configurations_else_the_recordings_else_the_default(frames: list[Frame]):
+def test_imu_noise_comes_from_configuration_then_recording_then_default(frames: list[Frame]):
     mine, recorded = ImuNoise(1e-2, 1e-1), ImuNoise(5e-4, 5e-3)
 
     def used(config: Config, in_frame: ImuNoise | None) -> ImuNoise:
@@ -104,7 +104,7 @@ def test_the_noise_is_the_configurations_else_the_recordings_else_the_default(fr
 
 
 @pytest.mark.parametrize("choice", [{"initial_pose": "lstm"}, {"residual": "network"}])
-def test_weights_that_cannot_be_read_end_a_run_at_once_and_not_at_every_scan(choice: dict, sequence: Sequence, caplog):
+def test_unreadable_weights_end_a_run_at_its_start(choice: dict, sequence: Sequence, caplog):
     lost = {"weights": "nowhere.safetensors"}
     run = run_odometry(sequence, Odometry(config=parse_config({"lstm": lost, "network": lost}, "here"), **choice))
     assert isinstance(run.stopped, ConfigError)
@@ -113,14 +113,14 @@ def test_weights_that_cannot_be_read_end_a_run_at_once_and_not_at_every_scan(cho
     assert (run.done, run.unreadable, warned) == (0, {}, [])
 
 
-def test_an_imu_without_noise_is_refused_and_named(frames: list[Frame]):
+def test_an_imu_without_noise_is_refused(frames: list[Frame]):
     for name in ("gyro_walk_rad_s2_sqrt_hz", "accel_bias_sigma_m_s2"):
         silent = replace(ImuNoise(), **{name: 0.0})
         with pytest.raises(ConfigError, match=f"ImuNoise.{name}: must be above 0, got 0"):
             Odometry(config=Config(imu_noise=silent)).step(frames[0])
 
 
-def test_what_is_no_answer_and_no_configuration_is_named(frames: list[Frame]):
+def test_wrong_types_from_users_are_named(frames: list[Frame]):
     class Bare(Identity):
         name = "bare"
 

@@ -1,4 +1,4 @@
-"""Sources and backends are found by name."""
+"""Names of sources and backends."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ INITIAL, RESIDUAL, BACKEND = sorted(INITIAL_POSE_SOURCES), sorted(RESIDUAL_SOURC
 
 
 @pytest.mark.parametrize("kind", ["initial pose", "residual", "backend"])
-def test_an_unknown_name_is_an_error_that_lists_those_there_are(kind: str):
+def test_an_unknown_name_raises_an_error_that_lists_the_known_ones(kind: str):
     known = {"initial pose": INITIAL, "residual": RESIDUAL, "backend": BACKEND}
     names = {seam: "preintegrated" if seam == kind else choices[0] for seam, choices in known.items()}
     with pytest.raises(ConfigError, match=f"unknown {kind} 'preintegrated'") as error:
@@ -23,9 +23,9 @@ def test_an_unknown_name_is_an_error_that_lists_those_there_are(kind: str):
     assert all(name in str(error.value) for name in known[kind])
 
 
-def test_objects_are_taken_as_they_are():
+def test_objects_are_accepted_unchecked():
     check_names(object(), object(), object())
 
 
-def test_a_setup_without_extrinsics_has_the_identity():
+def test_a_setup_without_extrinsics_uses_the_identity():
     np.testing.assert_array_equal(Setup(Config(), Calibration(), ImuNoise()).calibration.T_imu_lidar, np.eye(4))

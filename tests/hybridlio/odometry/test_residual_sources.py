@@ -1,4 +1,4 @@
-"""Residual sources. Every implementation is held to the same contract: a new one is tested by being listed."""
+"""Residual sources. Every registered implementation is tested against the same contract."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_residual_source_refines_along_a_drive(
 
 
 @pytest.mark.parametrize("name", RESIDUAL)
-def test_a_residual_source_goes_on_over_a_scan_without_points(
+def test_a_residual_source_bridges_a_scan_without_points(
     name: str, setup: Setup, sequence: Sequence, first_frames: list[Frame]
 ):
     source = RESIDUAL_SOURCES[name](setup)
@@ -51,7 +51,7 @@ def test_a_residual_source_goes_on_over_a_scan_without_points(
 
 
 @pytest.mark.parametrize("name", RESIDUAL)
-def test_a_residual_source_leaves_its_input_as_it_was(
+def test_a_residual_source_does_not_modify_its_input(
     name: str, setup: Setup, sequence: Sequence, first_frames: list[Frame]
 ):
     source, initial = RESIDUAL_SOURCES[name](setup), guess(sequence, 1)
@@ -62,9 +62,7 @@ def test_a_residual_source_leaves_its_input_as_it_was(
 
 
 @pytest.mark.parametrize("name", RESIDUAL)
-def test_a_residual_source_starts_again_as_if_new(
-    name: str, setup: Setup, sequence: Sequence, first_frames: list[Frame]
-):
+def test_a_residual_source_can_be_restarted(name: str, setup: Setup, sequence: Sequence, first_frames: list[Frame]):
     source, answers = RESIDUAL_SOURCES[name](setup), []
     for _ in range(2):
         source.start(first_frames[0])

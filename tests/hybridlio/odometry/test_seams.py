@@ -1,4 +1,4 @@
-"""The three seams' implementations together."""
+"""Combinations of implementations of the three seams."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hybridlio.odometry.setup import Setup
 
 @pytest.mark.parametrize("residual", sorted(RESIDUAL_SOURCES))
 @pytest.mark.parametrize("initial", sorted(INITIAL_POSE_SOURCES))
-def test_any_initial_pose_goes_with_any_residual(
+def test_every_initial_pose_source_works_with_every_residual_source(
     initial: str, residual: str, first_frames: list[Frame], learned_config: Config
 ):
     odometry = Odometry(initial, residual, config=learned_config)
@@ -32,7 +32,7 @@ def test_any_initial_pose_goes_with_any_residual(
 @pytest.mark.parametrize(
     "table", [INITIAL_POSE_SOURCES, RESIDUAL_SOURCES, BACKENDS], ids=["initial", "residual", "backend"]
 )
-def test_each_entry_makes_a_new_object_each_time(table: dict[str, Callable[[Setup], Any]], setup: Setup):
+def test_each_entry_makes_a_new_object(table: dict[str, Callable[[Setup], Any]], setup: Setup):
     for name, make in table.items():
         first, second = make(setup), make(deepcopy(setup))
         assert first is not second

@@ -23,7 +23,7 @@ def step(seconds: float) -> RelativePose:
     return RelativePose(se3.exp(TWIST * seconds), np.eye(6) * 1e-4, "test")
 
 
-def test_a_steady_motion_is_continued_however_long_the_steps_take():
+def test_a_steady_motion_is_continued_over_steps_of_any_duration():
     source = ConstantVelocity()
     source.predict(frame_at(0.1), state_at(0.0))
     source.correct(frame_at(0.1), step(0.1))
@@ -33,13 +33,13 @@ def test_a_steady_motion_is_continued_however_long_the_steps_take():
         source.correct(frame_at(end), step(end - start))
 
 
-def test_before_any_step_constant_velocity_knows_nothing_and_says_so():
+def test_constant_velocity_starts_with_an_unknown_motion():
     first = ConstantVelocity().predict(frame_at(0.1), state_at(0.0))
     np.testing.assert_array_equal(first.pose, np.eye(4))
     np.testing.assert_array_equal(first.covariance, unknown_motion_covariance(0.1))
 
 
-def test_a_step_once_known_narrows_the_next():
+def test_a_known_step_narrows_the_next_prediction():
     source = ConstantVelocity()
     unsure = source.predict(frame_at(0.1), state_at(0.0)).covariance
     source.correct(frame_at(0.1), step(0.1))
@@ -50,25 +50,25 @@ def test_a_step_once_known_narrows_the_next():
 def test_the_unknown_motion_covers_a_motorway_and_the_changed_one_an_emergency_stop():
     unknown, changed = (np.sqrt(np.diag(c(0.1))) for c in (unknown_motion_covariance, changed_motion_covariance))
     assert 3 * unknown[3] > 4.0  # 40 m/s for 0.1 s
-    assert 3 * unknown[2] > 0.06  # 35 degrees a second
+    assert 3 * unknown[2] > 0.06  # 35 °/s
     assert 3 * changed[3] > 0.05  # a change of 5 m/s² over 0.1 s
     assert (changed < unknown).all()
 
 
-def test_uncertainty_grows_with_time_and_is_never_zero():
+def test_uncertainty_grows_with_time_from_above_zero():
     for covariance in (unknown_motion_covariance, changed_motion_covariance):
         sigmas = np.array([np.diag(covariance(dt)) for dt in (0.0, 0.05, 0.1, 1.0)])
         assert (np.diff(sigmas, axis=0) > 0).all()
         assert (sigmas[0] > 0).all()
 
 
-def test_identity_never_learns():
+def test_identity_ignores_corrections():
     source = Identity()
     source.correct(frame_at(0.1), step(0.1))
     np.testing.assert_array_equal(source.predict(frame_at(0.2), state_at(0.1)).pose, np.eye(4))
 
 
-def test_without_a_residual_source_the_initial_pose_is_the_answer():
+def test_no_residual_returns_the_initial_pose():
     source, initial = NoResidual(), step(0.1)
     source.start(frame_at(0.0))
     assert source.refine(frame_at(0.1), initial) is initial

@@ -1,4 +1,4 @@
-"""The backend without a graph: poses are products, covariances those of products."""
+"""The backend without a graph: composed poses and compounded covariances."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_the_pose_is_the_product_of_the_relative_poses():
         np.testing.assert_allclose(T_LIDAR_IMU @ state.T_world_imu @ T_IMU_LIDAR, pose, atol=1e-10)
 
 
-def test_the_covariance_is_what_draws_of_the_steps_scatter_by():
+def test_the_covariance_agrees_with_monte_carlo():
     count, draws = 30, 4000
     state = chained([RelativePose(STEP, COVARIANCE, "test")] * count)[-1]
     noise = np.random.default_rng(2).multivariate_normal(np.zeros(6), COVARIANCE, size=(draws, count))
@@ -61,20 +61,20 @@ def test_the_covariance_is_what_draws_of_the_steps_scatter_by():
         velocities = (imu - imu_before)[:, :3, 3] * NS_PER_S / PERIOD_NS
     errors = np.hstack([se3.log(se3.between(state.T_world_imu, imu)), velocities - state.velocity_m_s])
     sampled, claimed = np.cov(errors.T), state.covariance[:9, :9].copy()
-    claimed[6:, 6:] -= np.eye(3) * 0.1**2  # the acceleration within a step, of which the draws have none
+    claimed[6:, 6:] -= np.eye(3) * 0.1**2  # the acceleration during a step, which the samples do not have
     root = np.linalg.cholesky(claimed)
     whitened = np.linalg.solve(root, np.linalg.solve(root, sampled).T)
     np.testing.assert_allclose(np.linalg.eigvalsh(whitened), 1.0, atol=0.25)
 
 
-def test_only_the_drift_adds_up_and_the_scatter_is_the_last_scans():
+def test_only_drift_accumulates_while_scatter_belongs_to_the_last_scan():
     drift = 0.1 * COVARIANCE
     state = chained([RelativePose(STEP, COVARIANCE, "test", drift=drift)] * 20)[-1]
     path = chained([RelativePose(STEP, drift, "test")] * 20)[-1]
     np.testing.assert_allclose(lidar_covariance(state), lidar_covariance(path) + 0.45 * COVARIANCE, rtol=1e-6)
 
 
-def test_a_failed_scan_on_a_map_is_unsure_alone():
+def test_a_failed_scan_on_a_map_does_not_widen_the_next():
     on_map = RelativePose(STEP, COVARIANCE, "test", drift=0.1 * COVARIANCE)
     failed = replace(on_map, covariance=np.eye(6), ok=False)
     states, without = chained([on_map, failed, on_map]), chained([on_map] * 3)
@@ -82,7 +82,7 @@ def test_a_failed_scan_on_a_map_is_unsure_alone():
     np.testing.assert_allclose(lidar_covariance(states[2]), lidar_covariance(without[2]))
 
 
-def test_a_step_without_drift_leaves_the_path_at_the_last_scan():
+def test_a_step_without_drift_starts_from_the_last_scans_full_covariance():
     on_map = RelativePose(STEP, COVARIANCE, "test", drift=0.1 * COVARIANCE)
     states = chained([on_map, RelativePose(STEP, COVARIANCE, "test"), on_map])
     expected = lidar_covariance(states[0])
@@ -91,7 +91,7 @@ def test_a_step_without_drift_leaves_the_path_at_the_last_scan():
     np.testing.assert_allclose(lidar_covariance(states[2]), expected, rtol=1e-6)
 
 
-def test_the_last_step_is_the_one_given():
+def test_the_last_step_is_the_given_relative_pose():
     backend = DeadReckoning(Calibration(T_IMU_LIDAR))
     backend.start(start_state(0, ImuSamples.empty(), ImuNoise()))
     backend.update(frame(1), RelativePose(STEP, COVARIANCE, "test", from_imu=True))
@@ -102,8 +102,8 @@ def test_the_last_step_is_the_one_given():
 
 
 @pytest.mark.parametrize("heading_sigma_rad", [1e-4, 0.1])
-def test_a_prediction_from_the_state_knows_the_speed_however_unsure_the_heading(heading_sigma_rad: float):
-    """In heading and velocity it is the same error, and what is predicted is relative to the heading."""
+def test_a_heading_error_does_not_widen_predictions_from_the_state(heading_sigma_rad: float):
+    """Heading and velocity share the error, and a prediction is relative to the heading."""
     stamps = np.arange(0, 4 * PERIOD_NS, PERIOD_NS // 10)
     still = ImuSamples(stamps, np.zeros((len(stamps), 3)), np.tile([0.0, 0.0, 9.81], (len(stamps), 1)))
     start = start_state(0, still, ImuNoise())
@@ -121,7 +121,7 @@ def test_a_prediction_from_the_state_knows_the_speed_however_unsure_the_heading(
     assert np.sqrt(predicted.covariance[4, 4]) < 0.05
 
 
-def test_scans_that_are_right_are_never_taken_to_contradict_the_imu(tiny_drive: Path):
+def test_right_scans_pass_the_gate_without_a_graph(tiny_drive: Path):
     sequence, odometry = open_sequence(tiny_drive), Odometry(backend="none")
     verdicts = [odometry.step(sequence[k]).gate.verdict for k in range(len(sequence))]
     assert set(verdicts[WARM_UP_STEPS + 1 :]) == {"accepted"}

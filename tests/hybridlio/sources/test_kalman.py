@@ -16,7 +16,7 @@ SIGMAS = np.r_[np.full(3, 5e-4), np.full(3, 0.01)]
 
 
 class Drive:
-    """A filter taken along a motion of the lidar given by its twist over time."""
+    """Runs a filter along a lidar motion given by its twist over time."""
 
     def __init__(self, gyro_bias: np.ndarray | None = None, imu: bool = True, mount: np.ndarray = MOUNT) -> None:
         self.filter = Kalman(Calibration(mount), NOISE)
@@ -24,7 +24,7 @@ class Drive:
         self.rng, self.time_s, self.k = np.random.default_rng(3), 0.0, 0
 
     def step(self, twist: np.ndarray, dt_s: float = 0.1) -> tuple[RelativePose, np.ndarray]:
-        """Predict and correct one step; returns the prediction and its error (rad, m)."""
+        """Predict and correct one step; return the prediction and its error (rad, m)."""
         self.k += 1
         end_s = self.time_s + dt_s
         state: State = start_state(round(self.time_s * 1e9), ImuSamples.empty(), NOISE)
@@ -55,13 +55,13 @@ def test_a_constant_velocity_is_recovered(twist: np.ndarray, imu: bool):
     assert np.linalg.norm(errors[:, 3:], axis=1).max() < 0.06
 
 
-def test_a_constant_acceleration_is_followed_without_lagging_behind():
-    drive, faster = Drive(), np.array([0, 0, 0, 0.2, 0, 0])  # 2 m/s², as each step's mean speed
+def test_a_constant_acceleration_is_followed_without_lag():
+    drive, faster = Drive(), np.array([0, 0, 0, 0.2, 0, 0])  # 2 m/s², in the mean speed of each step
     errors = np.array([drive.step(CRUISE + k * faster)[1] for k in range(40)])
     assert abs(errors[15:, 3].mean()) < 0.01
 
 
-def test_a_turn_is_followed_at_once_with_the_gyroscope_and_late_without():
+def test_a_turn_is_followed_at_once_only_with_a_gyroscope():
     errors = {}
     for imu in (True, False):
         drive = Drive(imu=imu)
@@ -69,10 +69,10 @@ def test_a_turn_is_followed_at_once_with_the_gyroscope_and_late_without():
             drive.step(CRUISE)
         errors[imu] = np.abs(drive.step(BEND)[1][2])
     assert errors[True] < 0.003
-    assert errors[False] > 0.03  # all of the turn
+    assert errors[False] > 0.03  # the whole rotation of the step
 
 
-def test_the_gyroscopes_bias_is_found():
+def test_the_gyroscopes_bias_is_estimated():
     bias = np.array([0.01, -0.008, 0.02])
     drive = Drive(gyro_bias=bias)
     early = np.array([drive.step(BEND)[1] for _ in range(3)])
@@ -80,11 +80,11 @@ def test_the_gyroscopes_bias_is_found():
         drive.step(BEND)
     late = np.array([drive.step(BEND)[1] for _ in range(20)])
     assert np.linalg.norm(late[:, :3].mean(axis=0)) < 0.3 * np.linalg.norm(early[0, :3])
-    # the filter keeps it in the lidar's axes
+    # in the lidar's axes, as in the filter
     np.testing.assert_allclose(MOUNT[:3, :3] @ drive.filter._filter.x[9:, 0], bias, atol=3e-3)
 
 
-def test_steps_of_other_lengths_are_predicted_for_as_long_as_they_take():
+def test_predictions_scale_with_the_steps_duration():
     drive = Drive()
     for _ in range(20):
         drive.step(BEND)
@@ -94,7 +94,7 @@ def test_steps_of_other_lengths_are_predicted_for_as_long_as_they_take():
         assert np.abs(error[:3]).max() < 3e-3
 
 
-def test_the_errors_of_a_car_are_no_larger_than_the_covariance_says():
+def test_errors_on_a_car_like_motion_are_within_the_covariance():
     nees = []
     for seed in range(5):
         drive, rng = Drive(), np.random.default_rng(seed)
@@ -110,18 +110,18 @@ def test_the_errors_of_a_car_are_no_larger_than_the_covariance_says():
     assert 0.2 < np.mean(nees) < 1.3
 
 
-def test_at_the_start_it_knows_nothing_of_the_speed():
+def test_the_speed_is_unknown_at_the_start():
     predicted, _ = Drive().step(CRUISE)
     np.testing.assert_allclose(predicted.pose[:3, 3], 0.0, atol=1e-12)
     assert 3 * np.sqrt(predicted.covariance[3, 3]) > 4.0
 
 
-def test_it_says_whether_the_imu_had_a_part_in_it():
+def test_predictions_are_marked_if_the_gyroscope_was_used():
     assert Drive(imu=True).step(CRUISE)[0].from_imu
     assert not Drive(imu=False).step(CRUISE)[0].from_imu
 
 
-def test_learning_a_step_before_any_was_predicted_changes_nothing():
+def test_a_correction_before_any_prediction_has_no_effect():
     source = Kalman(Calibration(), NOISE)
     frame = Frame(1, Scan(10**8, np.empty((0, 3), np.float32)))
     source.correct(frame, RelativePose(se3.exp(BEND * 0.1), np.eye(6), "test"))

@@ -1,4 +1,4 @@
-"""Scans compared with several keyframes: on a drive, over lost scans, and against wrong answers."""
+"""Relative poses to several recent scans: on a drive, over lost scans, and with wrong answers."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ STEP = se3.exp(np.array([0.0, 0.0, 0.01, 1.0, 0.0, 0.0]))
 
 
 class Numbered:
-    """A source whose scans are their numbers: each is one step from the next, and found there if not told otherwise."""
+    """A source whose scans are numbers. It finds each scan one step after the one before, unless set otherwise."""
 
     name = "numbered"
 
@@ -72,17 +72,17 @@ def behind(step: RelativePose) -> list[int]:
     return sorted(keyframe.stamp_ns - 1000 for keyframe in step.earlier_scans)
 
 
-def test_each_scan_is_compared_with_the_last_keyframes_but_the_scan_before():
+def test_each_scan_is_compared_with_recent_scans_other_than_the_last():
     _, keyed = numbered()
     steps = [keyed.refine(frame(k), GUESS) for k in range(1, 8)]
-    # with a keyframe every other metre and steps of one
+    # with a recent scan every other metre and steps of one metre
     assert [behind(step) for step in steps] == [[], [0], [0], [0, 2], [2], [2, 4], [4]]
     for k, step in enumerate(steps, 1):
         for near in step.earlier_scans:
             np.testing.assert_allclose(near.pose, np.linalg.matrix_power(STEP, k - near.stamp_ns + 1000), atol=1e-12)
 
 
-def test_what_is_shared_is_told_from_what_is_each_poses_own():
+def test_shared_noise_is_split_from_each_poses_own():
     _, keyed = numbered(shared=0.6)
     for k in range(1, 4):
         step = keyed.refine(frame(k), GUESS)
@@ -92,7 +92,7 @@ def test_what_is_shared_is_told_from_what_is_each_poses_own():
     np.testing.assert_allclose(step.earlier_scans[0].covariance, 0.4 * COVARIANCE)
 
 
-def test_after_a_failed_scan_the_last_good_one_is_a_keyframe():
+def test_after_a_failed_scan_the_last_good_one_is_compared():
     source, keyed = numbered(distance_m=50.0, count=1)
     source.failed = {3}
     steps = [keyed.refine(frame(k), GUESS) for k in range(1, 6)]
@@ -101,14 +101,14 @@ def test_after_a_failed_scan_the_last_good_one_is_a_keyframe():
     assert steps[2].drift is None
 
 
-def test_a_pose_that_the_steps_contradict_is_left_out():
+def test_a_pose_that_contradicts_the_path_is_left_out():
     source, keyed = numbered()
     source.wrong = {(2, 4)}
     steps = [keyed.refine(frame(k), GUESS) for k in range(1, 6)]
     assert [behind(step) for step in steps] == [[], [0], [0], [0], [2]]
 
 
-def test_a_scan_taken_back_is_no_keyframe_and_the_path_goes_on_by_the_initial_pose():
+def test_a_scan_taken_back_is_forgotten_and_the_path_continues_by_the_initial_pose():
     source, keyed = numbered()
     for k in (1, 2):
         keyed.refine(frame(k), GUESS)
@@ -125,11 +125,11 @@ def test_settings_out_of_range_are_refused(wrong: dict[str, float]):
 
 # ------------------------------------------------------------------------------------------------------ a hall
 
-HALL = np.array([14.0, 9.0, 4.0])  # half its sides
+HALL = np.array([14.0, 9.0, 4.0])  # half the side lengths
 
 
 def hall_scan(T_hall_lidar: np.ndarray, stamp_ns: int, rng: np.random.Generator) -> Scan:
-    """What 4,000 random rays meet of the hall's walls, with 2 cm of noise."""
+    """Return where 4,000 random rays hit the hall's walls, with 2 cm of noise."""
     rays = rng.normal(size=(4000, 3)) * [1.0, 1.0, 0.4]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     turned, origin = rays @ T_hall_lidar[:3, :3].T, T_hall_lidar[:3, 3]
@@ -139,7 +139,7 @@ def hall_scan(T_hall_lidar: np.ndarray, stamp_ns: int, rng: np.random.Generator)
 
 
 def hall_drive(seed: int, blind: tuple[int, ...] = ()) -> tuple[list[Frame], np.ndarray]:
-    """Frames without IMU, some blind, and the true poses in the first."""
+    """Return frames without IMU, some without points, and the true poses in the first one's frame."""
     rng = np.random.default_rng(seed)
     step = se3.exp(np.array([0.0, 0.0, 0.01, 0.5, 0.0, 0.0]))
     poses = [se3.make(np.eye(3), [-8.0, -3.0, -1.0])]
@@ -158,25 +158,25 @@ def config(count: int, **changes: Any) -> Config:
 
 
 def driven(count: int, seed: int, blind: tuple[int, ...] = ()) -> tuple[np.ndarray, Record]:
-    """Squared errors of the last ten poses in metres, and the record."""
+    """Return the squared errors of the last ten poses (m²), and the record."""
     frames, true = hall_drive(seed, blind)
     odometry = Odometry(config=config(count))
     poses = np.array([odometry.step(frame).pose for frame in frames])
     return ((poses[-10:, :3, 3] - true[-10:, :3, 3]) ** 2).sum(axis=1), odometry.record()
 
 
-def test_keyframes_lead_nearer_to_the_truth():
+def test_recent_scans_reduce_the_error():
     chained, keyed = (np.mean([driven(count, seed)[0] for seed in (1, 2)]) for count in (0, 3))
     assert keyed < 0.5 * chained
 
 
-def test_what_a_blind_scan_leaves_open_the_keyframes_close():
+def test_recent_scans_bridge_a_blind_scan():
     off, record = driven(2, seed=4, blind=(12, 13))
     assert [k + 1 for k, step in enumerate(record.relative) if not step.ok] == [12, 13]
     assert np.sqrt(off.mean()) < 0.05
 
 
-def test_keyframes_are_in_the_record(tmp_path: Path):
+def test_poses_to_recent_scans_are_in_the_record(tmp_path: Path):
     _, record = driven(3, seed=1)
     record.save(tmp_path / "odometry.npz")
     loaded = Record.load(tmp_path / "odometry.npz")
@@ -184,7 +184,7 @@ def test_keyframes_are_in_the_record(tmp_path: Path):
     assert {j - i for i, j, _ in loaded.edges} > {1, 2, 5}
 
 
-def test_keyframes_are_compared_in_every_source_that_can():
+def test_recent_scans_are_used_with_every_source_that_compares_pairs():
     setup = Setup(config(2), Calibration(), ImuNoise())
     assert isinstance(RESIDUAL_SOURCES["scan-matching"](setup), WithRecentScans)
     assert isinstance(RESIDUAL_SOURCES["network"](setup), WithRecentScans)

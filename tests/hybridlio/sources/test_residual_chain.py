@@ -1,4 +1,4 @@
-"""Two residual sources in a row: who starts where, whose answer counts, and what is left when one fails."""
+"""Two residual sources in a row: where each starts, whose answer is used, and failures of either."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ SURE = replace(UNSURE, covariance=np.eye(6) * 1e-4)
 
 
 class Moved:
-    """Moves the initial pose ahead and remembers what it was given."""
+    """Moves the initial pose forward and remembers its input."""
 
     def __init__(self, name, metres, sigma=0.01, ok=True):
         self.name, self._metres, self._covariance, self._ok = name, metres, np.eye(6) * sigma**2, ok
@@ -46,7 +46,7 @@ def ahead_m(relative):
     return se3.log(se3.between(UNSURE.pose, relative.pose))[3]
 
 
-def test_from_an_unsure_pose_the_second_starts_where_the_first_has_got_to_and_has_the_last_word():
+def test_from_a_vague_pose_the_second_source_refines_the_first_ones_answer():
     first, second = Moved("coarse", 0.2), Moved("fine", 0.03)
     chain = ResidualChain(first, second)
     chain.start(FRAME)
@@ -59,7 +59,7 @@ def test_from_an_unsure_pose_the_second_starts_where_the_first_has_got_to_and_ha
     assert found.details == {"coarse ok": 1, "coarse cost": 0.2, "fine ok": 1, "fine cost": 0.03}
 
 
-def test_where_the_first_fails_the_second_starts_at_the_initial_pose():
+def test_if_the_first_source_fails_the_second_starts_at_the_initial_pose():
     second = Moved("fine", 0.03)
     found = ResidualChain(Moved("coarse", 0.2, ok=False), second).refine(FRAME, UNSURE)
     assert second.given == [UNSURE]
@@ -68,7 +68,7 @@ def test_where_the_first_fails_the_second_starts_at_the_initial_pose():
     assert ahead_m(found) == pytest.approx(0.03)
 
 
-def test_where_the_second_fails_the_firsts_answer_stands():
+def test_if_the_second_source_fails_the_first_ones_answer_is_used():
     found = ResidualChain(Moved("coarse", 0.2), Moved("fine", 0.0, ok=False)).refine(FRAME, UNSURE)
     assert found.ok
     assert ahead_m(found) == pytest.approx(0.2)
@@ -76,7 +76,7 @@ def test_where_the_second_fails_the_firsts_answer_stands():
     assert found.details["fine ok"] == 0
 
 
-def test_where_both_fail_the_initial_pose_bridges_and_the_details_say_so():
+def test_if_both_sources_fail_the_initial_pose_bridges():
     found = ResidualChain(Moved("coarse", 0.2, ok=False), Moved("fine", 0.0, ok=False)).refine(FRAME, UNSURE)
     assert not found.ok
     assert (found.source, found.from_imu) == ("guess", True)
@@ -85,7 +85,7 @@ def test_where_both_fail_the_initial_pose_bridges_and_the_details_say_so():
     assert (found.details["coarse ok"], found.details["fine ok"]) == (0, 0)
 
 
-def test_where_the_first_leaves_a_direction_open_the_second_starts_at_the_initial_pose():
+def test_if_the_first_source_is_degenerate_the_second_starts_at_the_initial_pose():
     first, second = Moved("coarse", 0.2), Moved("fine", 0.0)
     first.degenerate = np.eye(6)[3:4]
     found = ResidualChain(first, second).refine(FRAME, UNSURE)
@@ -93,7 +93,7 @@ def test_where_the_first_leaves_a_direction_open_the_second_starts_at_the_initia
     assert (found.ok, len(found.degenerate)) == (True, 0)
 
 
-def test_of_a_sure_pose_the_first_only_proposes_where_to_start_and_is_not_asked_how_good_that_is():
+def test_from_a_certain_pose_the_first_source_only_proposes():
     first, second = Moved("coarse", 0.2), Moved("fine", 0.03)
     found = ResidualChain(first, second).refine(FRAME, SURE)
     assert first.given == []
@@ -105,7 +105,7 @@ def test_of_a_sure_pose_the_first_only_proposes_where_to_start_and_is_not_asked_
     assert found.details == {"fine ok": 1, "fine cost": 0.03}
 
 
-def test_where_the_second_fails_from_a_sure_pose_the_first_is_judged_and_the_second_goes_on_from_its_answer():
+def test_if_the_second_source_fails_from_a_certain_pose_the_proposal_is_judged_and_used():
     class Keeping(Moved):
         def take_back(self, initial):
             self.kept = initial
@@ -118,13 +118,13 @@ def test_where_the_second_fails_from_a_sure_pose_the_first_is_judged_and_the_sec
     assert (found.details["coarse ok"], found.details["fine ok"]) == (1, 0)
 
 
-def test_where_both_fail_from_a_sure_pose_it_bridges():
+def test_if_both_sources_fail_a_certain_pose_bridges():
     found = ResidualChain(Moved("coarse", 0.2, ok=False), Moved("fine", 0.0, ok=False)).refine(FRAME, SURE)
     assert (found.ok, found.source, found.proposed) == (False, "guess", None)
     assert np.array_equal(found.covariance, SURE.covariance)
 
 
-def test_both_hear_that_their_answer_was_not_believed():
+def test_both_sources_take_a_rejected_answer_back():
     class Humble(Moved):
         def take_back(self, initial):
             self.given.append(("back", initial))

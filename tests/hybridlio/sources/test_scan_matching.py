@@ -42,7 +42,7 @@ def empty(frame: Frame) -> Frame:
 
 
 def error(found: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
-    """Degrees and metres."""
+    """Return the error in degrees and metres."""
     xi = se3.log(se3.between(found, truth))
     return float(np.degrees(np.linalg.norm(xi[:3]))), float(np.linalg.norm(xi[3:]))
 
@@ -62,8 +62,8 @@ def test_a_short_drive_is_recovered_from_poor_guesses(target: str, sequence: Seq
         assert found.ok
         assert found.source == "scan-matching"
         assert not found.from_imu
-        assert metres < 0.04  # of 15 cm
-        assert degrees < 0.35  # of a sensor of 16 beams, each step beginning a third of a degree off
+        assert metres < 0.04  # the initial poses are 15 cm off
+        assert degrees < 0.35  # with 16 beams, and initial poses a third of a degree off
         whole = whole @ found.pose
     degrees, metres = error(whole, true_pose(sequence, 0, len(frames) - 1))
     assert metres < (0.06 if target == "local-map" else 0.12)
@@ -71,8 +71,8 @@ def test_a_short_drive_is_recovered_from_poor_guesses(target: str, sequence: Seq
 
 
 @pytest.mark.parametrize("skipped", [2, 3, 4])
-def test_a_start_at_speed_is_found_with_no_idea_of_it(skipped: int, sequence: Sequence, frames: list[Frame]):
-    """Scans left out of a drive at 8 m/s make one at 16, 24 and 32 m/s."""
+def test_an_unknown_speed_is_found_at_the_start(skipped: int, sequence: Sequence, frames: list[Frame]):
+    """Leaving scans out of a drive at 8 m/s makes drives at 16, 24 and 32 m/s."""
     matching = ScanMatching()
     matching.start(frames[0])
     fast = with_points(frames[skipped], frames[skipped].scan.points, frames[1].scan.stamp_ns)
@@ -82,7 +82,7 @@ def test_a_start_at_speed_is_found_with_no_idea_of_it(skipped: int, sequence: Se
     assert error(found.pose, truth)[1] < 0.05
 
 
-def test_a_start_at_rest_stays_at_rest(frames: list[Frame]):
+def test_a_start_at_rest_is_found_at_rest(frames: list[Frame]):
     matching = ScanMatching()
     matching.start(frames[0])
     found = matching.refine(frames[1], guess(np.eye(4), unknown_motion_covariance(0.1)))
@@ -95,7 +95,7 @@ def test_a_start_at_rest_stays_at_rest(frames: list[Frame]):
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_the_same_drive_gives_the_same_bytes(target: str, sequence: Sequence, frames: list[Frame]):
+def test_the_same_drive_gives_identical_results(target: str, sequence: Sequence, frames: list[Frame]):
     def drive() -> list[bytes]:
         matching, out = ScanMatching(ScanMatchingSettings(target=target)), []
         matching.start(frames[0])
@@ -107,8 +107,8 @@ def test_the_same_drive_gives_the_same_bytes(target: str, sequence: Sequence, fr
     assert drive() == drive()
 
 
-def test_its_covariance_is_what_its_errors_are(sequence: Sequence, frames: list[Frame]):
-    """Of the order of: a 16-beam scan's first steps are worse than claimed in pitch."""
+def test_the_covariance_is_of_the_order_of_the_errors(sequence: Sequence, frames: list[Frame]):
+    """A wide interval, because the pitch of a 16-beam sensor's first steps is less certain than its covariance."""
     matching, nees = ScanMatching(), []
     matching.start(frames[0])
     for k in range(1, len(frames)):
@@ -119,10 +119,10 @@ def test_its_covariance_is_what_its_errors_are(sequence: Sequence, frames: list[
     assert 0.05 < np.mean(nees) < 3.0
 
 
-# ------------------------------------------------------------------------------------------------ what it says
+# ------------------------------------------------------------------------------------------------ what it returns
 
 
-def test_only_a_maps_errors_are_taken_back_by_the_next_step(sequence: Sequence, frames: list[Frame]):
+def test_only_a_part_of_the_covariance_drifts_with_a_local_map(sequence: Sequence, frames: list[Frame]):
     for target in TARGETS:
         settings = ScanMatchingSettings(target=target)
         matching = ScanMatching(settings)
@@ -133,11 +133,11 @@ def test_only_a_maps_errors_are_taken_back_by_the_next_step(sequence: Sequence, 
         else:
             assert found.drift is not None
             share = np.trace(found.drift) / np.trace(found.covariance)
-            assert settings.drift_share * 0.999 <= share < 1  # more of it while the map is young
+            assert settings.drift_share * 0.999 <= share < 1  # a larger share while the map is young
             np.testing.assert_allclose(found.drift, share * found.covariance)
 
 
-def test_details_say_how_it_went(sequence: Sequence, frames: list[Frame]):
+def test_details_hold_the_registrations_diagnostics(sequence: Sequence, frames: list[Frame]):
     matching = ScanMatching()
     matching.start(frames[0])
     details = matching.refine(frames[1], guess(true_pose(sequence, 0, 1) @ OFF)).details
@@ -149,7 +149,7 @@ def test_details_say_how_it_went(sequence: Sequence, frames: list[Frame]):
     assert 0 < details["cost"] < 0.5
 
 
-def test_points_out_of_range_count_for_nothing(rng: np.random.Generator, sequence: Sequence, frames: list[Frame]):
+def test_points_out_of_range_are_ignored(rng: np.random.Generator, sequence: Sequence, frames: list[Frame]):
     vehicle = rng.uniform(-1, 1, (3000, 3))
     beyond = rng.normal(size=(3000, 3))
     beyond *= 150 / np.linalg.norm(beyond, axis=1, keepdims=True)
@@ -166,7 +166,7 @@ def test_points_out_of_range_count_for_nothing(rng: np.random.Generator, sequenc
 
 
 def corridor(rng: np.random.Generator) -> np.ndarray:
-    """A floor and two walls along x, 6 m apart."""
+    """Return points on a floor and two walls along x, 6 m apart."""
     x = rng.uniform(-25, 25, (30000, 1))
     across = rng.uniform(-3, 3, (10000, 1))
     height = rng.uniform(-1.7, 3.0, (20000, 1))
@@ -175,7 +175,7 @@ def corridor(rng: np.random.Generator) -> np.ndarray:
     return np.concatenate([floor, walls]) + 0.01 * rng.standard_normal((30000, 3))
 
 
-def test_in_a_corridor_it_says_that_it_does_not_know_how_far_it_went(rng: np.random.Generator, frames: list[Frame]):
+def test_the_direction_along_a_corridor_is_degenerate(rng: np.random.Generator, frames: list[Frame]):
     matching = ScanMatching()
     matching.start(with_points(frames[0], corridor(rng)))
     initial = guess(se3.exp(np.array([0.0, 0.0, 0.004, 0.8, 0.05, -0.03])))
@@ -185,22 +185,24 @@ def test_in_a_corridor_it_says_that_it_does_not_know_how_far_it_went(rng: np.ran
     assert abs(found.degenerate[0, 3]) > 0.99
     assert np.sqrt(found.covariance[3, 3]) > 1.0
     assert (np.sqrt(np.diag(found.covariance)[[4, 5]]) < 0.05).all()
-    # along the corridor the initial pose's word stands; across it the walls'
+    # along the corridor the initial pose is kept, across it the walls decide
     assert found.pose[0, 3] == pytest.approx(0.8, abs=0.05)
     np.testing.assert_allclose(found.pose[1:3, 3], 0.0, atol=0.01)
 
 
-def test_along_a_corridor_a_proposal_counts_for_nothing(rng: np.random.Generator, frames: list[Frame]):
+def test_a_proposal_is_ignored_along_a_corridor(rng: np.random.Generator, frames: list[Frame]):
     matching = ScanMatching()
     matching.start(with_points(frames[0], corridor(rng)))
     initial = guess(se3.exp(np.array([0.0, 0.0, 0.004, 0.8, 0.05, -0.03])))
-    proposed = replace(initial, proposed=se3.exp(np.array([0, 0, 0, 0.3, 0, 0])))  # half a metre back, straight
+    proposed = replace(
+        initial, proposed=se3.exp(np.array([0, 0, 0, 0.3, 0, 0]))
+    )  # half a metre behind, without rotation
     found = matching.refine(with_points(frames[1], corridor(rng)), proposed)
     assert found.pose[0, 3] == pytest.approx(0.8, abs=0.05)
     np.testing.assert_allclose(found.pose[1:3, 3], 0.0, atol=0.01)
 
 
-def test_a_good_proposal_saves_steps_and_a_bad_one_changes_nothing(sequence: Sequence, frames: list[Frame]):
+def test_a_good_proposal_saves_iterations_and_a_bad_one_has_no_effect(sequence: Sequence, frames: list[Frame]):
     truth, answers = true_pose(sequence, 0, 1), {}
     for name, proposed in {"none": None, "good": truth, "bad": truth @ OFF @ OFF @ OFF}.items():
         matching = ScanMatching()
@@ -216,7 +218,9 @@ def test_a_good_proposal_saves_steps_and_a_bad_one_changes_nothing(sequence: Seq
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_an_empty_scan_is_bridged_and_the_path_goes_on(target: str, sequence: Sequence, frames: list[Frame]):
+def test_an_empty_scan_is_bridged_and_the_next_one_corrects_the_bridge(
+    target: str, sequence: Sequence, frames: list[Frame]
+):
     matching = ScanMatching(ScanMatchingSettings(target=target))
     matching.start(frames[0])
     matching.refine(frames[1], guess(true_pose(sequence, 0, 1)))
@@ -229,7 +233,7 @@ def test_an_empty_scan_is_bridged_and_the_path_goes_on(target: str, sequence: Se
     assert bridged.details["points"] == 0
     after = matching.refine(frames[3], guess(true_pose(sequence, 2, 3)))
     assert after.ok
-    # what the bridge was off by, the next step takes back: scan 3 is found beside scan 1
+    # the next step undoes the bridge's error, because scan 3 is matched to scan 1
     assert error(bridged.pose @ after.pose, true_pose(sequence, 1, 3))[1] < 0.04
 
 
@@ -241,7 +245,7 @@ def test_three_empty_scans_in_a_row_are_bridged(sequence: Sequence, frames: list
     assert matching.refine(frames[4], guess(true_pose(sequence, 3, 4) @ OFF)).ok
 
 
-def test_a_bridge_more_precise_than_the_map_is_no_error(sequence: Sequence, frames: list[Frame]):
+def test_a_bridge_may_be_more_precise_than_the_map(sequence: Sequence, frames: list[Frame]):
     matching = ScanMatching()
     matching.start(frames[0])
     precise = guess(true_pose(sequence, 0, 1), np.eye(6) * 1e-12)
@@ -259,7 +263,7 @@ def test_a_scan_of_another_place_is_bridged(rng: np.random.Generator, sequence: 
     assert found.details["matched"] < 0.3
 
 
-def test_a_scan_that_was_bridged_is_no_part_of_the_map(sequence: Sequence, frames: list[Frame]):
+def test_a_bridged_scan_does_not_enter_the_map(sequence: Sequence, frames: list[Frame]):
     answers = []
     for between in (empty(frames[1]), with_points(frames[1], frames[1].scan.points[:150])):
         matching = ScanMatching()
@@ -270,13 +274,13 @@ def test_a_scan_that_was_bridged_is_no_part_of_the_map(sequence: Sequence, frame
 
 
 @pytest.mark.parametrize("points", [0, 50])
-def test_a_first_scan_of_too_few_points_cannot_be_started_at(points: int, frames: list[Frame]):
+def test_a_first_scan_with_too_few_points_is_refused(points: int, frames: list[Frame]):
     poor = with_points(replace(frames[0], index=17), frames[0].scan.points[:points])
     with pytest.raises(DataError, match=r"frame 17: only \d+ points between .* start at a scan with at least 200"):
         ScanMatching().start(poor)
 
 
-def test_a_start_that_failed_can_be_followed_by_one_that_works(sequence: Sequence, frames: list[Frame]):
+def test_a_failed_start_can_be_followed_by_another(sequence: Sequence, frames: list[Frame]):
     matching = ScanMatching()
     with pytest.raises(DataError):
         matching.start(empty(frames[0]))
@@ -284,7 +288,7 @@ def test_a_start_that_failed_can_be_followed_by_one_that_works(sequence: Sequenc
     assert matching.refine(frames[2], guess(true_pose(sequence, 1, 2))).ok
 
 
-def test_a_first_scan_of_one_beam_is_no_map_and_the_next_one_is(sequence: Sequence, frames: list[Frame]):
+def test_a_first_scan_without_planes_is_followed_by_another_first_keyframe(sequence: Sequence, frames: list[Frame]):
     turn = np.linspace(0, 2 * np.pi, 900, endpoint=False)
     ring = np.column_stack([40 * np.cos(turn), 40 * np.sin(turn), np.full(900, -1.0)])
     matching = ScanMatching()

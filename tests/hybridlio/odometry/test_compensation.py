@@ -1,4 +1,4 @@
-"""Motion within a sweep: how a gyroscope turns it, how sure that is, and what odometry makes of it at the start."""
+"""Motion during a sweep: its estimate from the gyroscope, the noise left, and compensation at start-up."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def turning(rate: np.ndarray, stamps_ns: np.ndarray) -> ImuSamples:
 
 
 def sweep(k: int, rng: np.random.Generator, imu: bool = True) -> tuple[Frame, np.ndarray]:
-    """A scan of points around a lidar that turns on the spot, and where they are as seen at its stamp."""
+    """Return a scan of points around a lidar that rotates on the spot, and the points as seen at its stamp."""
     stamp_ns = k * SWEEP_NS
     offsets_ns = np.sort(rng.integers(-SWEEP_NS // 2, SWEEP_NS // 2, 400)).astype(np.int32)
     points = rng.uniform(-30.0, 30.0, (400, 3))
     turned = se3.so3_exp(RATE * (offsets_ns / 1e9)[:, None])
-    seen = np.einsum("nji,nj->ni", turned, points)  # from the lidar of each point's own time
+    seen = np.einsum("nji,nj->ni", turned, points)  # in the lidar frame at each point's time
     samples, during = ImuSamples.empty(), ImuSamples.empty()
     if imu:
         samples = turning(RATE, np.arange(stamp_ns - SWEEP_NS, stamp_ns + 1, SWEEP_NS // 10))
@@ -38,7 +38,7 @@ def sweep(k: int, rng: np.random.Generator, imu: bool = True) -> tuple[Frame, np
 
 
 class Watched:
-    """A residual source that keeps what it is given, and finds a step that is known."""
+    """A residual source that keeps its input and returns a known step."""
 
     name = "watched"
 
@@ -56,7 +56,7 @@ class Watched:
 
 
 @pytest.mark.parametrize("speed_m_s", [0.0, 12.0])
-def test_a_sweep_turns_as_its_samples_say_without_their_bias_and_goes_on_at_the_speed_of_the_step(rng, speed_m_s):
+def test_a_sweeps_rotation_comes_from_unbiased_samples_and_its_speed_from_the_step(rng, speed_m_s):
     frame, _ = sweep(1, rng)
     biased = Frame(1, frame.scan, sweep_imu=turning(RATE + BIAS, frame.sweep_imu.stamps_ns))
     step = constant_twist(se3.make(np.eye(3), [speed_m_s / 10, 0.0, 0.0]), 0, SWEEP_NS)
@@ -67,14 +67,14 @@ def test_a_sweep_turns_as_its_samples_say_without_their_bias_and_goes_on_at_the_
     np.testing.assert_allclose(np.linalg.norm(twists[:, 3:], axis=1), speed_m_s, atol=1e-3)
 
 
-def test_without_samples_a_sweep_goes_on_as_the_step(rng):
+def test_without_samples_a_sweep_continues_the_step(rng):
     frame, _ = sweep(1, rng, imu=False)
     assert sweep_motion(frame, STANDING, BIAS, Calibration()) is STANDING
 
 
 @pytest.mark.parametrize("imu", [True, False])
-def test_what_compensation_leaves_is_as_large_as_said(rng, imu):
-    """Simulated: the mean turn of a sweep's points, by a gyroscope's noise or by a rate that is off."""
+def test_the_error_left_by_compensation_has_the_predicted_variance(rng, imu):
+    """Simulate the mean rotation of a sweep's points by the gyroscope's noise, or by a wrong rate without IMU."""
     noise, steps = ImuNoise(gyro_rad_s_sqrt_hz=2e-3), 200
     frame, _ = sweep(1, rng, imu=imu)
     said = compensation_noise(frame, noise)
@@ -83,14 +83,14 @@ def test_what_compensation_leaves_is_as_large_as_said(rng, imu):
     if imu:
         walk = np.cumsum(rng.normal(0.0, noise.gyro_rad_s_sqrt_hz * np.sqrt(dt_s), (runs, steps)), axis=1)
         turned = walk - walk[:, [steps // 2]]
-        once = np.mean(turned.mean(axis=1) ** 2)  # as a whole
+        once = np.mean(turned.mean(axis=1) ** 2)  # of the whole scan
     else:
         turned = rng.normal(0.0, 0.02, (runs, 1)) * np.linspace(-0.5, 0.5, steps) * SWEEP_NS / 1e9
-        once = np.mean(turned**2)  # of a point
+        once = np.mean(turned**2)  # of one point
     np.testing.assert_allclose(np.diag(said)[:3], 2 * once, rtol=0.1)
 
 
-def test_the_first_scan_is_handed_on_with_its_turn_taken_out(rng):
+def test_the_first_scan_is_compensated_for_rotation(rng):
     source = Watched()
     frame, points = sweep(0, rng)
     Odometry(residual=source).step(frame)
@@ -98,7 +98,7 @@ def test_the_first_scan_is_handed_on_with_its_turn_taken_out(rng):
     assert source.started[0].scan.time_offsets_ns is None
 
 
-def test_once_the_speed_is_known_the_first_scan_is_handed_on_again_with_it_taken_out(rng):
+def test_the_first_scan_is_compensated_again_once_the_speed_is_known(rng):
     odometry = Odometry(residual=(source := Watched()))
     (first, points), (second, _) = sweep(0, rng), sweep(1, rng)
     for frame in (first, second):
@@ -109,7 +109,7 @@ def test_once_the_speed_is_known_the_first_scan_is_handed_on_again_with_it_taken
     assert len(source.started) == 2
 
 
-def test_without_imu_the_first_step_is_looked_for_again_from_what_was_found(rng):
+def test_without_imu_the_first_step_is_repeated_from_its_result(rng):
     odometry = Odometry("constant-velocity", residual=(source := Watched()))
     for k in range(3):
         odometry.step(sweep(k, rng, imu=False)[0])

@@ -1,4 +1,4 @@
-"""An IMU that starts after the scans is taken up when it comes."""
+"""Start-up with an IMU whose samples start after the scans."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LATE = 15
 
 
 class Given:
-    """A residual source that gives the chain's relative poses."""
+    """A residual source that returns the chain's relative poses."""
 
     name = "given"
 
@@ -28,14 +28,14 @@ class Given:
         self._relative = relative
 
     def start(self, frame: Frame) -> None:
-        """Nothing to keep."""
+        """Do nothing."""
 
     def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:  # noqa: ARG002
         return self._relative[frame.index - 1]
 
 
 def late(frames: list[Frame], first: int = LATE) -> list[Frame]:
-    """The frames without the samples up to scan ``first``, and half of those of the step after it."""
+    """Return the frames without samples up to scan ``first`` and for half of the step after it."""
     out = [replace(frame, imu=ImuSamples.empty()) if frame.index <= first else frame for frame in frames]
     middle = (frames[first].scan.stamp_ns + frames[first + 1].scan.stamp_ns) // 2
     out[first + 1] = replace(out[first + 1], imu=out[first + 1].imu.between(middle, frames[first + 1].scan.stamp_ns))
@@ -57,7 +57,7 @@ def drive(request: pytest.FixtureRequest) -> Chain:
 
 
 @pytest.mark.parametrize("backend", ["incremental", "fixed-lag"])
-def test_gravity_speed_and_biases_are_found_once_samples_come(drive: Chain, backend: str):
+def test_gravity_speed_and_biases_are_estimated_once_samples_come(drive: Chain, backend: str):
     _, states = driven(drive, late(drive.frames), backend)
     assert [state.has_imu for state in states] == [k > LATE for k in range(1, len(drive.frames))]
     end, (whole, *_) = states[-1], driven(drive, drive.frames, backend)[1][::-1]
@@ -69,13 +69,13 @@ def test_gravity_speed_and_biases_are_found_once_samples_come(drive: Chain, back
         off = found - truth
         assert off @ np.linalg.solve(sigma, off) < 16.0  # χ² of three, 0.999
     assert np.linalg.norm(end.velocity_m_s - drive.velocities[-1]) < 0.3
-    # as sure of the speed as with samples from the start, but of the pose as far as the steps alone had it
+    # the speed is known as well as with samples from the start, the pose only as well as from the steps
     assert np.sqrt(np.trace(end.covariance[6:9, 6:9])) < 2 * np.sqrt(np.trace(whole.covariance[6:9, 6:9]))
     assert np.trace(end.covariance[:3, :3]) > np.trace(whole.covariance[:3, :3])
 
 
 @pytest.mark.parametrize("backend", ["incremental", "fixed-lag", "none"])
-def test_poses_stay_where_they_were_and_within_their_covariances(drive: Chain, backend: str):
+def test_taking_up_a_late_imu_keeps_poses_within_their_covariances(drive: Chain, backend: str):
     odometry, states = driven(drive, late(drive.frames), backend)
     without = driven(drive, [replace(f, imu=ImuSamples.empty()) for f in drive.frames], backend)[1]
     np.testing.assert_allclose(states[LATE - 1].T_world_imu, without[LATE - 1].T_world_imu, atol=1e-6)
@@ -84,7 +84,7 @@ def test_poses_stay_where_they_were_and_within_their_covariances(drive: Chain, b
     assert len(odometry.record().relative) == len(drive.relative)
 
 
-def test_smoothing_takes_the_late_samples_too(drive: Chain):
+def test_smoothing_uses_samples_that_start_late(drive: Chain):
     odometry, _ = driven(drive, late(drive.frames), "fixed-lag")
     record = odometry.record()
     assert record.start.has_imu
@@ -94,9 +94,7 @@ def test_smoothing_takes_the_late_samples_too(drive: Chain):
     assert tilt[0] < tilt[1]
 
 
-def test_a_drive_whose_imu_starts_late_is_followed_by_default_and_says_so(
-    tiny_drive: Path, caplog: pytest.LogCaptureFixture
-):
+def test_a_drive_whose_imu_starts_late_is_followed_with_a_warning(tiny_drive: Path, caplog: pytest.LogCaptureFixture):
     sequence = open_sequence(tiny_drive)
     odometry = Odometry()
     poses = np.array([odometry.step(frame).pose for frame in late(list(sequence), 10)])
