@@ -32,7 +32,7 @@ from torch import Tensor
 
 from hybridlio.cloud.preparation import prepare
 from hybridlio.core.arrays import Array
-from hybridlio.core.files import write_whole
+from hybridlio.core.files import write_atomically
 from hybridlio.core.sensors import LIDAR_MODELS, LidarModel, Scan
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.learned.data.pairs import Pairs
@@ -194,7 +194,7 @@ def train_in_phases(folder: Path, runs: Path, drives: int, epochs: int) -> None:
             )
             options = RunOptions("cpu", max_seconds=None if last else PHASE_S)
             train(phase, pairs, run, validation, start, options, Watchers(_say_now_and_then, _say_validation))
-            write_whole(run / "phase.done", "")
+            write_atomically(run / "phase.done", "")
         if last:
             return
         start = _weights_in(checkpoint, phase)
@@ -206,7 +206,7 @@ def _shards_of_run(run: Path, folder: Path) -> list[str]:
     if not listed.is_file():
         names = [shard.folder.name for shard in shards_in(folder / "training")]
         run.mkdir(parents=True, exist_ok=True)
-        write_whole(listed, "\n".join(names) + "\n")
+        write_atomically(listed, "\n".join(names) + "\n")
     return listed.read_text(encoding="utf-8").split()
 
 
