@@ -9,14 +9,16 @@ ARGS ?=
 
 RUN := $(VENV)/bin/python
 READY := $(VENV)/.stamp-ready
+DOCS_READY := $(VENV)/.stamp-docs
 
-.PHONY: help demo test lint format types clean
+.PHONY: help demo test lint format types docs clean
 
 help:
 	@echo 'make demo     simulate a drive, run the odometry, smooth, evaluate, report   (DEMO_SECONDS=60 DEMO=demo)'
 	@echo 'make test     all tests   (WORKERS=2 ARGS="-k kalman")'
 	@echo 'make lint     ruff: rules and format        make format   apply both'
 	@echo 'make types    mypy, strict, on all packages'
+	@echo 'make docs     build the documentation into site/, strictly'
 	@echo 'make clean    remove the environment and everything that was built'
 
 demo: $(READY)
@@ -36,8 +38,11 @@ format: $(READY)
 types: $(READY)
 	$(RUN) -m mypy
 
+docs: $(DOCS_READY)
+	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet
+
 clean:
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage
+	rm -rf $(VENV) build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage
 
 $(RUN):
 	@$(PYTHON) -c 'import sys; sys.exit("hybridlio needs Python 3.11 or newer: make PYTHON=python3.11" if sys.version_info < (3, 11) else 0)'
@@ -47,4 +52,8 @@ $(READY): pyproject.toml constraints.txt scripts/system-libraries.sh | $(RUN)
 	@bash scripts/system-libraries.sh $(RUN)
 	@echo 'installing hybridlio and what it needs into $(VENV) (a few minutes, once)'
 	@$(RUN) -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test]'
+	@touch $@
+
+$(DOCS_READY): $(READY)
+	@$(RUN) -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[docs]'
 	@touch $@

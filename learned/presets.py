@@ -66,7 +66,7 @@ DEFAULT = Recipe(
 """What ships: the LSTMs correct what velocity and mean angular velocity give, and a siamese encoder of both maps weighs
 the points of a registration between them, instead of the residual being read off pooled features.
 
-Each departure from ``paper``, and what it is worth, is in docs/learned.md.
+Each departure from ``paper``, and what it is worth, is in docs/concepts/one_loss.md.
 """
 
 PUBLISHED = Recipe(

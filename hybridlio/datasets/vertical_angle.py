@@ -19,7 +19,7 @@ from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.sensors import Scan
 from hybridlio.datasets.notes import Notes
 
-KITTI_VERTICAL_ANGLE_DEG = 0.205  # KISS-ICP's value; registration of two drives finds 0.18 to 0.20 (docs/datasets.md)
+KITTI_VERTICAL_ANGLE_DEG = 0.205  # KISS-ICP's value; registration of two drives finds 0.18 to 0.20 (docs/results.md)
 
 # digests of KITTI's calib_imu_to_velo.txt (the same on all dates) and of calib.txt's Tr (of 00-02, 03 and 04-21)
 _KITTI_CALIBRATIONS = frozenset({"416e61ca9ac1b4ea", "eca64c0091f55929", "328069dfec6ced4f", "31474ac6c25ac7ea"})

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 LSTM = "lstm"
 ADAPTED_SUFFIX = "-adapted"
-# Adaptation of trained weights; measured with these values in docs/training.md (benchmarks/front_end.py --adapt).
+# Adaptation of trained weights; measured with these values in docs/results.md (benchmarks/front_end.py --adapt).
 _ADAPTATION_EPOCHS = 10
 _ADAPTATION_RATE = 0.1  # share of the recipe's learning rate: small steps, which keep what the weights have learned
 
