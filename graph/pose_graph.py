@@ -21,11 +21,11 @@ from hybridlio.graph.model.measurements import Factor, Kind, factor_label
 from hybridlio.graph.model.new_factors import between_factor, check_direction, imu_factor, prior_factor, vector_factor
 from hybridlio.graph.model.noise import NoiseInput, RobustLike
 from hybridlio.graph.solve.batch import solve_batch
-from hybridlio.graph.solve.initial_values import InitialMethod, find_initial_values
+from hybridlio.graph.solve.initial_values import find_initial_values
 from hybridlio.graph.solve.nonlinear import IterationProgress, silent
 from hybridlio.graph.solve.online_solver import OnlineSolver
 from hybridlio.graph.solve.replay import solve_online
-from hybridlio.graph.solve.settings import ONLINE_SOLVERS, InitialName, OnlineSolverName, Settings, SolverName
+from hybridlio.graph.solve.settings import ONLINE_SOLVERS, InitialMethod, InitialName, OnlineName, Settings, SolverName
 from hybridlio.graph.solve.solution import Solution
 
 _UP = np.array([0.0, 0.0, 1.0])
@@ -259,9 +259,7 @@ class PoseGraph:
         solve = solve_online if backend in ONLINE_SOLVERS else solve_batch
         return solve(self._data, settings, progress or silent)
 
-    def online(
-        self, backend: OnlineSolverName = "incremental", *, lag: int = 200, forget: bool = False
-    ) -> OnlineSolver:
+    def online(self, backend: OnlineName = "incremental", *, lag: int = 200, forget: bool = False) -> OnlineSolver:
         """Return a solver that follows this graph while it grows: its ``update()`` takes over what has changed.
 
         Args:

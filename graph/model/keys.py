@@ -13,10 +13,10 @@ from hybridlio.core.errors import GraphError
 Key: TypeAlias = "int | tuple[int, int]"
 
 _INDEX_BITS = 56  # of GTSAM's 64-bit symbols; the letter takes the other eight
-_FIRST_LETTER = ord("a")  # of robot 0, as GTSAM's examples for several robots do
+_FIRST_LETTER = ord("a")  # of robot 0; data sets of several robots call them a, b, c
 _LAST_ROBOT = 127 - _FIRST_LETTER  # keeps the packed key within a signed 64-bit integer
 PLAIN_KEYS = _FIRST_LETTER << _INDEX_BITS  # integers below it are not packed
-_LISTED_KEYS = 10  # keys that a message lists before it only counts the rest
+_LISTED_KEYS = 10  # in a message, which then fits on a screen; the rest is counted
 
 
 def check_key(key: object) -> Key:

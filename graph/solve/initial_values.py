@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -17,9 +16,8 @@ from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, list_keys
 from hybridlio.graph.model.measurements import Factor
 from hybridlio.graph.solve.chordal import chordal_poses
+from hybridlio.graph.solve.settings import INITIAL_METHODS
 
-InitialMethod: TypeAlias = Literal["odometry", "spanning-tree", "chordal"]
-INITIAL_METHODS = ("odometry", "spanning-tree", "chordal")
 _FIXES_TO_ALIGN = 3  # positions that determine a rigid transform, if they are not on one line
 # χ² per degree of freedom up to which given initial values count as good, which saves the search for better ones. It is
 # 1 at the optimum of consistent factors; 2 allows for noise that was stated half as large as it is.

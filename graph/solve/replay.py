@@ -15,7 +15,7 @@ from hybridlio.graph.solve.online_solver import OnlineSolver
 from hybridlio.graph.solve.settings import Settings
 from hybridlio.graph.solve.solution import Solution
 
-_LAST_UPDATES = 3  # each linearises anew what has moved: two usually converge, the third confirms
+_LAST_UPDATES = 3  # each linearises anew what has moved, so they act as Gauss-Newton's last iterations
 
 
 def solve_online(graph: GraphData, settings: Settings, report: IterationProgress) -> Solution:

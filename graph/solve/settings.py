@@ -8,12 +8,14 @@ from typing import Literal, TypeAlias
 from hybridlio.core.errors import ConfigError
 
 SolverName: TypeAlias = Literal["auto", "batch", "gnc", "incremental", "fixed-lag"]
-OnlineSolverName: TypeAlias = Literal["incremental", "fixed-lag"]
-InitialName: TypeAlias = Literal["auto", "given", "odometry", "spanning-tree", "chordal"]
+OnlineName: TypeAlias = Literal["incremental", "fixed-lag"]
+InitialMethod: TypeAlias = Literal["odometry", "spanning-tree", "chordal"]
+InitialName: TypeAlias = Literal["auto", "given"] | InitialMethod
 
 SOLVERS = ("auto", "batch", "gnc", "incremental", "fixed-lag")
 ONLINE_SOLVERS = ("incremental", "fixed-lag")
-INITIAL = ("auto", "given", "odometry", "spanning-tree", "chordal")
+INITIAL_METHODS: tuple[InitialMethod, ...] = ("odometry", "spanning-tree", "chordal")
+INITIAL = ("auto", "given", *INITIAL_METHODS)
 
 
 @dataclass(frozen=True)
