@@ -27,7 +27,7 @@ _MAX_ANGLE_DEG = 5.0  # a larger error is not a calibration error: the angle is 
 _MAX_SCANS_TRIED = 5  # for one that can be read
 _MIN_REFLECTANCES = 20  # distinct values in a scan; a constant column proves nothing, KITTI's scans have dozens
 _ELEVATIONS_DEG = np.linspace(-20.0, 1.0, 1051)  # bins of 0.02°, within the lidar's field of view
-_RANGE_M = (5.0, 60.0)  # horizontal; nearer, the laser's offset changes the elevation, farther points are few
+_RANGE_M = (5.0, 60.0)  # horizontal; excludes the car itself and the few far points
 _MIN_ELEVATION_SHARE = 0.5  # KITTI's scans have returns in 72 % or more of the bins, beams from one origin in 5 %
 
 

@@ -45,7 +45,7 @@ class ChainSettings:
         true_noise: the IMU's real noise; by default the claimed one.
         step_sigmas: ``(6,)`` claimed standard deviations of a relative pose, rad and m.
         step_error: real standard deviations relative to the claimed ones.
-        drift_share: share of a relative pose's covariance that accumulates over steps, as of registration to a map;
+        drift_share: share of a relative pose's covariance that accumulates over steps, as in registration to a map;
             None for independent errors.
         back: also give the poses relative to the scans this many before.
         imu_hz: rate of the IMU.

@@ -26,6 +26,10 @@ from hybridlio.simulation.world.world import World
 DEFAULT_SECONDS = 60.0
 _MARGIN_S = 1.0  # of the path before and after the scans, for the IMU's lead and the spline's ends
 _BEHIND_M, _AHEAD_M = 70.0, 130.0  # road and town before the start and after the end: as far as the lidar sees them
+_LENGTH_RESERVE = 1.1  # of the road over the distance at cruising speed
+_SLOWEST, _LONGEST_STOPS_S = 0.25, 60.0  # mean speed relative to cruising, and time in stops, that a drive allows for
+_MIN_SECONDS = 0.2  # two scans
+_LANE_SIGMA_M = 3.0  # smooths the lane below a recorded path, whose points may be noisy
 _STRETCHES = (1.0, 1.3, 1.7, 2.2)  # factors of the road's length that are tried until the drive fits
 _ROUND_TRIP_SHARE = 0.25  # of the length: with bends and stops, two round trips fit in any drive of a minute
 _ROUND_TRIP_M = (220.0, 700.0)  # two blocks of houses
@@ -64,6 +68,7 @@ def plan(config: SimulationConfig) -> Drive:
 
 
 def _ground(land: Height, centreline: Road, config: SimulationConfig) -> Ground:
+    """Return the ground of a road on ``land``."""
     rng = np.random.default_rng([config.seed, RandomStream.GROUND])
     points = centreline.at(np.arange(0.0, centreline.length_m, STEP_M))
     roughness = waves(rng, *_ROUGHNESS)
@@ -72,18 +77,21 @@ def _ground(land: Height, centreline: Road, config: SimulationConfig) -> Ground:
 
 
 def _along_generated_road(config: SimulationConfig) -> Drive:
+    """Plan a drive along a generated road, which is made longer until the drive fits."""
     seconds = config.seconds or DEFAULT_SECONDS
-    length = config.length_m or 1.1 * config.speed_m_s * (seconds + 2 * _MARGIN_S)
-    most = 4 * length / config.speed_m_s + 60.0 if config.length_m else seconds
-    ticks = np.arange(round(-_MARGIN_S / FINE_S), round((most + _MARGIN_S) / FINE_S) + 1)
+    length = config.length_m or _LENGTH_RESERVE * config.speed_m_s * (seconds + 2 * _MARGIN_S)
+    most = length / (_SLOWEST * config.speed_m_s) + _LONGEST_STOPS_S if config.length_m else seconds
+    margin = round(_MARGIN_S / FINE_S)
+    ticks = np.arange(-margin, round((most + _MARGIN_S) / FINE_S) + 1)
     times = np.asarray(ticks * FINE_S, dtype=np.float64)
     for stretch in _STRETCHES:
         centreline, lane, ground, s = _driven(config, length, stretch, times)
-        driven = s - s[round(_MARGIN_S / FINE_S)]
+        driven = s - s[margin]
         if (driven[-1] > config.length_m) if config.length_m else (s[-1] < lane.length_m - STEP_M):
             break
     if config.length_m:
-        seconds = max(float(times[min(int(np.searchsorted(driven, config.length_m)), len(times) - 101)]), 0.2)
+        last = min(int(np.searchsorted(driven, config.length_m)), len(times) - margin - 1)
+        seconds = max(float(times[last]), _MIN_SECONDS)
     used = slice(0, round((seconds + 2 * _MARGIN_S) / FINE_S) + 1)
     path = drive_path(lane, s[used], times[used], ground)
     return _with_world(config, path, centreline, lane, ground, seconds)
@@ -109,6 +117,7 @@ def _driven(config: SimulationConfig, length: float, stretch: float, times: Arra
 
 
 def _along_poses(config: SimulationConfig) -> Drive:
+    """Plan a drive along a pose file, with heights corrected, on land that passes below it."""
     recorded = read_lidar_poses(config.require_poses(), config.poses_frame)
     lidar_poses = level_revisits(without_false_rises(recorded))
     path = path_along(lidar_poses)
@@ -117,7 +126,7 @@ def _along_poses(config: SimulationConfig) -> Drive:
         driven = np.cumsum(np.linalg.norm(np.diff(lidar_poses[:, :3, 3], axis=0), axis=1))
         seconds = min(seconds, (float(np.searchsorted(driven, config.length_m)) + 1) / SCAN_RATE_HZ)
     seconds = min(seconds, config.seconds or np.inf)
-    lidar = path.poses(np.arange(path.start_s, path.end_s, 0.1)) @ T_IMU_LIDAR
+    lidar = path.poses(np.arange(path.start_s, path.end_s, _EGO_STEP_S)) @ T_IMU_LIDAR
     below = lidar[:, :3, 3] - LIDAR_HEIGHT_M * lidar[:, :3, 2]
     lane = _road_below(below[:, :2], lidar[:, :2, 0])
     centreline = Road.through(lane.beside(np.arange(0.0, lane.length_m, STEP_M), LANE_OFFSET_M))
@@ -140,12 +149,13 @@ def _road_below(points: Array, ahead: Array) -> Road:
     rough = np.concatenate([back, points[kept], on])
     dense = Road.through(rough)
     even = dense.at(np.arange(0.0, dense.length_m, STEP_M))
-    return Road.through(gaussian_filter1d(even, 3.0 / STEP_M, axis=0, mode="nearest"))
+    return Road.through(gaussian_filter1d(even, _LANE_SIGMA_M / STEP_M, axis=0, mode="nearest"))
 
 
 def _with_world(
     config: SimulationConfig, path: SmoothPath, centreline: Road, lane: Road, ground: Ground, seconds: float
 ) -> Drive:
+    """Return a drive of ``seconds`` along ``path``, with objects and traffic."""
     items = lay_out(
         centreline,
         ground.centre,

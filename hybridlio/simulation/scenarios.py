@@ -90,7 +90,7 @@ def open_scenario(
         name: one of :data:`SCENARIOS`.
         out: a folder for the drives of all scenarios, each in a folder of its own.
         seed, length_m: of the drive.
-        progress: as of :func:`hybridlio.simulation.simulate.simulate`.
+        progress: see :func:`hybridlio.simulation.simulate.simulate`.
 
     Raises:
         ConfigError: there is no such scenario.
