@@ -12,6 +12,7 @@ from hybridlio.graph.model.keys import Key
 from hybridlio.graph.model.noise import Noise, Robust
 
 Kind: TypeAlias = Literal["between", "prior", "gps", "attitude", "velocity", "bias", "imu"]
+VECTOR_NOISE_SIZE = {"gps": 3, "attitude": 2, "velocity": 3, "bias": 6}  # a direction has two degrees of freedom
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,10 +13,8 @@ from hybridlio.core.sensors import ImuNoise, ImuSamples
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, check_key
-from hybridlio.graph.model.measurements import Factor, Kind, factor_label
+from hybridlio.graph.model.measurements import VECTOR_NOISE_SIZE, Factor, Kind, factor_label
 from hybridlio.graph.model.noise import NoiseInput, RobustLike, make_noise, make_robust
-
-_VECTOR_NOISE_SIZE = {"gps": 3, "attitude": 2, "velocity": 3, "bias": 6}  # a direction has two degrees of freedom
 
 
 def prior_factor(data: GraphData, key: Key, pose: ArrayLike, noise: NoiseInput, robust: RobustLike) -> Factor:
@@ -71,7 +69,7 @@ def vector_factor(
         DataError: a vector is malformed, or the noise is not symmetric positive definite.
         GraphError: unknown pose, a planar graph, or none or several forms of noise.
     """
-    name, size = factor_label(kind, (key,)), _VECTOR_NOISE_SIZE[kind]
+    name, size = factor_label(kind, (key,)), VECTOR_NOISE_SIZE[kind]
     (key,) = data.known_keys(key, what=name)
     data.require_space(name)
     measured = np.concatenate([check_vector(vector, 3, name) for vector in vectors])
