@@ -9,15 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import Array, Stamps
 from hybridlio.core.sensors import ImuSamples
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.core.trajectory_files import write_kitti, write_tum
 
-Array = NDArray[np.float64]
 EARTH_RADIUS_M, LATITUDE_DEG, LONGITUDE_DEG = 6378137.0, 49.0, 8.4
 SPEED_M_S, YAW_RATE_RAD_S = 8.0, 0.2
 MS = 1_000_000
@@ -35,10 +34,10 @@ class Ride:
     )
 
     @property
-    def stamps_ns(self) -> NDArray[np.int64]:
+    def stamps_ns(self) -> Stamps:
         return self.start_ns + np.arange(self.count) * 100 * MS
 
-    def T_enu_imu(self, stamps_ns: NDArray[np.int64]) -> Array:
+    def T_enu_imu(self, stamps_ns: Stamps) -> Array:
         seconds = (np.asarray(stamps_ns) - self.start_ns) / 1e9
         twist = np.array([0, 0, YAW_RATE_RAD_S, SPEED_M_S, 0, 0])
         return se3.exp([0.02, -0.01, 0.5, 0, 0, 0]) @ se3.exp(seconds[:, None] * twist)
@@ -47,17 +46,17 @@ class Ride:
     def lidar(self) -> Trajectory:
         return Trajectory(self.stamps_ns, self.T_enu_imu(self.stamps_ns) @ self.T_imu_lidar).from_first()
 
-    def imu(self, stamps_ns: NDArray[np.int64]) -> ImuSamples:
+    def imu(self, stamps_ns: Stamps) -> ImuSamples:
         rows = np.ones((len(stamps_ns), 1))
         return ImuSamples(stamps_ns, rows * [0, 0, YAW_RATE_RAD_S], rows * [0, SPEED_M_S * YAW_RATE_RAD_S, 9.81])
 
-    def imu_stamps_ns(self, period_ms: int) -> NDArray[np.int64]:
+    def imu_stamps_ns(self, period_ms: int) -> Stamps:
         return np.arange(self.stamps_ns[0] - 30 * MS, self.stamps_ns[-1] + 130 * MS, period_ms * MS)
 
     def points(self, k: int) -> Array:
         return np.random.default_rng(k).uniform(-20, 20, size=(50 + k, 4)) * [1, 1, 0.1, 0.02] + [0, 0, 0, 0.5]
 
-    def oxts_rows(self, stamps_ns: NDArray[np.int64]) -> Array:
+    def oxts_rows(self, stamps_ns: Stamps) -> Array:
         """Return KITTI's 30 columns, with the inverse of the Mercator projection at the ride's start."""
         T, imu = self.T_enu_imu(stamps_ns), self.imu(np.arange(len(stamps_ns)))  # the same at all times
         scale = EARTH_RADIUS_M * np.cos(np.radians(LATITUDE_DEG))
@@ -85,11 +84,11 @@ def put_bin(path: Path, points: Array) -> Path:
     return put(path, np.asarray(points, dtype="<f4").tobytes())
 
 
-def put_oxts(folder: Path, ride: Ride, stamps_ns: NDArray[np.int64]) -> None:
+def put_oxts(folder: Path, ride: Ride, stamps_ns: Stamps) -> None:
     put_rows(folder, stamps_ns, ride.oxts_rows(stamps_ns))
 
 
-def put_rows(folder: Path, stamps_ns: NDArray[np.int64], rows: Array) -> None:
+def put_rows(folder: Path, stamps_ns: Stamps, rows: Array) -> None:
     put(folder / "timestamps.txt", "".join(f"{iso(t)}\n" for t in stamps_ns))
     for k, row in enumerate(rows):
         put(folder / f"data/{k:010d}.txt", " ".join(f"{v:.14g}" for v in row) + "\n")

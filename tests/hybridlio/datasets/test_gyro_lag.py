@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from hybridlio.core.arrays import Array
 from hybridlio.datasets.gyro_lag import gyro_lag_ns
 from hybridlio.datasets.stamps import read_stamps
 
-Array = NDArray[np.float64]
 MS = 1_000_000
 START_NS = 1_317_042_272_000_000_000
 
