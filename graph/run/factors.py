@@ -24,7 +24,8 @@ Factors = list[gtsam.NonlinearFactor]
 
 VARIABLES = (X, V, B, G, M)  # that a scan may have
 
-# Tight enough to define the origin (a thousandth of the best registration), loose enough for double precision.
+# Tight enough to define the origin, far below the floors of any measurement (5e-5 rad, 1e-3 m), and loose enough for
+# double precision.
 _GAUGE_SIGMA = 1e-6
 _GRAVITY_CHAIN_SIGMA_M_S2 = 1e-6  # per scan; 0.1 mm/s² after 10,000 scans, so gravity stays one vector
 # Random walk of the biases over a gap in the samples, m/s² and rad/s per √s: 30 and 50 times the defaults of ImuNoise,

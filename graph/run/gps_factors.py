@@ -227,8 +227,8 @@ def _noise_scale(fixes: Sequence[GpsFix], residuals: Array, inliers: NDArray[np.
     steps = np.diff(stamps)
     if len(steps) < _LEAST_FOR_SPREAD:
         return 1.0
-    beside = np.maximum(steps[1:], steps[:-1]) < _LONGEST_PAUSE * np.median(steps)
-    regular = np.flatnonzero(beside & inliers[2:] & inliers[1:-1] & inliers[:-2])
+    consecutive = np.maximum(steps[1:], steps[:-1]) < _LONGEST_PAUSE * np.median(steps)
+    regular = np.flatnonzero(consecutive & inliers[2:] & inliers[1:-1] & inliers[:-2])
     if len(regular) < _LEAST_FOR_SPREAD:
         return 1.0
     second = residuals[regular] - 2 * residuals[regular + 1] + residuals[regular + 2]

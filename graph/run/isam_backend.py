@@ -18,8 +18,8 @@ from hybridlio.graph.run.inertial_steps import InertialSteps
 from hybridlio.graph.run.scan_numbers import ScanNumbers
 
 # While tilt, speed and biases converge (2 s at 10 Hz), every step relinearises everything that it changes; the graph is
-# still small. In the very first steps even that diverges, as the speed may be off by 20 m/s and down by 0.3 rad: these
-# are solved from scratch by damped iterations.
+# still small. In the very first steps the speed may be wrong by 20 m/s and gravity's direction by 0.3 rad, too much for
+# that: they are solved from scratch by damped iterations.
 WARM_UP_STEPS = 20
 _DAMPED_STEPS = 5
 

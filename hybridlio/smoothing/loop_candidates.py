@@ -118,8 +118,8 @@ class CandidateFinder:
         """Add keyframe ``k`` and return its candidates; keyframes are added in order."""
         descriptor = self._settings.descriptor
         points = se3.transform(self._levels[k], self._surroundings(k))
-        beside = [(0.0, left, 0.0) for left in descriptor.beside_m]
-        views = np.stack([place_descriptor(points - offset, descriptor) for offset in beside])
+        viewpoints = [(0.0, left, 0.0) for left in descriptor.beside_m]
+        views = np.stack([place_descriptor(points - viewpoint, descriptor) for viewpoint in viewpoints])
         spectra = descriptor_spectrum(views)
         self._spectra[k], self._keys[k] = spectra[0], ring_key(views[0])
         possible, sure = self._possible(k)

@@ -1,4 +1,4 @@
-"""Runs of whole drives through the incremental backend."""
+"""Whole drives: run through the incremental backend, or composed of their relative poses."""
 
 from __future__ import annotations
 
@@ -21,6 +21,14 @@ def run(chain: Any) -> tuple[IncrementalBackend, list[State], list[RelativePose]
         states.append(backend.update(frame, relative))
         steps.append(backend.last_step())
     return backend, states, steps
+
+
+def composed(drive: Any) -> np.ndarray:
+    """Compose the drive's relative poses; return the lidar poses ``(N, 4, 4)``."""
+    poses = [np.eye(4)]
+    for relative in drive.relative:
+        poses.append(poses[-1] @ relative.pose)
+    return np.array(poses)
 
 
 def pose_error(state: State, T_world_imu: np.ndarray) -> np.ndarray:

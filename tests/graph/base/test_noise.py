@@ -3,6 +3,7 @@ import pytest
 
 from hybridlio.core.errors import DataError
 from hybridlio.graph.base import noise
+from hybridlio.graph.model.noise import KERNELS, Robust
 
 
 def test_the_squared_whitened_residual_is_the_mahalanobis_distance(rng: np.random.Generator):
@@ -31,3 +32,10 @@ def test_sigmas_whiten_each_component_by_its_sigma():
 def test_an_invalid_covariance_is_an_error_with_the_measurements_name(covariance: np.ndarray, what: str):
     with pytest.raises(DataError, match=f"gps 7.*{what}"):
         noise.gaussian(covariance, "gps 7")
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("norm", [0.5, 2.5, 10.0])
+def test_a_kernel_weighs_residuals_as_its_formula_does(kernel: str, norm: float):
+    model = noise.with_kernel(noise.sigmas(np.ones(3)), kernel, 2.0)
+    assert model.robust().weight(norm) == pytest.approx(Robust(kernel, 2.0).weight(norm), rel=1e-9)

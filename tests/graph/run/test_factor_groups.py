@@ -7,6 +7,7 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import X
+from online_runs import composed
 
 from hybridlio.core import se3
 from hybridlio.core.errors import ConfigError
@@ -45,13 +46,6 @@ class Pairs:
 
     def read(self, solution: GroupSolution) -> Any:
         return solution
-
-
-def composed(drive: Any) -> np.ndarray:
-    poses = [np.eye(4)]
-    for relative in drive.relative:
-        poses.append(poses[-1] @ relative.pose)
-    return np.array(poses)
 
 
 def rmse(smoothed: Any, drive: Any) -> float:

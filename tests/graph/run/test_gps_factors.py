@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import E, G
+from online_runs import composed
 from scipy.spatial.transform import Rotation
 
 from hybridlio.core import se3
@@ -25,13 +26,6 @@ LEVER = np.array([-0.4, 0.6, 1.1])
 SHIFT_S = 0.43
 SIGMA_M = 0.3
 ENU = se3.make(Rotation.from_euler("ZYX", (2.1, 0.0, 0.0)).as_matrix(), (350.0, -120.0, 4.0))
-
-
-def composed(drive: Any) -> np.ndarray:
-    poses = [np.eye(4)]
-    for relative in drive.relative:
-        poses.append(poses[-1] @ relative.pose)
-    return np.array(poses)
 
 
 def T_enu_world(drive: Any) -> np.ndarray:

@@ -44,11 +44,11 @@ def test_the_predicted_step_is_the_lidars_not_the_imus():
 def test_missing_samples_give_a_constant_velocity_step_that_is_not_ok(imu: ImuSamples):
     state, frame = straight(1)
     source = Preintegration(InertialSteps(Calibration(), NOISE))
-    coasted, sure = source.predict(frame(imu), state), source.predict(frame(at_rest(0.0, 0.1)), state)
+    coasted, integrated = source.predict(frame(imu), state), source.predict(frame(at_rest(0.0, 0.1)), state)
     assert not coasted.ok
     assert not coasted.from_imu
     np.testing.assert_allclose(coasted.pose, se3.make(np.eye(3), [1.0, 0.0, 0.0]), atol=1e-12)
-    assert (np.diag(coasted.covariance) > np.diag(sure.covariance)).all()
+    assert (np.diag(coasted.covariance) > np.diag(integrated.covariance)).all()
 
 
 def test_without_samples_the_last_rate_of_turn_continues():

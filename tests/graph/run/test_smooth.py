@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import X
+from online_runs import composed
 
 from hybridlio.core import se3
 from hybridlio.core.errors import GraphError
@@ -22,14 +23,6 @@ from hybridlio.smoothing.smoothed import Smoothed
 
 ALMOST_NONE = ImuNoise(1e-6, 1e-6, 1e-9, 1e-9, 1e-6, 1e-6)
 TIGHT = np.r_[np.full(3, 1e-5), np.full(3, 1e-4)]
-
-
-def composed(drive: Any) -> np.ndarray:
-    """The drive's relative poses, composed."""
-    poses = [np.eye(4)]
-    for relative in drive.relative:
-        poses.append(poses[-1] @ relative.pose)
-    return np.array(poses)
 
 
 def errors_of(poses: np.ndarray, drive: Any) -> np.ndarray:

@@ -10,7 +10,7 @@ import pytest
 from hybridlio.core import se3
 from hybridlio.core.errors import GraphError
 from hybridlio.graph import PoseGraph
-from hybridlio.graph.base.truncated_squares import chi2_bound, truncated_weights
+from hybridlio.graph.base.truncated_squares import chi2_bound
 
 
 def laps(rng: np.random.Generator, dimension: int, count: int = 120, lap: int = 30) -> PoseGraph:
@@ -86,15 +86,6 @@ def test_contradicting_loops_that_alone_join_a_part_are_refused(rng):
     graph.add_between(5, 100, se3.exp([0, 0, 0, -50, 0, 0]), sigmas=0.01)
     with pytest.raises(GraphError, match="pose 100"):
         graph.optimize("gnc")
-
-
-def test_weights_go_from_nearly_quadratic_to_truncated():
-    chi2, bound = np.array([0.0, 5.0, 9.9, 10.1, 20.0, 1e6]), 10.0
-    soft, hard = truncated_weights(chi2, bound, 1e-6), truncated_weights(chi2, bound, 1e6)
-    np.testing.assert_array_equal(hard, [1, 1, 1, 0, 0, 0])
-    assert soft[0] == 1
-    assert (np.diff(soft) <= 0).all()
-    assert (soft[1:] > 0).all()
 
 
 def test_a_tenth_of_wrong_loops_in_a_recorded_drive_is_rejected(shared_data: Path, rng):

@@ -36,11 +36,6 @@ def pairs_of(count: int, rng: np.random.Generator) -> np.ndarray:
     return np.column_stack([rng.integers(0, 150, count), rng.integers(250, 440, count)])
 
 
-def test_chi_square_quantiles_of_six_degrees_of_freedom():
-    assert chi_square_quantile(0.99, 6) == pytest.approx(16.812, abs=1e-3)
-    assert chi_square_quantile(0.5, 6) == pytest.approx(5.348, abs=1e-3)
-
-
 def test_chi2_of_correct_loops_is_consistent_with_their_noise(loop_drive: Any):
     corners = [(0, 0), (60, 0), (60, 40), (0, 40), (0, 5), (60, 5)]
     of_odometry, of_pairs = [], []

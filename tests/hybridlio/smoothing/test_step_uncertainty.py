@@ -15,7 +15,7 @@ def chain(round_trip: Any) -> OdometryChain:
     return OdometryChain(round_trip.record.online, round_trip.record.relative)
 
 
-def composed(record: Any, i: int, j: int) -> np.ndarray:
+def compounded(record: Any, i: int, j: int) -> np.ndarray:
     """The covariance from scan i to scan j, compounded step by step."""
     covariance = np.zeros((6, 6))
     for step in record.relative[i:j]:
@@ -25,7 +25,7 @@ def composed(record: Any, i: int, j: int) -> np.ndarray:
 
 @pytest.mark.parametrize(("i", "j"), [(0, 439), (0, 1), (120, 121), (50, 300), (430, 439)])
 def test_a_covariance_compounds_the_steps_in_between(chain: OdometryChain, round_trip: Any, i: int, j: int):
-    expected = composed(round_trip.record, i, j)
+    expected = compounded(round_trip.record, i, j)
     np.testing.assert_allclose(chain.covariance(np.array(i), np.array(j)), expected, rtol=1e-6, atol=1e-12)
 
 
@@ -43,16 +43,16 @@ def test_scatter_counts_at_both_ends_and_does_not_add_up(round_trip: Any):
     )
     i, j = np.array(50), np.array(300)
     chain = OdometryChain(record.online, on_map)
-    expected = composed(record, 50, 300) + scatter
+    expected = compounded(record, 50, 300) + scatter
     expected += se3.rotate_covariance(scatter, se3.inverse(chain.relative(i, j)))
     np.testing.assert_allclose(chain.covariance(i, j), expected, rtol=1e-6, atol=1e-12)
 
 
 def test_covariances_are_scaled_up_to_those_of_the_online_estimate(round_trip: Any, chain: OdometryChain):
     online = round_trip.record.online
-    unsure = OdometryChain(replace(online, covariances=4.0 * online.covariances), round_trip.record.relative)
+    less_certain = OdometryChain(replace(online, covariances=4.0 * online.covariances), round_trip.record.relative)
     i, j = np.array([100, 200]), np.array([200, 400])
-    np.testing.assert_allclose(unsure.covariance(i, j), 4.0 * chain.covariance(i, j), rtol=1e-6)
+    np.testing.assert_allclose(less_certain.covariance(i, j), 4.0 * chain.covariance(i, j), rtol=1e-6)
 
 
 def test_many_pairs_give_the_same_as_each_alone(chain: OdometryChain):
