@@ -22,7 +22,7 @@ from hybridlio.core import se3
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.trajectory_files import read_kitti
 from hybridlio.datasets.imu_faults import without_filled_gaps
-from hybridlio.evaluation.evaluate import align, associate
+from hybridlio.evaluation.ate_rpe import align, associate
 from hybridlio.record.odometry_noise import odometry_noise
 from hybridlio.record.record import Record
 from hybridlio.smoothing.gps_alignment import fix_stamps

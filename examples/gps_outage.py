@@ -14,7 +14,7 @@ import numpy as np
 
 import hybridlio as hl
 from hybridlio.core.geodesy import GeodeticPoint
-from hybridlio.evaluation.evaluate import ate
+from hybridlio.evaluation.ate_rpe import ate
 from hybridlio.record.record import Record
 from hybridlio.simulation.chain import ChainSettings, make_chain
 from hybridlio.smoothing.georeference import georeference, write_georeferenced

@@ -67,8 +67,7 @@ def ablate(
 ) -> None:
     """Train and evaluate each row of one of the paper's tables with the same number of steps, and print the table.
 
-    The published results are shown too, marked as such. The same command resumes where it stopped and keeps finished
-    rows. A row that fails does not stop the others.
+    Published results are shown beside them. The same command resumes. A row that fails does not stop the others.
     """
     from hybridlio.learned.networks.devices import pick_device
     from hybridlio.runs.training_data import DataOptions

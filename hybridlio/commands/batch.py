@@ -28,7 +28,7 @@ def batch(
     ],
     out: Annotated[
         Path,
-        typer.Option("-o", "--out", metavar="DIR", help="The folder to write the run folders to.", show_default=False),
+        typer.Option("-o", "--out", metavar="DIR", help="The folder for the run folders and the results, batch.md.", show_default=False),
     ],
     sequence: common.SequenceNames = None,
     reader: common.ReaderName = None,
@@ -57,8 +57,7 @@ def batch(
 ) -> None:
     """Run the odometry on many recordings in parallel, each into a run folder below -o.
 
-    A recording that fails does not stop the others. The same command runs only what is missing. DIR/batch.md has the
-    results.
+    A recording that fails does not stop the others. The same command runs only what is missing.
     """
     from hybridlio.runs.batch import BatchOptions, run_batch
     from hybridlio.runs.recordings import find_recordings

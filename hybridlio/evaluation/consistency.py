@@ -1,7 +1,7 @@
-"""Whether covariances tell the truth: the normalised estimation error squared (NEES) and its average (ANEES).
+"""Consistency of covariances: the normalised estimation error squared (NEES) and its average (ANEES).
 
 Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), §5.4.2. Errors of poses
-are right perturbations, ``Log(estimate⁻¹·truth)``, as the covariances are.
+are right perturbations ``Log(estimate⁻¹·truth)``, like the covariances.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.trajectory import Trajectory
 
-PROBABILITY = 0.95
+PROBABILITY = 0.95  # of the bounds; the usual two-sided level of the NEES test
 
 
 @dataclass(frozen=True, eq=False)
 class Anees:
-    """The average NEES, divided by the dimension: 1 is consistent, above it the covariances are too small.
+    """The average NEES, divided by the dimension: 1 is consistent, more means that the covariances are too small.
 
     Attributes:
-        value: the average; covariances ``k`` times too small give ``k``.
-        lower, upper: where it lies in 95 of 100 cases for true covariances and independent errors. The errors of
-            absolute poses are not independent, and stray outside far more often.
-        nees: ``(N,)`` each sample's NEES, divided by the dimension.
-        dimension: of one error.
+        value: the average; ``k`` for covariances that are ``k`` times too small.
+        lower, upper: the interval that has the average with the given probability for correct covariances and
+            independent errors. Errors of absolute poses are correlated, and leave it far more often.
+        nees: ``(N,)`` the NEES of each sample, divided by the dimension.
+        dimension: the dimension of an error.
     """
 
     value: float
@@ -38,18 +38,18 @@ class Anees:
 
     @property
     def consistent(self) -> bool:
-        """Whether the average lies within the bounds."""
+        """Whether the average is within the bounds."""
         return self.lower <= self.value <= self.upper
 
 
 @dataclass(frozen=True, eq=False)
 class PoseConsistency:
-    """ANEES of whole poses (6 dimensions), and of their rotations and positions alone (3 each).
+    """ANEES of poses (6 dimensions), and of their rotations and positions alone (3 each).
 
     Attributes:
         pose, rotation, position: the averages.
-        errors: ``(N, 6)`` rad and m, rotation first.
-        sigmas: ``(N, 6)`` the standard deviations that the covariances claim.
+        errors: ``(N, 6)`` in rad and m, rotation first.
+        sigmas: ``(N, 6)`` standard deviations by the covariances.
     """
 
     pose: Anees
@@ -60,10 +60,10 @@ class PoseConsistency:
 
 
 def anees(errors: Array, covariances: Array, probability: float = PROBABILITY) -> Anees:
-    """Average NEES of ``(N, d)`` errors under their ``(N, d, d)`` covariances, with χ² bounds.
+    """Return the average NEES of errors ``(N, d)`` with covariances ``(N, d, d)``, and its χ² bounds.
 
     Raises:
-        DataError: shapes that do not match, no rows, or a row that is not finite or not positive definite; names it.
+        DataError: the shapes do not match, there is no row, or a row is not finite or not positive definite; names it.
     """
     errors, covariances = np.asarray(errors, np.float64), np.asarray(covariances, np.float64)
     if errors.ndim != 2 or not len(errors) or covariances.shape != (*errors.shape, errors.shape[1]):
@@ -76,8 +76,8 @@ def anees(errors: Array, covariances: Array, probability: float = PROBABILITY) -
 
 
 def bounds(samples: int, dimension: int, probability: float = PROBABILITY) -> tuple[float, float]:
-    """Where the average of independent NEES values, divided by the dimension, lies with the given probability."""
-    from scipy.stats import chi2  # here, as it takes half a second to load
+    """Return the interval that has the average NEES, divided by the dimension, with the given probability."""
+    from scipy.stats import chi2  # loaded here, as it takes half a second
 
     freedom = samples * dimension
     tail = (1 - probability) / 2
@@ -85,10 +85,10 @@ def bounds(samples: int, dimension: int, probability: float = PROBABILITY) -> tu
 
 
 def pose_consistency(errors: Array, covariances: Array) -> PoseConsistency:
-    """ANEES of ``(N, 6)`` pose errors, rotation first, under ``(N, 6, 6)`` covariances; each part by its own block.
+    """Return the ANEES of pose errors ``(N, 6)``, rotation first, with covariances ``(N, 6, 6)``.
 
     Raises:
-        DataError: as :func:`anees`.
+        DataError: see :func:`anees`.
     """
     errors, covariances = np.asarray(errors, np.float64), np.asarray(covariances, np.float64)
     return PoseConsistency(
@@ -101,37 +101,41 @@ def pose_consistency(errors: Array, covariances: Array) -> PoseConsistency:
 
 
 def step_consistency(reference: Trajectory, relative_poses: Array, covariances: Array) -> PoseConsistency:
-    """Consistency of the steps from each pose to the next.
+    """Return the consistency of the steps from each pose to the next.
 
     Args:
         reference: ``N`` poses.
         relative_poses: ``(N-1, 4, 4)`` estimated ``T_k_k1``.
-        covariances: ``(N-1, 6, 6)`` of theirs.
+        covariances: ``(N-1, 6, 6)`` their covariances, rad² and m², rotation first.
 
     Raises:
-        DataError: as :func:`anees`.
+        DataError: see :func:`anees` and :func:`step_errors`.
     """
     return pose_consistency(step_errors(reference, relative_poses), covariances)
 
 
 def step_errors(reference: Trajectory, relative_poses: Array) -> Array:
-    """Errors ``(N-1, 6)`` (rad, m) of estimated steps ``(N-1, 4, 4)`` against the ``N`` reference poses'."""
+    """Return the errors ``(N-1, 6)`` (rad, m) of estimated steps ``(N-1, 4, 4)`` against ``N`` reference poses.
+
+    Raises:
+        DataError: the numbers do not match.
+    """
     relative_poses = np.asarray(relative_poses, np.float64)
     if len(relative_poses) != len(reference) - 1:
-        raise DataError(f"{len(relative_poses)} steps do not fit {len(reference)} reference poses; one fewer is needed")
+        raise DataError(f"{len(relative_poses)} steps do not match {len(reference)} reference poses; give one fewer")
     true = se3.between(reference.poses[:-1], reference.poses[1:])
     return se3.log(se3.between(relative_poses, true))
 
 
 def absolute_consistency(reference: Trajectory, estimate: Trajectory) -> PoseConsistency:
-    """Consistency of the poses relative to the first, which itself has no error and is left out.
+    """Return the consistency of the poses relative to the first, which has no error and is left out.
 
     Raises:
-        DataError: the estimate has no covariances, the numbers of poses differ, and as :func:`anees`.
+        DataError: the estimate has no covariances, or the numbers of poses differ; see also :func:`anees`.
     """
     if estimate.covariances is None or len(reference) != len(estimate):
-        has = "no" if estimate.covariances is None else f"{len(estimate)}"
-        raise DataError(f"consistency needs a covariance for each of {len(reference)} reference poses, there are {has}")
+        count = 0 if estimate.covariances is None else len(estimate)
+        raise DataError(f"consistency: {count} covariances for {len(reference)} reference poses; give one per pose")
     errors = se3.log(se3.between(estimate.from_first().poses, reference.from_first().poses))
     return pose_consistency(errors[1:], estimate.covariances[1:])
 

@@ -1,4 +1,4 @@
-"""KITTI's odometry drift: how far pieces of fixed length of the estimate end from where they should.
+"""KITTI's odometry drift: the error at the end of segments of fixed length, relative to their length.
 
 Definition: Geiger, Lenz, Urtasun, "Are we ready for autonomous driving?" (CVPR 2012), §3.2, and the evaluation program
 of the odometry benchmark.
@@ -21,17 +21,17 @@ from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.trajectory import Trajectory
 
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
-KITTI_STEP = 10
-_SPEED_STEP_M_S = 2.0
+KITTI_STEP = 10  # frames between the starts of segments, as in KITTI's program
+_SPEED_BIN_M_S = 2.0  # as in KITTI's program
 
 
 @dataclass(frozen=True)
 class DriftAverage:
-    """The average over the segments of one length, or around one speed.
+    """The average drift of the segments of one length, or around one speed.
 
     Attributes:
         at: the length in metres, or the speed in metres per second.
-        count: how many segments it averages.
+        count: number of segments.
         t_rel_percent, r_rel_deg_per_100m: translational and rotational drift.
     """
 
@@ -46,10 +46,10 @@ class Drift:
     """Drift of every segment, one row each, ordered as KITTI's program does: by first frame, then by length.
 
     Attributes:
-        lengths_m: the lengths asked for.
+        lengths_m: the requested lengths.
         first_frame, last_frame: ``(S,)``; a segment ends at the first frame more than its length away along the path.
-        r_err_rad_per_m, t_err: ``(S,)`` rotational and translational error at its end, over its length.
-        length_m, speed_m_s: ``(S,)``.
+        r_err_rad_per_m, t_err: ``(S,)`` rotational and translational error at the end, divided by the length.
+        length_m, speed_m_s: ``(S,)`` the segment's length and mean speed.
     """
 
     lengths_m: tuple[float, ...]
@@ -65,26 +65,26 @@ class Drift:
 
     @property
     def t_rel_percent(self) -> float | None:
-        """Translational drift averaged over all segments, in percent; None where no segment fits the path."""
+        """Translational drift averaged over all segments in percent; None if no segment fits the path."""
         return float(self.t_err.mean() * 100) if len(self) else None
 
     @property
     def r_rel_deg_per_100m(self) -> float | None:
-        """Rotational drift averaged over all segments, in degrees per 100 m; None where no segment fits the path."""
+        """Rotational drift averaged over all segments in degrees per 100 m; None if no segment fits the path."""
         return float(np.degrees(self.r_err_rad_per_m.mean()) * 100) if len(self) else None
 
     def by_length(self) -> list[DriftAverage]:
-        """Averages over the segments of each length that has any."""
+        """Return the averages over the segments of each length that has any."""
         return self._averages((length, self.length_m == length) for length in self.lengths_m)
 
     def by_speed(self) -> list[DriftAverage]:
-        """Averages over the segments within 2 m/s of 2, 4, 6 … m/s; neighbouring bins overlap, as KITTI's do."""
+        """Return the averages over segments within 2 m/s of 2, 4, 6 … m/s; as in KITTI's program, the bins overlap."""
         fastest = float(self.speed_m_s.max(initial=0.0))
-        speeds = np.arange(_SPEED_STEP_M_S, fastest + _SPEED_STEP_M_S, _SPEED_STEP_M_S)
-        return self._averages((float(s), np.abs(self.speed_m_s - s) < _SPEED_STEP_M_S) for s in speeds)
+        speeds = np.arange(_SPEED_BIN_M_S, fastest + _SPEED_BIN_M_S, _SPEED_BIN_M_S)
+        return self._averages((float(s), np.abs(self.speed_m_s - s) < _SPEED_BIN_M_S) for s in speeds)
 
     def rows(self) -> Array:
-        """``(S, 5)`` as KITTI's error files have it: first frame, rad/m, translational error, length, speed."""
+        """Return ``(S, 5)`` rows as in KITTI's error files: first frame, rad/m, translational error, length, speed."""
         return np.column_stack([self.first_frame, self.r_err_rad_per_m, self.t_err, self.length_m, self.speed_m_s])
 
     def _averages(self, groups: Iterable[tuple[float, NDArray[np.bool_]]]) -> list[DriftAverage]:
@@ -106,26 +106,26 @@ def kitti_drift(
     lengths_m: Sequence[float] = KITTI_LENGTHS_M,
     step: int = KITTI_STEP,
 ) -> Drift:
-    """Drift of the estimate, over segments that start at every ``step``-th pose.
+    """Return the drift of an estimate over segments that start at every ``step``-th pose.
 
     Args:
-        reference, estimate: as many poses each, row by row of the same moment (see ``associate``).
+        reference, estimate: ``N`` poses each, at the same times (see :func:`hybridlio.evaluation.ate_rpe.associate`).
         lengths_m: the segments' lengths along the reference.
-        step: poses from one segment's start to the next's.
+        step: number of poses from the start of one segment to that of the next.
 
     Raises:
-        DataError: the trajectories do not have as many poses each, or a length is not positive.
+        DataError: the trajectories have different numbers of poses, or a length is not positive.
     """
     if len(reference) != len(estimate):
         raise DataError(
-            f"drift: {len(reference)} reference poses against {len(estimate)}; associate them by time before"
+            f"drift: {len(reference)} reference poses but {len(estimate)} estimated ones; associate them by time first"
         )
     if not all(math.isfinite(length) and length > 0 for length in lengths_m):
         raise DataError(f"drift: segment lengths must be positive, got {list(lengths_m)} m")
     first, last, length = _segments(reference, lengths_m, step)
     true, estimated = (se3.between(t.poses[first], t.poses[last]) for t in (reference, estimate))
     error = se3.between(estimated, true)
-    # KITTI counts a segment's frames, not the periods between them: its 0.1 s a frame is this mean period
+    # KITTI's program divides by 0.1 s per frame of the segment, counting both ends; here a frame takes the mean period
     seconds = (reference.stamps_ns[last] - reference.stamps_ns[first]) / NS_PER_S
     frames = last - first + 1
     return Drift(
@@ -140,9 +140,9 @@ def kitti_drift(
 
 
 def lengths_for(path_length_m: float) -> tuple[float, ...]:
-    """Eight segment lengths for a path: KITTI's own from 100 m on, else multiples of 0.1, 0.2, 0.5, 1 … m that fit.
+    """Return eight segment lengths for a path: KITTI's from 100 m on, else multiples of 0.1, 0.2, 0.5, 1 … 10 m.
 
-    A path too short for eight steps of 0.1 m, as of a vehicle at rest, has none.
+    A path under 0.8 m, as of a vehicle at rest, has none.
     """
     if path_length_m > KITTI_LENGTHS_M[0]:
         return KITTI_LENGTHS_M
@@ -154,7 +154,7 @@ def lengths_for(path_length_m: float) -> tuple[float, ...]:
 def _segments(
     reference: Trajectory, lengths_m: Sequence[float], step: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """First frames, last frames and lengths of the segments that the path has room for."""
+    """Return first frames, last frames and lengths of the segments that fit the path."""
     travelled = _travelled_m(reference)
     first = np.repeat(np.arange(0, len(reference), step), len(lengths_m))
     length = np.tile(np.asarray(lengths_m, np.float32), len(first) // max(len(lengths_m), 1))
@@ -164,7 +164,7 @@ def _segments(
 
 
 def _travelled_m(reference: Trajectory) -> NDArray[np.float32]:
-    # in single precision, as KITTI's program adds up: in double a segment in a thousand would end a frame elsewhere
+    # summed in single precision, like KITTI's program: in double, one segment in a thousand ends at another frame
     steps = np.diff(reference.poses[:, :3, 3], axis=0).astype(np.float32)
     metres = np.linalg.norm(steps.astype(np.float64), axis=1)
     return np.array(

@@ -1,7 +1,4 @@
-"""Everything an estimate is judged by, in one call: drift, ATE, RPE and the consistency of its covariances.
-
-The parts live in `drift`, `trajectory_errors` and `consistency` and are offered here too.
-"""
+"""Compute all metrics of an estimate in one call: drift, ATE, RPE and the consistency of its covariances."""
 
 from __future__ import annotations
 
@@ -17,50 +14,16 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.trajectory import Trajectory
-from hybridlio.evaluation.ate_rpe import MAX_DIFFERENCE_NS, Association, PoseErrors, align, associate, ate, rpe
-from hybridlio.evaluation.consistency import (
-    Anees,
-    PoseConsistency,
-    absolute_consistency,
-    anees,
-    pose_consistency,
-    step_consistency,
-    step_errors,
-)
+from hybridlio.evaluation.ate_rpe import MAX_DIFFERENCE_NS, Association, associate, ate, rpe
+from hybridlio.evaluation.consistency import PoseConsistency, absolute_consistency, pose_consistency
 from hybridlio.evaluation.drift import KITTI_LENGTHS_M, Drift, DriftAverage, kitti_drift, lengths_for
 
-__all__ = [
-    "KITTI_LENGTHS_M",
-    "Anees",
-    "Association",
-    "Drift",
-    "DriftAverage",
-    "Evaluation",
-    "PoseConsistency",
-    "PoseErrors",
-    "Steps",
-    "absolute_consistency",
-    "align",
-    "anees",
-    "associate",
-    "associated_step_errors",
-    "ate",
-    "evaluate",
-    "kitti_drift",
-    "lengths_for",
-    "pose_consistency",
-    "rpe",
-    "step_consistency",
-    "step_errors",
-]
-
-
-_FRAMES_DIFFER_DEG = 20.0
+_MAX_HEADING_DIFFERENCE_DEG = 20.0  # more than estimates err; camera and lidar axes are 90° apart
 
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Estimated motions from each pose of an estimate to the next.
+    """Relative poses from each pose of an estimate to the next.
 
     Attributes:
         poses: ``(N-1, 4, 4)`` ``T_k_k1``.
@@ -73,26 +36,28 @@ class Steps:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """An estimate's errors against a reference; None marks what could not be computed.
+    """The errors of an estimate against a reference; None marks metrics that could not be computed.
 
     Attributes:
-        poses: how many moments were compared; of them, ``duration_s`` from first to last.
+        poses: number of poses compared.
+        duration_s: time from the first to the last of them.
         length_m, estimate_length_m: path lengths of the reference and of the estimate.
-        t_rel_percent, r_rel_deg_per_100m: KITTI's drift over 100-800 m; None for a path under 100 m.
-        chosen_lengths_m: other segment lengths, those asked for or those that fit a short path; None if not needed.
-        chosen_t_rel_percent, chosen_r_rel_deg_per_100m: drift over the chosen lengths, not comparable with KITTI's.
-        ate_m: root mean square of the position errors after rigid alignment of the positions (Umeyama's, as in evo).
-        ate_deg: of the orientation errors, after an alignment that minds orientations too (:func:`align`).
-        rpe_m, rpe_deg: root mean square of the errors from frame to frame.
-        end_error_m: distance from the true end with the first poses laid on each other.
-        anees_rotation, anees_position: of the poses relative to the first; 1 is consistent, above is overconfident.
-        step_anees_rotation, step_anees_position: of the steps from pose to pose.
-        anees_bounds, step_anees_bounds: where 95 % of consistent estimators with independent errors would lie.
-        segments, segments_by_speed: the drift's averages by length and by speed (over the chosen lengths where
-            KITTI's do not fit).
-        warnings: why not to trust the figures.
-        drift, chosen_drift: every segment.
-        pose_consistency, step_consistency: every error with its σ; the poses' lack the first.
+        t_rel_percent, r_rel_deg_per_100m: KITTI drift over 100–800 m; None for a path under 100 m.
+        chosen_lengths_m: other segment lengths, given or fitted to a short path; None if there are none.
+        chosen_t_rel_percent, chosen_r_rel_deg_per_100m: drift over these lengths; not comparable with KITTI's.
+        ate_m: root mean square position error after rigid alignment of the positions (Umeyama, as in evo).
+        ate_deg: root mean square orientation error after :func:`~hybridlio.evaluation.ate_rpe.align`, which uses
+            orientations too.
+        rpe_m, rpe_deg: root mean square relative pose error from frame to frame.
+        end_error_m: position error of the last pose, with the first poses aligned.
+        anees_rotation, anees_position: ANEES of the poses relative to the first; 1 is consistent, more overconfident.
+        step_anees_rotation, step_anees_position: ANEES of the steps from pose to pose.
+        anees_bounds, step_anees_bounds: the 95 % interval of ANEES for consistent covariances and independent errors.
+        segments, segments_by_speed: drift averaged by length and by speed, over the chosen lengths if KITTI's do not
+            fit.
+        warnings: reasons not to trust some of the metrics.
+        drift, chosen_drift: the drift of every segment.
+        pose_consistency, step_consistency: every error with its standard deviation; without the first pose.
     """
 
     poses: int
@@ -124,7 +89,7 @@ class Evaluation:
     step_consistency: PoseConsistency | None = field(repr=False)
 
     def to_json_dict(self) -> dict[str, Any]:
-        """Every attribute but the single segments and errors, as plain numbers, lists and None."""
+        """Return all attributes except the single segments and errors, as plain numbers, lists and None."""
         arrays = ("drift", "chosen_drift", "pose_consistency", "step_consistency")
         out = {name: value for name, value in vars(self).items() if name not in arrays}
         for name, key in (("segments", "length_m"), ("segments_by_speed", "speed_m_s")):
@@ -142,25 +107,27 @@ def evaluate(
     """Compare an estimate with a reference.
 
     Args:
-        reference: the truth; None, as of a recording without, is an error.
-        estimate: poses of the same sensor; the two may use different world frames. With covariances, of the poses
-            relative to the first, their consistency is judged too.
-        lengths_m: segment lengths for the drift beside KITTI's; by default :func:`lengths_for` a path under 100 m.
-        steps: the motions behind the estimate, to judge their covariances too.
-        max_difference_ns: see :func:`associate`.
+        reference: the ground truth; None raises an error, as for a recording without a reference.
+        estimate: poses of the same sensor; its world frame may differ. If it has covariances, of the poses relative to
+            the first, their consistency is computed.
+        lengths_m: segment lengths for drift in addition to KITTI's; default: those of
+            :func:`~hybridlio.evaluation.drift.lengths_for` for a path under 100 m, otherwise none.
+        steps: the estimate's relative poses, to compute the consistency of their covariances.
+        max_difference_ns: see :func:`~hybridlio.evaluation.ate_rpe.associate`.
 
     Raises:
-        DataError: there is no reference, the two share less than two moments, or the steps do not fit the estimate.
+        DataError: there is no reference, fewer than two poses can be associated, or the numbers of steps and poses do
+            not match.
     """
     _check_steps(steps, estimate)
-    both = associate(_known(reference), estimate, max_difference_ns)
+    both = associate(_require(reference), estimate, max_difference_ns)
     drift = kitti_drift(both.reference, both.estimate)
     chosen = _chosen_drift(both, lengths_m, bool(len(drift)))
     shown = drift if len(drift) or chosen is None else chosen
     absolute, relative = ate(both.reference, both.estimate), rpe(both.reference, both.estimate)
     warnings = _warnings(both)
-    poses = _judged(lambda: _absolute(both), "poses", warnings)
-    step = _judged(lambda: _steps(both, estimate, steps), "steps", warnings)
+    poses = _consistency_or_none(lambda: _absolute(both), "poses", warnings)
+    step = _consistency_or_none(lambda: _steps(both, estimate, steps), "steps", warnings)
     end = se3.between(both.reference.from_first().poses[-1], both.estimate.from_first().poses[-1])
     return Evaluation(
         poses=len(both.reference),
@@ -193,33 +160,38 @@ def evaluate(
     )
 
 
-def _known(reference: Trajectory | None) -> Trajectory:
+def _require(reference: Trajectory | None) -> Trajectory:
     if reference is None:
-        raise DataError("there is no reference to compare with: the recording came without")
+        raise DataError("no reference to compare with: the recording has none")
     return reference
 
 
 def _check_steps(steps: Steps | None, estimate: Trajectory) -> None:
     if steps is not None and not len(steps.poses) == len(steps.covariances) == len(estimate) - 1:
         raise DataError(
-            f"{len(steps.poses)} steps with {len(steps.covariances)} covariances do not fit {len(estimate)} poses"
+            f"{len(steps.poses)} steps with {len(steps.covariances)} covariances do not match {len(estimate)} poses; "
+            "there must be one fewer than poses"
         )
 
 
 def _warnings(both: Association) -> list[str]:
-    """Poses of two sensors (KITTI's camera against the lidar) align well and still make nonsense of relative errors."""
+    """Return a warning if reference and estimate are poses of different sensors, such as camera and lidar.
+
+    Such trajectories align well as a whole, but their relative errors are meaningless. They show in the mean direction
+    of motion, which the axes of one sensor see alike.
+    """
     steps = [se3.between(t.poses[:-1], t.poses[1:])[:, :3, 3] for t in (both.reference, both.estimate)]
     ahead = [step.sum(axis=0) for step in steps]
     lengths = [float(np.linalg.norm(direction)) for direction in ahead]
     if min(lengths) < 0.5 * both.reference.length_m or min(lengths) < 1.0:
         return []
     angle = np.degrees(np.arccos(np.clip(ahead[0] @ ahead[1] / (lengths[0] * lengths[1]), -1.0, 1.0)))
-    if angle < _FRAMES_DIFFER_DEG:
+    if angle < _MAX_HEADING_DIFFERENCE_DEG:
         return []
     towards = ["xyz"[int(np.abs(direction).argmax())] for direction in ahead]
     return [
-        f"the reference moves along its {towards[0]} axis, the estimate along its {towards[1]}, {angle:.0f}° apart: "
-        "these are poses of two different frames (camera and lidar?), whose drift and relative errors mean nothing"
+        f"the reference moves along its {towards[0]} axis, the estimate along its {towards[1]} axis, {angle:.0f}° off; "
+        "if their poses are of different sensors (camera and lidar?), drift and relative errors are meaningless"
     ]
 
 
@@ -230,17 +202,19 @@ def _chosen_drift(both: Association, lengths_m: Sequence[float] | None, has_kitt
     return kitti_drift(both.reference, both.estimate, lengths, step=1) if lengths else None
 
 
-def _judged(judge: Callable[[], PoseConsistency | None], what: str, warnings: list[str]) -> PoseConsistency | None:
-    # a covariance that is none must not take drift and ATE away
+def _consistency_or_none(
+    compute: Callable[[], PoseConsistency | None], name: str, warnings: list[str]
+) -> PoseConsistency | None:
+    # an invalid covariance must not lose drift and ATE
     try:
-        return judge()
+        return compute()
     except DataError as error:
-        warnings.append(f"the covariances of the {what} are not judged: {error}")
+        warnings.append(f"no consistency of the {name}: {error}")
         return None
 
 
 def _absolute(both: Association) -> PoseConsistency | None:
-    # covariances are relative to the estimate's own first pose: without it among the moments they say nothing here
+    # covariances are relative to the estimate's first pose, so the reference must have that pose too
     if both.estimate.covariances is None or both.estimate_rows[0] != 0:
         return None
     return absolute_consistency(both.reference, both.estimate)
@@ -256,12 +230,12 @@ def _steps(both: Association, estimate: Trajectory, steps: Steps | None) -> Pose
 def associated_step_errors(
     both: Association, estimate: Trajectory, step_poses: Array
 ) -> tuple[NDArray[np.int64], Array]:
-    """Errors of an estimate's steps ``(N-1, 4, 4)`` where the reference has both ends: which steps, ``(M, 6)`` errors.
+    """Return the steps of which the reference has both ends, as indices ``(M,)``, and their errors ``(M, 6)``.
 
     Args:
         both: the estimate associated with the reference.
-        estimate: the same estimate, whole.
-        step_poses: its motions ``T_k_k1`` from each pose to the next.
+        estimate: the whole estimate, ``N`` poses.
+        step_poses: ``(N-1, 4, 4)`` its relative poses ``T_k_k1``.
     """
     rows = both.estimate_rows
     at_own_stamps = estimate.stamps_ns[rows] == both.reference.stamps_ns

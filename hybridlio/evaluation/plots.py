@@ -1,6 +1,6 @@
-"""The report's figures. Each function takes arrays and gives a matplotlib figure; no global state is touched.
+"""The report's plots. Each function takes arrays and returns a matplotlib figure, without changing global state.
 
-Colours are Okabe and Ito's, which colour-blind readers can tell apart; meaning never hangs on colour alone.
+Colours are from Okabe and Ito's palette for colour-blind readers; nothing is shown by colour alone.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _STYLE: dict[Any, Any] = {
 
 
 def to_png(figure: Figure, dpi: int = 160) -> bytes:
-    """The figure as a PNG picture."""
+    """Return the figure as a PNG file."""
     buffer = io.BytesIO()
     with rc_context(_STYLE):
         figure.savefig(buffer, format="png", dpi=dpi)
@@ -63,13 +63,13 @@ def trajectory_figure(
     bridged_m: Array | None = None,
     loops_m: Array | None = None,
 ) -> Figure:
-    """The paths from above, their heights along the way, and with a reference their distances from it.
+    """Plot the paths from above, their heights and, with a reference, their distances from it.
 
     Args:
         paths: by name, the main one first, in the reference's frame.
-        reference_m: ``(R, 3)`` positions of the truth.
-        bridged_m: ``(B, 3)`` positions where a scan could not be used, to be marked.
-        loops_m: ``(L, 2, 3)`` positions of the two ends of each loop closure, to be joined.
+        reference_m: ``(R, 3)`` positions of the ground truth.
+        bridged_m: ``(B, 3)`` positions at scans that could not be used.
+        loops_m: ``(L, 2, 3)`` positions of the two ends of each loop closure.
     """
     with rc_context(_STYLE):
         figure = Figure(figsize=(_WIDTH_IN, 5.4), layout="constrained")
@@ -92,7 +92,7 @@ def trajectory_figure(
 
 
 def drift_figure(drifts: Mapping[str, Drift]) -> Figure:
-    """Drift by segment length, and by speed where the segments have several speeds."""
+    """Plot drift by segment length, and by speed if there are more than two speed bins."""
     with rc_context(_STYLE):
         by_speed = {name: drift.by_speed() for name, drift in drifts.items()}
         rows = 2 if max(map(len, by_speed.values()), default=0) > 2 else 1
@@ -107,10 +107,10 @@ def drift_figure(drifts: Mapping[str, Drift]) -> Figure:
 
 
 def step_error_figure(errors: Mapping[str, tuple[Array, Array]]) -> Figure:
-    """Errors of the motion from scan to scan: over time, and the share of scans below each size.
+    """Plot the errors of steps over time, and their cumulative distribution.
 
     Args:
-        errors: name to times ``(M,)`` in seconds and errors ``(M, 6)`` in rad and m, rotation first.
+        errors: by name, times ``(M,)`` in seconds and errors ``(M, 6)`` in rad and m, rotation first.
     """
     with rc_context(_STYLE):
         figure = Figure(figsize=(_WIDTH_IN, 5.4), layout="constrained")
@@ -123,9 +123,9 @@ def step_error_figure(errors: Mapping[str, tuple[Array, Array]]) -> Figure:
                 share = np.arange(1, len(size) + 1) / len(size)
                 row[1].plot(share, np.sort(positive), color=colour, label=f"{name}: median {_short(np.median(size))}")
         for row, title, unit in zip(axes, ("Translation", "Rotation"), ("m", "°"), strict=True):
-            row[0].set(title=f"{title} error a scan", ylabel=f"[{unit}]", yscale="log", xlabel="time [s]")
+            row[0].set(title=f"{title} error per step", ylabel=f"[{unit}]", yscale="log", xlabel="time [s]")
             row[0].yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-            row[1].set(title="Share of scans with less", xlabel="scans")
+            row[1].set(title="Cumulative distribution", xlabel="share of steps")
             row[1].xaxis.set_major_formatter(PercentFormatter(1.0))
             row[1].legend(loc="best")
             for text in row[1].get_legend().get_texts():
@@ -134,11 +134,11 @@ def step_error_figure(errors: Mapping[str, tuple[Array, Array]]) -> Figure:
 
 
 def timing_figure(timings_s: Mapping[str, Array], period_s: float | None = None) -> Figure:
-    """Where the time goes: stages stacked over the scans, and each one's median and 99th percentile.
+    """Plot the processing time: stages stacked over the scans, and the median and 99th percentile of each stage.
 
     Args:
-        timings_s: stage to ``(M,)`` seconds, one a scan.
-        period_s: time between scans; the line below which processing keeps up.
+        timings_s: by stage, ``(M,)`` seconds per scan.
+        period_s: time between scans, drawn as the limit of real time.
     """
     with rc_context(_STYLE):
         figure = Figure(figsize=(_WIDTH_IN, 3.6), layout="constrained")
@@ -151,7 +151,7 @@ def timing_figure(timings_s: Mapping[str, Array], period_s: float | None = None)
         stacked.stackplot(bins + width / 2, means, colors=colours, linewidth=0, step="mid" if len(bins) < 40 else None)
         totals = np.sum([t[:scans] for t in timings_s.values()], axis=0)
         _real_time(stacked, period_s, float(np.max(np.sum(means, axis=0))))
-        stacked.set(title=f"Time a scan{f' (means of {width})' if width > 1 else ''}", xlabel="scan", ylabel="[ms]")
+        stacked.set(title=f"Time per scan{f' (mean of {width})' if width > 1 else ''}", xlabel="scan", ylabel="[ms]")
         stacked.set_xlim(0, scans)
         stacked.set_ylim(bottom=0)
         _timing_bars(bars, {**timings_s, "all": totals}, [*colours, REFERENCE])
@@ -159,7 +159,7 @@ def timing_figure(timings_s: Mapping[str, Array], period_s: float | None = None)
 
 
 def nees_figure(times_s: Array, consistency: PoseConsistency) -> Figure:
-    """NEES over time, of rotations and of positions, with the band that 95 % of consistent ones lie in."""
+    """Plot NEES over time, of rotations and positions, with the 95 % interval of consistent values."""
     with rc_context(_STYLE):
         figure = Figure(figsize=(_WIDTH_IN, 3.7), layout="constrained")
         axes = figure.subplots(1, 2, sharey=True)
@@ -177,7 +177,7 @@ def nees_figure(times_s: Array, consistency: PoseConsistency) -> Figure:
 
 
 def sigma_figure(times_s: Array, consistency: PoseConsistency) -> Figure:
-    """Errors over time, axis by axis, against the ±3σ that the covariances claim."""
+    """Plot errors over time for each axis, with ±3σ by the covariances."""
     labels = ("roll", "pitch", "yaw", "x, forward", "y, left", "z, up")
     with rc_context(_STYLE):
         figure = Figure(figsize=(_WIDTH_IN, 4.6), layout="constrained")
@@ -212,7 +212,7 @@ def _above(
     ax.plot(*main[0, :2], "o", color="white", mec="black", ms=8, zorder=4, label="start")
     ax.plot(*main[-1, :2], "s", color="black", ms=7, zorder=4, label="end")
     if bridged_m is not None and len(bridged_m):
-        ax.plot(*bridged_m[:, :2].T, "x", color=BAD, ms=7, mew=2, zorder=5, label="scan bridged")
+        ax.plot(*bridged_m[:, :2].T, "x", color=BAD, ms=7, mew=2, zorder=5, label="bridged scan")
     if loops_m is not None and len(loops_m):
         _draw_loops(ax, loops_m)
     ax.set(title="From above", xlabel="x [m]", ylabel="y [m]")
@@ -222,9 +222,9 @@ def _above(
 
 
 def _draw_loops(ax: Axes, loops_m: Array) -> None:
-    """Dots at both ends, which may lie on each other, and a line between them."""
+    """Draw a dot at both ends, which may coincide, and a line between them."""
     joined = np.concatenate([loops_m[:, :, :2], np.full((len(loops_m), 1, 2), np.nan)], axis=1).reshape(-1, 2)
-    ax.plot(*joined.T, "-o", color=LOOP, ms=3.5, lw=1.2, zorder=3.5, label="loop closed")
+    ax.plot(*joined.T, "-o", color=LOOP, ms=3.5, lw=1.2, zorder=3.5, label="loop closure")
 
 
 def _line(k: int) -> dict[str, Any]:
@@ -263,15 +263,15 @@ def _timing_bars(ax: Axes, timings_s: Mapping[str, Array], colours: list[str]) -
     ax.set_yticks(rows, list(timings_s))
     ax.set_xlim(0, 1.18 * max(*p99s, *medians, 1e-6))
     ax.grid(visible=False, axis="y")
-    ax.set(title="Median (bar, number) and 99 % (tick)", xlabel="[ms]")
+    ax.set(title="Median (bar) and 99th percentile (tick)", xlabel="[ms]")
 
 
 def _nees(ax: Axes, times_s: Array, result: Anees) -> None:
     window = max(1, min(50, len(result.nees) // 10))
     low, high = bounds(1, result.dimension)
-    ax.axhspan(low, high, color="#009E73", alpha=0.13, lw=0, label="95 % of consistent values")
+    ax.axhspan(low, high, color="#009E73", alpha=0.13, lw=0, label="95 % interval if consistent")
     ax.axhline(1, color="#00664b", lw=1, ls="--")
-    ax.plot(times_s, np.maximum(result.nees, 1e-9), ".", ms=4, alpha=0.5, color=COLOURS[0], mec="none", label="a step")
+    ax.plot(times_s, np.maximum(result.nees, 1e-9), ".", ms=4, alpha=0.5, color=COLOURS[0], mec="none", label="step")
     mean = np.convolve(result.nees, np.ones(window) / window, "valid")
     middle = times_s[window // 2 : window // 2 + len(mean)]
     ax.plot(middle, mean, color="black", lw=1.3, label=f"mean of {window}")
@@ -282,7 +282,7 @@ def _travelled(positions_m: Array) -> Array:
 
 
 def _at_least(ax: Axes, span: float) -> None:
-    """Do not blow up noise: an axis shows no less than ``span``."""
+    """Widen the axes to at least ``span``, so that noise is not magnified."""
     for get, put in ((ax.get_xlim, ax.set_xlim), (ax.get_ylim, ax.set_ylim)):
         low, high = get()
         if high - low < span:

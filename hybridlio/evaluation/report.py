@@ -1,4 +1,4 @@
-"""A run as one self-contained HTML file: pictures inside it, nothing fetched from anywhere."""
+"""Write a run's report: one HTML file that contains its plots and loads nothing from elsewhere."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from hybridlio.evaluation.report_data import DrawnPath, Findings, ReportData, an
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Findings", "ReportData", "analyse", "draw", "pictures", "write_report"]
+__all__ = ["Findings", "ReportData", "analyse", "draw", "figures", "write_report"]
 
 _PACKAGES = ("numpy", "scipy", "gtsam", "small_gicp", "open3d", "torch", "filterpy")
-_FRAMES_LISTED = 200
+_MAX_RANGES_LISTED = 200  # about a page
 
 
 def write_report(
@@ -34,16 +34,16 @@ def write_report(
     findings: Findings | None = None,
     drawn: Mapping[str, bytes] | None = None,
 ) -> None:
-    """Write the report, whole or not at all.
+    """Write the report, completely or not at all.
 
     Args:
         path: the HTML file.
         data: the run.
-        findings: of the same data, where they are computed already.
-        drawn: its pictures, as :func:`draw` makes them, where they are drawn already.
+        findings: the result of :func:`analyse` on ``data``, if it exists already.
+        drawn: the result of :func:`draw`, if it exists already.
 
     Raises:
-        DataError: the place cannot be written to.
+        DataError: the file cannot be written.
     """
     import jinja2
 
@@ -57,14 +57,14 @@ def write_report(
 
 
 def draw(data: ReportData, findings: Findings) -> dict[str, bytes]:
-    """The :func:`pictures` as PNG, by name."""
+    """Return the :func:`figures` as PNG files, by name."""
     from hybridlio.evaluation.plots import to_png
 
-    return {name: to_png(figure) for name, figure in pictures(data, findings).items()}
+    return {name: to_png(figure) for name, figure in figures(data, findings).items()}
 
 
-def pictures(data: ReportData, findings: Findings) -> dict[str, Figure]:
-    """The figures that the data allows: trajectory, drift, steps, timing, nees, sigma_steps, sigma_poses."""
+def figures(data: ReportData, findings: Findings) -> dict[str, Figure]:
+    """Return the figures that the data allow: trajectory, drift, steps, timing, nees, sigma_steps, sigma_poses."""
     from hybridlio.evaluation import plots
 
     reference = None if data.reference is None or not findings.evaluations else data.reference.poses[:, :3, 3]
@@ -89,7 +89,7 @@ def pictures(data: ReportData, findings: Findings) -> dict[str, Figure]:
 
 def _page(data: ReportData, findings: Findings, drawn: Mapping[str, bytes]) -> dict[str, Any]:
     inline = {name: base64.b64encode(png).decode() for name, png in drawn.items()}
-    second = data.first_scan + 1  # the scan that the first step leads to
+    second = data.first_scan + 1  # the first step leads to the second scan
     bridged = [] if data.ok is None else _ranges(np.flatnonzero(~np.asarray(data.ok, bool)) + second)
     degenerate = [] if data.degenerate is None else _ranges(np.flatnonzero(data.degenerate) + second)
     return {
@@ -98,8 +98,8 @@ def _page(data: ReportData, findings: Findings, drawn: Mapping[str, bytes]) -> d
         "tiles": _tiles(data, findings),
         "warnings": [*data.warnings, *findings.notes],
         "names": list(findings.evaluations),
-        "figures": _figure_rows(findings),
-        "pictures": inline,
+        "metrics": metric_rows(format_metrics(e) for e in findings.evaluations.values()),
+        "plots": inline,
         "drift_names": [name for name, e in findings.evaluations.items() if len(_drift(e))],
         "drift": _drift_rows(findings),
         "short": any(e.t_rel_percent is None for e in findings.evaluations.values()),
@@ -122,11 +122,12 @@ def _own_facts(data: ReportData) -> dict[str, str]:
 
 
 def _tiles(data: ReportData, findings: Findings) -> list[tuple[str, str, str]]:
-    """The headline: label, figure, unit."""
+    """Return the headline metrics: label, value, unit."""
     tiles: list[tuple[str, float | None, str]] = []
     own = findings.evaluations.get(data.estimate_name)
     if own is not None:
-        short = "" if own.chosen_lengths_m is None else f", {own.chosen_lengths_m[0]:g}–{own.chosen_lengths_m[-1]:g} m"
+        lengths = own.chosen_lengths_m
+        over = "" if lengths is None else f" over {lengths[0]:g}–{lengths[-1]:g} m"
         if own.t_rel_percent is not None:
             tiles += [
                 ("translation drift", own.t_rel_percent, "%"),
@@ -134,18 +135,14 @@ def _tiles(data: ReportData, findings: Findings) -> list[tuple[str, str, str]]:
             ]
         else:
             tiles += [
-                (f"drift{short}", own.chosen_t_rel_percent, "%"),
-                (f"turn{short}", own.chosen_r_rel_deg_per_100m, "°/100 m"),
+                (f"translation drift{over}", own.chosen_t_rel_percent, "%"),
+                (f"rotation drift{over}", own.chosen_r_rel_deg_per_100m, "°/100 m"),
             ]
-        tiles += [("ATE", own.ate_m, "m"), ("error at the end", own.end_error_m, "m")]
+        tiles += [("ATE", own.ate_m, "m"), ("end error", own.end_error_m, "m")]
     if data.timings_s:
         total = sum(np.sum(t) for t in data.timings_s.values())
         tiles.append(("speed", max(map(len, data.timings_s.values())) / float(total), "scans/s"))
     return [(label, _digits(value), unit) for label, value, unit in tiles if value is not None]
-
-
-def _figure_rows(findings: Findings) -> list[tuple[str, list[str]]]:
-    return metric_rows(format_metrics(e) for e in findings.evaluations.values())
 
 
 def _drift(evaluation: Evaluation) -> Drift:
@@ -154,7 +151,7 @@ def _drift(evaluation: Evaluation) -> Drift:
 
 
 def _drift_rows(findings: Findings) -> list[tuple[str, list[str]]]:
-    """Length, then translation and rotation drift of each trajectory that has any."""
+    """Return the length, then the translation and rotation drift of each trajectory that has any."""
     columns = [{a.at: a for a in e.segments} for e in findings.evaluations.values() if e.segments]
     rows = []
     for length in sorted({at for column in columns for at in column}):
@@ -192,13 +189,13 @@ def _timing_rows(data: ReportData) -> list[tuple[str, list[str]]]:
 
 
 def _consistency_rows(findings: Findings) -> list[tuple[str, list[str]]]:
-    """ANEES, errors in σ, bounds and verdict; absolute poses get neither of the last two, see :class:`Anees`."""
+    """Return ANEES, its root, bounds and verdict. Absolute poses have no bounds and verdict, see :class:`Anees`."""
     rows = []
-    for what, timed in (("steps", findings.steps), ("poses from the first", findings.poses)):
+    for name, timed in (("steps", findings.steps), ("poses", findings.poses)):
         for part in ("rotation", "position") if timed is not None else ():
             result = getattr(timed.consistency, part)  # type: ignore[union-attr]
-            judged = [f"{result.lower:.3f}–{result.upper:.3f}", _verdict(result)] if what == "steps" else ["–", "–"]
-            rows.append((f"{what}, {part}", [_digits(result.value), _digits(np.sqrt(result.value)), *judged]))
+            verdict = [f"{result.lower:.3f}–{result.upper:.3f}", _verdict(result)] if name == "steps" else ["–", "–"]
+            rows.append((f"{name}, {part}", [_digits(result.value), _digits(np.sqrt(result.value)), *verdict]))
     return rows
 
 
@@ -216,16 +213,17 @@ def _bridged_m(data: ReportData, findings: Findings) -> Any:
 
 
 def _loops_m(loops: Any, path: DrawnPath) -> Any:
-    """``(L, 2, 3)``; of loops whose two ends are drawn."""
+    """Return ``(L, 2, 3)`` positions of the loops whose two ends are drawn."""
     drawn = loops[np.isin(loops, path.rows).all(axis=1)]
     return path.positions_m[np.searchsorted(path.rows, drawn)]
 
 
 def _ranges(frames: Any) -> list[str]:
-    """Frame numbers with runs drawn together, ``4``, ``7–9`` …, at most a page of them."""
+    """Return frame numbers as text, with consecutive ones joined: ``4``, ``7–9`` …, at most a page."""
     runs = np.split(frames, np.flatnonzero(np.diff(frames) != 1) + 1) if len(frames) else []
     texts = [f"{run[0]}" if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs]
-    return texts[:_FRAMES_LISTED] + ([f"and {len(texts) - _FRAMES_LISTED} more"] if len(texts) > _FRAMES_LISTED else [])
+    more = len(texts) - _MAX_RANGES_LISTED
+    return texts[:_MAX_RANGES_LISTED] + ([f"and {more} more"] if more > 0 else [])
 
 
 def _digits(value: float) -> str:

@@ -1,4 +1,4 @@
-"""What a report is made of, and what follows from it."""
+"""The input of a report, and its analysis."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from hybridlio.evaluation.evaluate import Evaluation, Steps, associated_step_err
 
 @dataclass(frozen=True, eq=False)
 class ReportData:
-    """A run, for its report. All but the name and the estimate may be left out, and what needs them is then too.
+    """A run, for its report. Only the name and the estimate are required; parts without data are left out.
 
     Attributes:
-        name: the sequence's.
-        estimate: ``N`` poses, with covariances relative to the first where known.
-        reference: the truth, at any rate.
-        estimate_name: what legends call the estimate.
-        others: more trajectories to show beside, such as the one before smoothing, or a peer's; by name.
-        initial_poses, final_poses: ``(N-1, 4, 4)`` steps ``T_k_k1`` before and after looking at the scans.
-        step_covariances: ``(N-1, 6, 6)`` of the final steps.
-        timings_s: stage to ``(M,)`` seconds, one a scan, in the order in which the stages run.
-        ok: ``(N-1,)``; False where a step is bridged because its scan could not be used.
-        degenerate: ``(N-1,)``; True where the scan left a direction of the step unconstrained.
-        first_scan: which of the recording's scans, counted from 0, the estimate's first pose belongs to.
-        loops: ``(L, 2)`` rows of the estimate that loop closures join.
-        facts: short lines for the head by label, such as the sources used.
+        name: name of the sequence.
+        estimate: ``N`` poses, with covariances relative to the first if known.
+        reference: the ground truth, at any rate.
+        estimate_name: name of the estimate in legends.
+        others: other trajectories to show, by name, such as the one before smoothing.
+        initial_poses, final_poses: ``(N-1, 4, 4)`` steps ``T_k_k1`` before and after the residual.
+        step_covariances: ``(N-1, 6, 6)`` covariances of the final steps.
+        timings_s: by stage, ``(M,)`` seconds per scan; stages in the order in which they run.
+        ok: ``(N-1,)``; False where the scan could not be used and the step is bridged by the initial pose.
+        degenerate: ``(N-1,)``; True where the scan does not constrain every direction of the step.
+        first_scan: index of the recording's scan that the first pose of the estimate belongs to.
+        loops: ``(L, 2)`` rows of the estimate that loop closures connect.
+        facts: short texts for the head by label, such as the sources used.
         config: the configuration as YAML text.
-        warnings: what a reader should know before trusting the figures.
+        warnings: what a reader should know first.
     """
 
     name: str
@@ -69,27 +69,27 @@ class ReportData:
             value = getattr(self, name)
             if value is not None and np.shape(value) != (steps, *shape):
                 raise DataError(
-                    f"report: {name} must be {(steps, *shape)} for {steps + 1} poses, not {np.shape(value)}"
+                    f"report: {name} must have the shape {(steps, *shape)} for {steps + 1} poses, not {np.shape(value)}"
                 )
         for stage, seconds in self.timings_s.items():
             if np.ndim(seconds) != 1 or not len(seconds) or not np.isfinite(seconds).all():
-                raise DataError(f"report: the timing of {stage!r} must be a finite number of seconds for each scan")
+                raise DataError(f"report: timings_s[{stage!r}] must be one finite number of seconds per scan")
 
     @property
     def period_s(self) -> float | None:
-        """Median time between poses; None for a single one."""
+        """Median time between poses; None for a single pose."""
         stamps = self.estimate.stamps_ns
         return float(np.median(np.diff(stamps)) / NS_PER_S) if len(stamps) > 1 else None
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnPath:
-    """A trajectory as drawn: in the reference's frame, laid on it at the first moment they share.
+    """A trajectory as drawn: in the reference's frame, aligned at the first common pose.
 
     Attributes:
-        rows: ``(M,)`` the trajectory's rows that are drawn, those that the reference has too where there is one.
-        positions_m: ``(M, 3)``.
-        travelled_m, error_m: ``(M,)`` the reference's path length and the distance from it; empty without reference.
+        rows: ``(M,)`` the trajectory's rows that are drawn; with a reference, those that it has too.
+        positions_m: ``(M, 3)`` positions.
+        travelled_m, error_m: ``(M,)`` path length of the reference and distance from it; empty without a reference.
     """
 
     rows: NDArray[np.int64]
@@ -100,7 +100,7 @@ class DrawnPath:
 
 @dataclass(frozen=True, eq=False)
 class TimedConsistency:
-    """Consistency, and the times ``(M,)`` in seconds since the first pose that its rows belong to."""
+    """Consistency, and the times of its rows, ``(M,)`` seconds since the first pose."""
 
     times_s: Array
     consistency: PoseConsistency
@@ -108,14 +108,14 @@ class TimedConsistency:
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What follows from a run's data; parts without the data they need are empty or None.
+    """The analysis of a run; parts without data are empty or None.
 
     Attributes:
-        paths: every trajectory by name, the estimate first.
-        evaluations: by name.
-        step_errors: ``initial`` and ``final`` to times ``(M,)`` s and errors ``(M, 6)`` in rad and m.
+        paths: all trajectories by name, the estimate first.
+        evaluations: their evaluations by name.
+        step_errors: for ``initial`` and ``final``, times ``(M,)`` in s and errors ``(M, 6)`` in rad and m.
         steps, poses: consistency of the final steps, and of the poses relative to the first.
-        notes: why something that was asked for is missing.
+        notes: warnings of the evaluations, and why a trajectory is not compared.
     """
 
     paths: dict[str, DrawnPath]
@@ -127,7 +127,7 @@ class Findings:
 
 
 def analyse(data: ReportData) -> Findings:
-    """Evaluate what can be evaluated; what cannot is noted, not raised."""
+    """Return the analysis of a run. A trajectory that cannot be compared with the reference is noted, not an error."""
     notes: list[str] = []
     steps = None
     if data.final_poses is not None and data.step_covariances is not None:
@@ -143,12 +143,12 @@ def analyse(data: ReportData) -> Findings:
             notes += [f"{name}: {warning}" for warning in evaluations[name].warnings]
             own = both if is_own else own
     errors = _step_errors(data, own)
-    judged = evaluations.get(data.estimate_name)
+    evaluation = evaluations.get(data.estimate_name)
     timed_steps = timed_poses = None
-    if judged is not None and judged.step_consistency is not None:
-        timed_steps = TimedConsistency(errors["final"][0], judged.step_consistency)
-    if judged is not None and own is not None and judged.pose_consistency is not None:
-        timed_poses = TimedConsistency(data.estimate.times_s[own.estimate_rows[1:]], judged.pose_consistency)
+    if evaluation is not None and evaluation.step_consistency is not None:
+        timed_steps = TimedConsistency(errors["final"][0], evaluation.step_consistency)
+    if evaluation is not None and own is not None and evaluation.pose_consistency is not None:
+        timed_poses = TimedConsistency(data.estimate.times_s[own.estimate_rows[1:]], evaluation.pose_consistency)
     return Findings(paths, evaluations, errors, timed_steps, timed_poses, notes)
 
 
@@ -158,17 +158,17 @@ def _associate(reference: Trajectory | None, trajectory: Trajectory, name: str, 
     try:
         return associate(reference, trajectory)
     except DataError as error:
-        notes.append(f"{name} is not compared with the reference: {error}")
+        notes.append(f"{name}: not compared with the reference: {error}")
         return None
 
 
 def _path(trajectory: Trajectory, both: Association | None) -> DrawnPath:
     if both is None:
         return DrawnPath(np.arange(len(trajectory)), trajectory.from_first().poses[:, :3, 3], np.empty(0), np.empty(0))
-    laid = align(both.reference, both.estimate, "first").poses
+    aligned = align(both.reference, both.estimate, "first").poses
     true = both.reference.poses[:, :3, 3]
     travelled = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(true, axis=0), axis=1)))
-    return DrawnPath(both.estimate_rows, laid[:, :3, 3], travelled, np.linalg.norm(laid[:, :3, 3] - true, axis=1))
+    return DrawnPath(both.estimate_rows, aligned[:, :3, 3], travelled, np.linalg.norm(aligned[:, :3, 3] - true, axis=1))
 
 
 def _step_errors(data: ReportData, own: Association | None) -> dict[str, tuple[Array, Array]]:

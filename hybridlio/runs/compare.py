@@ -18,7 +18,8 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.files import write_atomically
 from hybridlio.core.progress import Progress
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.evaluation.evaluate import Evaluation, associate, associated_step_errors, evaluate
+from hybridlio.evaluation.ate_rpe import associate
+from hybridlio.evaluation.evaluate import Evaluation, associated_step_errors, evaluate
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.odometry import Odometry
 from hybridlio.runs.run import Run, run_odometry

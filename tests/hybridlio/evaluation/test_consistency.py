@@ -100,7 +100,7 @@ def test_a_bad_row_is_named(rng: np.random.Generator) -> None:
 
 def test_steps_and_covariances_that_do_not_fit_the_reference_are_refused() -> None:
     reference = Trajectory(np.arange(5), np.tile(np.eye(4), (5, 1, 1)))
-    with pytest.raises(DataError, match="5 steps do not fit 5 reference poses"):
+    with pytest.raises(DataError, match="5 steps do not match 5 reference poses"):
         step_consistency(reference, reference.poses, np.tile(np.eye(6), (5, 1, 1)))
-    with pytest.raises(DataError, match="there are no"):
+    with pytest.raises(DataError, match="0 covariances for 5"):
         absolute_consistency(reference, reference)
