@@ -13,7 +13,6 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from hybridlio.core.errors import ConfigError, DataError
-from hybridlio.odometry.setup import Setup
 
 if TYPE_CHECKING:  # the command line imports this module for the names
     from hybridlio.cloud.preparation import PreparationOptions
@@ -21,6 +20,7 @@ if TYPE_CHECKING:  # the command line imports this module for the names
     from hybridlio.learned.settings import Recipe
     from hybridlio.learned.sources.network_residual import NetworkResidual
     from hybridlio.odometry.config import Config
+    from hybridlio.odometry.setup import Setup
     from hybridlio.sources.recent_scans import PairSource
 
 
@@ -144,6 +144,7 @@ def check_implementations(config: Config) -> None:
         ConfigError: a name is unknown, or an implementation cannot be made with its settings.
     """
     from hybridlio.core.sensors import Calibration, ImuNoise
+    from hybridlio.odometry.setup import Setup
 
     chosen = (config.initial_pose, config.residual, config.backend)
     check_names(*chosen)
