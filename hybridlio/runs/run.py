@@ -184,7 +184,7 @@ def _advance(run: Run, k: int) -> None:
     except DataError as error:
         if run.estimates:
             raise
-        run.unreadable[k] = str(error)
+        run.unreadable[k] = str(error).removeprefix(f"frame {k}: ")
         run.skipped += 1
         level = logging.WARNING if run.skipped <= _MAX_START_WARNINGS else logging.INFO
         more = "; further scans like this are logged with -v" if run.skipped == _MAX_START_WARNINGS else ""
@@ -224,9 +224,9 @@ def _read_frame(run: Run, k: int) -> Frame:
             raise DataError("its points are identical to those of the scan before; it was delivered twice")
         return frame
     except DataError as error:
-        run.unreadable[k] = str(error)
+        run.unreadable[k] = str(error).removeprefix(f"frame {k}: ")
         if run.estimates:
-            _log.warning("frame %d: bridged by the initial pose: %s", k, error)
+            _log.warning("frame %d: bridged by the initial pose: %s", k, run.unreadable[k])
         return run.sequence.without_scan(k)
 
 

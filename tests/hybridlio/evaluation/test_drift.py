@@ -87,7 +87,7 @@ def test_short_paths_get_eight_lengths_that_fit_and_long_ones_kittis() -> None:
 
 
 def test_unequal_numbers_of_poses_and_lengths_of_no_metres_are_refused() -> None:
-    with pytest.raises(DataError, match="400 reference poses against 399"):
+    with pytest.raises(DataError, match="400 reference poses but 399"):
         kitti_drift(straight(400), straight(399))
     with pytest.raises(DataError, match="must be positive"):
         kitti_drift(straight(400), straight(400), lengths_m=(0.0, 100.0))

@@ -72,7 +72,7 @@ def test_every_stage_is_timed_at_every_scan_after_the_first(whole, sequence):
 @pytest.mark.parametrize("kind", ["unreadable", "empty"])
 def test_a_scan_without_points_is_bridged_by_the_initial_pose(kind, whole, sequence, caplog):
     empty = Scan(int(sequence.stamps_ns[15]), np.empty((0, 3), np.float32))
-    bad = {15: DataError("scans/15.bin: truncated") if kind == "unreadable" else empty}
+    bad = {15: DataError("frame 15: scans/15.bin: truncated") if kind == "unreadable" else empty}
     with caplog.at_level(logging.WARNING, logger="hybridlio"):
         run = run_odometry(with_scans(sequence, bad), Odometry())
     assert run.stopped is None
@@ -83,7 +83,7 @@ def test_a_scan_without_points_is_bridged_by_the_initial_pose(kind, whole, seque
     assert end_error_m(run) < 0.2
     if kind == "unreadable":
         assert run.unreadable == {15: "scans/15.bin: truncated"}
-        assert "scans/15.bin: truncated" in caplog.text
+        assert "frame 15: bridged by the initial pose: scans/15.bin: truncated" in caplog.text
 
 
 def test_the_run_starts_at_the_first_scan_that_can_be_used(sequence, caplog):
