@@ -28,7 +28,13 @@ def batch(
     ],
     out: Annotated[
         Path,
-        typer.Option("-o", "--out", metavar="DIR", help="The folder for the run folders and the results, batch.md.", show_default=False),
+        typer.Option(
+            "-o",
+            "--out",
+            metavar="DIR",
+            help="The folder for the run folders and the results, batch.md.",
+            show_default=False,
+        ),
     ],
     sequence: common.SequenceNames = None,
     reader: common.ReaderName = None,

@@ -85,7 +85,11 @@ InitialPoseName = Annotated[
 ]
 ResidualName = Annotated[
     str | None,
-    typer.Option("--residual", metavar="NAME", help=f"Source of residuals, which correct initial poses: {', '.join(RESIDUAL_SOURCES)}."),
+    typer.Option(
+        "--residual",
+        metavar="NAME",
+        help=f"Source of residuals, which correct initial poses: {', '.join(RESIDUAL_SOURCES)}.",
+    ),
 ]
 BackendName = Annotated[
     str | None, typer.Option("--backend", metavar="NAME", help=f"Factor graph: {', '.join(BACKENDS)}.")

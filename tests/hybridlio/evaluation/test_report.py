@@ -188,9 +188,7 @@ def test_the_drawn_lines_are_the_data(data: ReportData) -> None:
 
 
 def test_arrays_that_do_not_fit_the_poses_are_refused_by_name(data: ReportData) -> None:
-    with pytest.raises(
-        DataError, match=r"final_poses must have the shape \(399, 4, 4\) for 400 poses, not \(400"
-    ):
+    with pytest.raises(DataError, match=r"final_poses must have the shape \(399, 4, 4\) for 400 poses, not \(400"):
         dataclasses.replace(data, final_poses=data.estimate.poses)
     with pytest.raises(DataError, match=r"timings_s\['match'\]"):
         dataclasses.replace(data, timings_s={"match": np.array([0.1, np.nan])})
