@@ -22,17 +22,27 @@ FROM_ELSEWHERE = {  # page of the site: the file that it shows
     "benchmarks.md": "benchmarks/README.md",
 }
 PAGE_OF = {file: page for page, file in FROM_ELSEWHERE.items()}
+LAYOUT = "layout.md"  # shows the section "Layout" of the README
 
 
 def on_files(files: Any, config: Any) -> Any:
     """Add the made pages to those that lie in the docs folder."""
     from mkdocs.structure.files import File
 
-    files.append(File.generated(config, "reference/cli.md", content=cli_reference()))
-    for page, file in FROM_ELSEWHERE.items():
-        text = (ROOT / file).read_text(encoding="utf-8")
-        files.append(File.generated(config, page, content=with_links_of_the_site(text, file)))
+    for page, text in made_pages().items():
+        files.append(File.generated(config, page, content=text))
     return files
+
+
+def made_pages() -> dict[str, str]:
+    """Return the made pages by name, as Markdown."""
+    pages = {"reference/cli.md": cli_reference()}
+    for page, file in FROM_ELSEWHERE.items():
+        pages[page] = with_links_of_the_site((ROOT / file).read_text(encoding="utf-8"), file)
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    layout = re.search(r"^## Layout\n(.*?)(?=^## )", readme, flags=re.DOTALL | re.MULTILINE)
+    pages[LAYOUT] = f"# Layout\n{with_links_of_the_site(layout[1], 'README.md')}" if layout else ""
+    return pages
 
 
 def with_links_of_the_site(text: str, file: str) -> str:
@@ -48,6 +58,8 @@ def with_links_of_the_site(text: str, file: str) -> str:
         if target.startswith(("https://", "#")):
             return link[0]
         inside = os.path.normpath(PurePosixPath(file).parent / path)
+        if (inside, anchor) == ("README.md", "layout"):
+            return f"[{words}]({LAYOUT})"
         page = inside.removeprefix("docs/") if inside.startswith("docs/") else PAGE_OF.get(inside)
         return f"[{words}]({page}{hash_}{anchor})" if page else words
 

@@ -17,14 +17,14 @@ import yaml
 from command_line import ok
 
 import hybridlio as hl
-from docs.make_cli_reference import cli_reference
-from docs.make_pages import FROM_ELSEWHERE, with_links_of_the_site
+from docs.make_pages import FROM_ELSEWHERE, made_pages
 from hybridlio.commands.app import app
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 README = ROOT / "README.md"
 PAGES = [README, *(ROOT / file for file in FROM_ELSEWHERE.values()), *sorted(DOCS.rglob("*.md"))]
+MADE = {DOCS / name: text for name, text in made_pages().items()}
 MAX_README_WORDS = 900
 NOT_RUN = "# not run"
 
@@ -35,14 +35,7 @@ def name_of(page: Path) -> str:
 
 def text_of(page: Path) -> str:
     """The text of a page; pages that are made while the site is built are made here."""
-    if page == DOCS / "reference/cli.md":
-        return cli_reference()
-    made = FROM_ELSEWHERE.get(str(page.relative_to(DOCS))) if page.is_relative_to(DOCS) else None
-    return with_links_of_the_site((ROOT / made).read_text(), made) if made else page.read_text()
-
-
-def is_there(page: Path) -> bool:
-    return page.exists() or page in {DOCS / "reference/cli.md", *(DOCS / made for made in FROM_ELSEWHERE)}
+    return MADE.get(page) or page.read_text()
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -63,7 +56,7 @@ def test_every_link_leads_somewhere(page: Path):
             continue
         path, _, anchor = link.partition("#")
         target = Path(os.path.normpath(page.parent / path)) if path else page
-        if not is_there(target) or (anchor and anchor not in anchors(target)):
+        if not (target.exists() or target in MADE) or (anchor and anchor not in anchors(target)):
             dead.append(link)
     assert dead == []
 
@@ -101,7 +94,9 @@ def commands() -> dict[str, Any]:
 
 
 def test_the_reference_of_the_command_line_holds_every_command_and_option():
-    sections = dict(re.findall(r"^## (\S+)\n(.*?)(?=^## |\Z)", cli_reference(), flags=re.DOTALL | re.MULTILINE))
+    sections = dict(
+        re.findall(r"^## (\S+)\n(.*?)(?=^## |\Z)", MADE[DOCS / "reference/cli.md"], flags=re.DOTALL | re.MULTILINE)
+    )
     assert list(sections) == list(commands())
     for name, command in commands().items():
         options = {option for p in command.params if p.param_type_name == "option" for option in p.opts}
