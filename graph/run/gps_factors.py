@@ -21,10 +21,9 @@ from typing import Any
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import A, E, G, P, T, W, X
-from numpy.typing import NDArray
 
 from hybridlio.core import se3
-from hybridlio.core.arrays import Array
+from hybridlio.core.arrays import Array, Index, Mask
 from hybridlio.core.estimates import State
 from hybridlio.core.pose_interpolation import PosePath
 from hybridlio.core.sensors import NS_PER_S, GpsFix
@@ -55,9 +54,6 @@ class GpsGroup:
     Args:
         record: of the run, with its fixes.
         options: how to use them.
-
-    Raises (from :meth:`build`):
-        EstimationError: too few fixes lie in the run's time.
     """
 
     name = "gps"
@@ -70,10 +66,14 @@ class GpsGroup:
         antenna = self._options.antenna_m if self._options.antenna_m is not None else record.calibration.antenna_imu_m
         self._antenna = np.zeros(3) if antenna is None else np.asarray(antenna, dtype=np.float64)
         self._scale: float | None = None
-        self._rows: NDArray[np.int64] = np.empty(0, np.int64)
+        self._rows: Index = np.empty(0, np.int64)
 
     def build(self, states: Sequence[State], previous: gtsam.Values | None) -> GroupFactors:
-        """Return one possible outlier per fix, with the factors and initial values of frame and clock."""
+        """Return one possible outlier per fix, with the factors and initial values of frame and clock.
+
+        Raises:
+            EstimationError: too few fixes lie in the run's time.
+        """
         path = _path_of(states)
         if previous is None:
             aligned = self._align(path, states[0])
@@ -124,13 +124,13 @@ class GpsGroup:
         placed = se3.transform(T_enu_world, points)
         T_scan_world = se3.inverse(path.poses[near])
         levers = (T_scan_world @ np.column_stack([points, np.ones(len(points))])[..., None])[:, :3, 0]
-        drawn = (T_scan_world[:, :3, :3] @ velocities[..., None])[..., 0]
+        lever_rates = (T_scan_world[:, :3, :3] @ velocities[..., None])[..., 0]
         link = noise.sigmas(np.full(3, _LINK_SIGMA_M))
         for n, (k, fix) in enumerate(zip(near.tolist(), fixes, strict=True)):
             for key, value in ((A(n), levers[n]), (W(n), points[n]), (P(n), placed[n])):
                 group.values.insert(key, value)
             links = [
-                _lever_factor(n, levers[n], drawn[n], shift_s, link),
+                _lever_factor(n, levers[n], lever_rates[n], shift_s, link),
                 gtsam.ReferenceFrameFactorPoint3Pose3(A(n), X(k), W(n), link),
                 gtsam.ReferenceFrameFactorPoint3Pose3(W(n), E(0), P(n), link),
             ]
@@ -211,7 +211,7 @@ def _plumb_factor(start: State) -> gtsam.NonlinearFactor:
     return gtsam.CustomFactor(noise.sigmas(np.full(2, _PLUMB_SIGMA_RAD)), [E(0), G(0)], error)
 
 
-def _noise_scale(fixes: Sequence[GpsFix], residuals: Array, inliers: NDArray[np.bool_]) -> float:
+def _noise_scale(fixes: Sequence[GpsFix], residuals: Array, inliers: Mask) -> float:
     """Return the ratio of the fixes' scatter to their claimed standard deviations, at least 1.
 
     From second differences of consecutive residuals, which cancel the drift of the path; from their median, and without

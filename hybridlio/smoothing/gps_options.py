@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hybridlio.core.arrays import Array
+from hybridlio.core.arrays import Array, Mask
 from hybridlio.core.setting_checks import check_not_negative, check_setting
 from hybridlio.smoothing.gps_alignment import MAX_SHIFT_S
 
@@ -62,12 +61,12 @@ class GpsFit:
     shift_s: float
     shift_sigma_s: float
     residuals_m: Array
-    used: NDArray[np.bool_]
+    used: Mask
     weights: Array
     noise_scale: float
 
     @property
-    def rejected(self) -> NDArray[np.bool_]:
+    def rejected(self) -> Mask:
         """``(M,)`` used fixes whose weight is below a tenth."""
         return self.used & (self.weights < _REJECTED_WEIGHT)
 
