@@ -1,0 +1,73 @@
+"""Degeneracy beside its usual cases: poor starts, few objects between walls, and how far sigmas can be believed."""
+
+import numpy as np
+import pytest
+from weak_scenes import (
+    TRUTH,
+    bend,
+    between_trunks,
+    bushes,
+    error,
+    ground,
+    in_a_field,
+    joined,
+    noisy_surface,
+    observe,
+    off_by,
+    scan,
+)
+
+from hybridlio.registration.degeneracy import ObservedRegistration
+
+DRAWS = range(6)
+
+
+def between_walls(seed: int, ahead_m: float, *, dense: np.ndarray | None = None) -> ObservedRegistration:
+    """Register a scan of a straight corridor with eight bushes."""
+    rng = np.random.default_rng(seed)
+    where = np.column_stack([rng.uniform(-22, 22, 8), rng.uniform(-3, 3, 8)])
+    surface = noisy_surface(rng, joined(bend(rng, 1e6, 6000), bushes(rng, where, 60)), 0.03)
+    source = scan(rng, joined(bend(rng, 1e6, 3000), bushes(rng, where, 16)))
+    return observe(surface, source, off_by(ahead_m), dense=dense)
+
+
+@pytest.mark.parametrize("seed", DRAWS)
+def test_a_start_60_cm_away_in_a_field_converges_to_centimetres(seed: int):
+    """One parabola leaves up to 0.2 m in three of these draws."""
+    assert abs(error(in_a_field(np.random.default_rng(seed), 0.6))[3]) < 0.02
+
+
+def test_errors_along_a_corridor_with_bushes_match_their_sigma():
+    """Sigma is of the parabola: point-to-point matches are for open ground only."""
+    normalised = []
+    for seed in DRAWS:
+        observed = between_walls(seed, 0.2 * np.cos(seed))
+        assert observed.is_observed.tolist() == [True]
+        normalised.append(float(error(observed)[3] / observed.weak_sigmas_m[0]) ** 2)
+    assert 0.3 < np.mean(normalised) < 4.0
+
+
+def test_point_matches_are_not_used_between_walls(rng: np.random.Generator):
+    """There, thick planes are mostly the edges of walls, along which any point has a neighbour."""
+    other_points = scan(rng, ground(rng, 500))
+    with_points, without = between_walls(1, 0.2, dense=other_points), between_walls(1, 0.2)
+    np.testing.assert_array_equal(with_points.registration.pose, without.registration.pose)
+
+
+def test_errors_between_trunks_match_their_covariance():
+    normalised = []
+    for seed in DRAWS:
+        rng = np.random.default_rng(seed)
+        surface, source, points = between_trunks(rng)
+        observed = observe(surface, source, off_by(0.1, -0.1), 0.1, dense=points)
+        assert observed.is_observed.all()
+        part = error(observed)[3:5]
+        normalised.append(part @ np.linalg.solve(observed.covariance(5.0)[3:5, 3:5], part) / 2)
+    assert 0.05 < np.mean(normalised) < 3.0
+
+
+def test_a_right_start_between_trunks_is_kept(rng: np.random.Generator):
+    """Point matches from 10 cm to either side agree on it."""
+    surface, source, points = between_trunks(rng)
+    observed = observe(surface, source, TRUTH, 0.1, dense=points)
+    assert np.abs(error(observed)[3:5]).max() < 0.02
