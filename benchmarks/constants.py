@@ -51,7 +51,7 @@ def _in(file: str, tests: tuple[str, ...], **gross: tuple[str, ...]) -> list[Con
 
 REGISTRATION = "tests/hybridlio/registration/test_"
 SOURCES = "tests/hybridlio/sources/test_"
-ICP = tuple(f"{REGISTRATION}{name}.py" for name in ("icp", "icp_covariance"))
+ICP = tuple(f"{REGISTRATION}{name}.py" for name in ("icp_limits", "icp", "icp_covariance"))
 INFORMATION = tuple(f"{REGISTRATION}{name}.py" for name in ("information", "icp_covariance", "degeneracy"))
 DEGENERACY = tuple(f"{REGISTRATION}{name}.py" for name in ("cost_profile", "degeneracy_limits", "degeneracy"))
 MAP = tuple(f"{REGISTRATION}{name}.py" for name in ("local_map", "ring_planes", "voxel_map"))
@@ -238,7 +238,7 @@ def run_tests(folder: Path, tests: tuple[str, ...]) -> tuple[int, str]:
     threads = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
     environment = {**os.environ, **threads, "PYTHONPATH": str(folder)}
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
+    failed = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", done.stdout, re.MULTILINE)
     return done.returncode, failed.group(1) if failed else done.stdout[-2000:] + done.stderr[-2000:]
 
 
