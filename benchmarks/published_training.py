@@ -36,7 +36,7 @@ from hybridlio.core.files import write_atomically
 from hybridlio.core.sensors import LIDAR_MODELS, LidarModel, Scan
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.learned.data.pairs import Pairs
-from hybridlio.learned.data.preparing import prepare_shard
+from hybridlio.learned.data.preparing import KnownMotion, prepare_shard
 from hybridlio.learned.data.shards import Shard
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
 from hybridlio.learned.networks.weights import load_weights, own_tensors
@@ -140,10 +140,11 @@ def simulate(folder: Path, seeds: list[int], poses: Path | None, minutes: float)
                 sequence,
                 place,
                 partial(prepare, options=options),
-                recipe.network.geometry,
-                recipe.network.imu_samples,
-                step=lambda frame, steps=steps: steps.get(frame.index),
-                made_by=f"benchmarks/published_training.py, {config.model_dump_json()}",
+                recipe.network,
+                KnownMotion(
+                    step=lambda frame, steps=steps: steps.get(frame.index),  # type: ignore[misc]
+                    source=f"benchmarks/published_training.py, {config.model_dump_json()}",
+                ),
             )
         done = time.monotonic()
         print(

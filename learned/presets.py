@@ -88,7 +88,7 @@ PUBLISHED = Recipe(
         remap_gradient=False,
         distance="gradient",
         vertex_scale_m=20.0,
-        output_scale=0.02,
+        output_scale=0.1,
     ),
     LossSettings(
         kernel_m=0.03,
@@ -99,16 +99,25 @@ PUBLISHED = Recipe(
         keep_ground=True,
     ),
     OptimiserSettings(
-        epochs=30,
+        epochs=24,
         batch=16,
-        learning_rate=1e-3,
+        learning_rate=2e-3,
         schedule="cosine",
         clip_norm=1.0,
         initial_noise_rad=0.004,
         initial_noise_m=0.08,
         velocity_noise_m_s=0.1,
+        mirrored=0.5,
+        swapped=0.25,
+        points=2048,
+        balanced=0.8,
     ),
 )
+"""The published method without any registration step, made to train on a CPU: siamese LSTMs, a siamese ResNet encoder of
+vertex and normal maps, pooling, attention and ``T = δT·T̂``, taught by the paper's loss alone.
+
+Each departure from ``paper`` is in docs/learned.md.
+"""
 
 _ENCODER: Mapping[str, Any] = MappingProxyType(
     {

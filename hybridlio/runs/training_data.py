@@ -30,7 +30,7 @@ from hybridlio.core.sensors import Scan
 from hybridlio.datasets.registry import check_options, open_sequence, sequence_names
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.learned.data.pairs import Pairs
-from hybridlio.learned.data.preparing import prepare_shard
+from hybridlio.learned.data.preparing import KnownMotion, prepare_shard
 from hybridlio.learned.data.shards import FORMAT, Shard
 from hybridlio.learned.presets import split as sequences_of
 from hybridlio.learned.settings import NetworkSettings, Recipe
@@ -219,11 +219,12 @@ def _prepare(sequence: Sequence, folder: Path, recipe: Recipe, initial_pose: str
         sequence,
         folder,
         partial(prepare, options=preparation_for(recipe)),
-        recipe.network.geometry,
-        recipe.network.imu_samples,
-        initial=(lambda frame: found.initial.get(frame.index)) if found.initial else None,
-        step=(lambda frame: found.reliable_step(frame.index)) if found.steps else None,
-        made_by=f"initial poses by {source}" if found.initial else "",
+        recipe.network,
+        KnownMotion(
+            initial=(lambda frame: found.initial.get(frame.index)) if found.initial else None,
+            step=(lambda frame: found.reliable_step(frame.index)) if found.steps else None,
+            source=f"initial poses by {source}" if found.initial else "",
+        ),
         progress=lambda done, total: report(round(total * (1 - share) + done * share)),
     )
 

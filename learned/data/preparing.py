@@ -1,4 +1,4 @@
-"""From a recording to a shard. How a scan is prepared is an argument, so that this, too, runs without heavy libraries.
+"""From a recording to a shard. How a scan is prepared is an argument, so that this runs without heavy libraries.
 
 ``prepare`` is :func:`hybridlio.cloud.preparation.prepare` with its options, or any callable whose result has maps and
 a cloud.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -20,6 +21,10 @@ from hybridlio.core.sensors import NS_PER_S, Frame, Scan
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.learned.data.imu_rows import imu_rows
 from hybridlio.learned.data.shards import ScanRecord, ShardInfo, write_shard
+from hybridlio.learned.settings import NetworkSettings
+
+StepOf = Callable[[Frame], NDArray[np.float64] | None]
+"""Returns a step ``T_k_k1`` ``(4, 4)`` that leads to a frame, or None where it is not known."""
 
 
 class AveragedCloud(Protocol):
@@ -32,108 +37,124 @@ class AveragedCloud(Protocol):
 
     @property
     def normals(self) -> NDArray[np.float32] | None:
-        """``(K, 3)`` unit vectors, zero where there is none."""
+        """``(K, 3)`` unit vectors, zero where a point has none."""
         ...
 
 
 class Mapped(Protocol):
-    """What is taken of a prepared scan at run time."""
+    """The part of a prepared scan that a network needs at run time."""
 
     @property
     def vertex_map(self) -> NDArray[np.float32]:
-        """``(3, H, W)``."""
+        """``(3, H, W)`` metres, 0 in empty cells."""
         ...
 
     @property
     def usable(self) -> bool:
-        """Whether there are points enough."""
+        """Whether the scan has enough points."""
         ...
 
 
 class Prepared(Mapped, Protocol):
-    """What is taken of a prepared scan to train by."""
+    """The part of a prepared scan that training needs."""
 
     @property
     def loss_cloud(self) -> AveragedCloud:
-        """For the loss."""
+        """The points that the loss is computed from."""
         ...
 
 
-Initial = Callable[[Frame], NDArray[np.float64] | None]
-Progress = Callable[[int, int], None]
+@dataclass(frozen=True, eq=False)
+class KnownMotion:
+    """What is known of a recording's motion beside its reference.
+
+    Attributes:
+        initial: returns the initial pose of a frame, for a network whose initial poses are given.
+        step: returns the step to a frame as odometry found it. A pair whose previous step is not known has no last
+            velocity, and a network that needs one does not train on it.
+        source: where these come from; kept in the shard's description.
+    """
+
+    initial: StepOf | None = None
+    step: StepOf | None = None
+    source: str = ""
 
 
 def prepare_shard(
     sequence: Sequence,
     folder: str | os.PathLike[str],
     prepare: Callable[[Scan], Prepared],
-    geometry: MapGeometry,
-    imu_samples: int = 15,
-    initial: Initial | None = None,
-    step: Initial | None = None,
-    made_by: str = "",
-    progress: Progress | None = None,
+    network: NetworkSettings,
+    motion: KnownMotion | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> ShardInfo:
-    """Prepare every scan of a recording once and write the shard.
+    """Prepare every scan of a recording and write the shard.
 
-    A scan that cannot be read is kept as one that is not usable. The velocity at each scan comes from the step before,
-    as it would at run time: by ``step`` where that is given, else by the reference where there is one, else by
-    ``initial``.
+    A scan that cannot be read becomes a record that is not usable. The velocity at each scan is that of the step before,
+    as at run time: by ``motion.step`` where given, else by the reference where there is one, else by
+    ``motion.initial``.
 
     Args:
         sequence: the recording.
         folder: of the shard.
-        prepare: makes a scan ready.
-        geometry: the cells that ``prepare`` gives.
-        imu_samples: S.
-        initial: gives the initial pose ``T_k_k1`` of a frame, or None where there is none.
-        step: gives the step ``T_k_k1`` to a frame as odometry found it, or None where it did not: a pair without a
-            last velocity is left out of the training of a network that is told of it.
-        made_by: kept in the shard's description.
+        prepare: prepares a scan, with the map geometry of ``network``.
+        network: determines the map geometry and the number of IMU rows.
+        motion: initial poses and steps, where they are known.
         progress: called with scans done and scans in all.
 
     Raises:
         DataError: the recording has fewer than two scans.
     """
-    records = _records(sequence, prepare, geometry, imu_samples, initial, step, progress)
-    return write_shard(folder, records, sequence.name, geometry, imu_samples, made_by)
+    motion = motion or KnownMotion()
+    records = _records(sequence, prepare, network, motion, progress)
+    return write_shard(folder, records, sequence.name, network.geometry, network.imu_samples, motion.source)
 
 
 def _records(
     sequence: Sequence,
     prepare: Callable[[Scan], Prepared],
-    geometry: MapGeometry,
-    imu_samples: int,
-    initial: Initial | None,
-    step: Initial | None,
-    progress: Progress | None,
+    network: NetworkSettings,
+    motion: KnownMotion,
+    progress: Callable[[int, int], None] | None,
 ) -> Iterator[ScanRecord]:
-    before: NDArray[np.float64] | None = None  # the step that led to scan k-1
+    last_step: NDArray[np.float64] | None = None  # the step that led to scan k-1
     for k in range(len(sequence)):
         frame, readable = _frame(sequence, k)
-        prepared = prepare(frame.scan) if readable else None
-        usable = prepared is not None and prepared.usable
-        empty = np.zeros((0, 3), np.float32)
-        cloud = prepared.loss_cloud if prepared is not None and usable else None
-        normals = empty if cloud is None or cloud.normals is None else cloud.normals
-        vertices = np.zeros((3, geometry.rows, geometry.columns), np.float32)
-        calibration = frame.calibration
-        T_imu_lidar = None if calibration is None else calibration.T_imu_lidar
-        guess, reference = initial(frame) if initial is not None and k else None, _step(sequence, k)
-        yield ScanRecord(
-            vertex_map=prepared.vertex_map if prepared is not None and usable else vertices,
-            loss_points=empty if cloud is None else cloud.points,
-            loss_normals=normals,
-            usable=usable,
-            imu=imu_rows(frame.imu, imu_samples, T_imu_lidar) if k and len(frame.imu) else None,
-            dt_s=float(sequence.stamps_ns[k] - sequence.stamps_ns[k - 1]) / NS_PER_S if k else 0.0,
-            velocity_m_s=_velocity(before, sequence, k),
-            initial=guess,
-            reference=reference,
-        )
-        before = step(frame) if step is not None and k else guess if reference is None else reference
+        record = _scan_record(prepare(frame.scan) if readable else None, network.geometry)
+        if k:
+            guess, reference = _asked(motion.initial, frame), _reference_step(sequence, k)
+            yield replace(
+                record,
+                imu=_imu(frame, network.imu_samples),
+                dt_s=float(sequence.stamps_ns[k] - sequence.stamps_ns[k - 1]) / NS_PER_S,
+                velocity_m_s=_velocity(last_step, sequence, k),
+                initial=guess,
+                reference=reference,
+            )
+            last_step = _asked(motion.step, frame) if motion.step else guess if reference is None else reference
+        else:
+            yield record
         if progress is not None:
             progress(k + 1, len(sequence))
+
+
+def _scan_record(scan: Prepared | None, geometry: MapGeometry) -> ScanRecord:
+    """Return the part of a record that belongs to the scan alone; empty where the scan is not usable."""
+    empty = np.zeros((0, 3), np.float32)
+    if scan is None or not scan.usable:
+        return ScanRecord(np.zeros((3, geometry.rows, geometry.columns), np.float32), empty, empty, usable=False)
+    cloud = scan.loss_cloud
+    return ScanRecord(scan.vertex_map, cloud.points, empty if cloud.normals is None else cloud.normals)
+
+
+def _asked(step: StepOf | None, frame: Frame) -> NDArray[np.float64] | None:
+    return None if step is None else step(frame)
+
+
+def _imu(frame: Frame, samples: int) -> NDArray[np.float32] | None:
+    if not len(frame.imu):
+        return None
+    return imu_rows(frame.imu, samples, None if frame.calibration is None else frame.calibration.T_imu_lidar)
 
 
 def _frame(sequence: Sequence, k: int) -> tuple[Frame, bool]:
@@ -143,16 +164,16 @@ def _frame(sequence: Sequence, k: int) -> tuple[Frame, bool]:
         return sequence.without_scan(k), False
 
 
-def _step(sequence: Sequence, k: int) -> NDArray[np.float64] | None:
-    """``T_{k-1}_{k}`` by the reference."""
-    if sequence.reference is None or k < 1:
+def _reference_step(sequence: Sequence, k: int) -> NDArray[np.float64] | None:
+    """Return ``T_{k-1}_{k}`` by the reference, None without one."""
+    if sequence.reference is None:
         return None
     return se3.between(sequence.reference.poses[k - 1], sequence.reference.poses[k])
 
 
-def _velocity(before: NDArray[np.float64] | None, sequence: Sequence, k: int) -> NDArray[np.float64] | None:
-    """Mean velocity from scan k-2 to k-1, in the axes of scan k-1, by the step between them."""
-    if before is None:
+def _velocity(step: NDArray[np.float64] | None, sequence: Sequence, k: int) -> NDArray[np.float64] | None:
+    """Return the mean velocity from scan k-2 to k-1 in the axes of scan k-1, by the step between them."""
+    if step is None:
         return None
     seconds = float(sequence.stamps_ns[k - 1] - sequence.stamps_ns[k - 2]) / NS_PER_S
-    return np.asarray(before[:3, :3].T @ before[:3, 3] / seconds)
+    return np.asarray(step[:3, :3].T @ step[:3, 3] / seconds)

@@ -13,7 +13,7 @@ from hybridlio.core import se3
 from hybridlio.core.errors import DataError
 from hybridlio.learned.data.augmentation import perturbed
 from hybridlio.learned.data.pairs import Pairs, padded
-from hybridlio.learned.data.preparing import prepare_shard
+from hybridlio.learned.data.preparing import KnownMotion, prepare_shard
 from hybridlio.learned.data.shards import ScanRecord, Shard, write_shard
 from hybridlio.learned.settings import NetworkSettings, OptimiserSettings
 
@@ -88,7 +88,7 @@ def test_without_a_reference_velocities_come_from_the_initial_poses(tiny_drive, 
     sequence = replace(hl.open_sequence(tiny_drive).part(0, 4), reference=None)
     options = PreparationOptions(geometry=GEOMETRY, loss_points=1000, threads=1)
     step = se3.exp([0, 0, 0.5, 1.0, 0, 0])
-    prepare_shard(sequence, tmp_path / "s", partial(prepare, options=options), GEOMETRY, initial=lambda _: step)
+    prepare_shard(sequence, tmp_path / "s", partial(prepare, options=options), SETTINGS, KnownMotion(lambda _: step))
     shard = Shard(tmp_path / "s")
     assert np.isnan(shard.velocity_m_s[1]).all()
     assert np.allclose(shard.velocity_m_s[2:], step[:3, :3].T @ step[:3, 3] / 0.1, rtol=1e-2)
@@ -153,7 +153,7 @@ def test_clouds_are_padded_to_the_largest():
 def test_a_recording_becomes_a_shard_with_true_steps_and_resampled_imu(tiny_drive, tmp_path):
     sequence = hl.open_sequence(tiny_drive).part(0, 5)
     options = PreparationOptions(geometry=GEOMETRY, loss_points=1000, threads=1)
-    info = prepare_shard(sequence, tmp_path / "s", partial(prepare, options=options), GEOMETRY)
+    info = prepare_shard(sequence, tmp_path / "s", partial(prepare, options=options), SETTINGS)
     shard = Shard(tmp_path / "s")
     assert (info.scans, info.name) == (5, sequence.name)
     truth = se3.between(sequence.reference.poses[:-1], sequence.reference.poses[1:])
@@ -176,7 +176,7 @@ def test_a_scan_that_cannot_be_read_stays_as_one_that_is_not_usable(tiny_drive, 
 
     options = PreparationOptions(geometry=GEOMETRY, loss_points=1000, threads=1)
     sequence = replace(whole, load_scan=load)
-    prepare_shard(sequence, tmp_path / "s", partial(prepare, options=options), GEOMETRY)
+    prepare_shard(sequence, tmp_path / "s", partial(prepare, options=options), SETTINGS)
     shard = Shard(tmp_path / "s")
     assert shard.usable.tolist() == [True, False, True, True]
     assert len(Pairs([shard], SETTINGS)) == 1
