@@ -113,8 +113,8 @@ PUBLISHED = Recipe(
         balanced=0.8,
     ),
 )
-"""The published method without any registration step, made to train on a CPU: siamese LSTMs, a siamese ResNet encoder of
-vertex and normal maps, pooling, attention and ``T = δT·T̂``, taught by the paper's loss alone.
+"""The published method without any registration step, reduced so that a CPU can train it: siamese LSTMs, a siamese
+ResNet encoder of vertex and normal maps, pooling, attention and ``T = δT·T̂``, taught by the paper's loss alone.
 
 Each departure from ``paper`` is in docs/learned.md.
 """

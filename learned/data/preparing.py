@@ -90,8 +90,8 @@ def prepare_shard(
 ) -> ShardInfo:
     """Prepare every scan of a recording and write the shard.
 
-    A scan that cannot be read becomes a record that is not usable. The velocity at each scan is that of the step before,
-    as at run time: by ``motion.step`` where given, else by the reference where there is one, else by
+    A scan that cannot be read becomes a record that is not usable. The velocity at each scan is that of the step
+    before, as at run time: by ``motion.step`` where given, else by the reference where there is one, else by
     ``motion.initial``.
 
     Args:
