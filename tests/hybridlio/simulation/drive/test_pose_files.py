@@ -52,7 +52,7 @@ def test_a_tum_file_is_interpolated_at_ten_scans_per_second(tmp_path: Path):
         ("1 2 3\n" * 20, "row 1 has 3 columns; expected one of TUM"),
         ("a b\n", "row 1 has 2 columns"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 9, "9 poses; a drive needs at least 10"),
-        ("".join(f"{k} 0 0 0 0 0 0 0\n" for k in range(20)), "row 1: its quaternion"),
+        ("".join(f"{k} 0 0 0 0 0 0 0\n" for k in range(20)), "row 1: the length of the quaternion"),
     ],
 )
 def test_other_files_are_rejected(tmp_path: Path, text: str, message: str):
