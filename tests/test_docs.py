@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import os
 import re
 import shlex
@@ -59,6 +61,37 @@ def test_every_link_leads_somewhere(page: Path):
         if not (target.exists() or target in MADE) or (anchor and anchor not in anchors(target)):
             dead.append(link)
     assert dead == []
+
+
+def is_defined(name: str) -> bool:
+    """Whether a dotted name is that of a module, or of something in a module."""
+    parts = name.split(".")
+    for k in range(len(parts), 0, -1):
+        module = ".".join(parts[:k])
+        try:
+            found = importlib.import_module(module)
+        except ModuleNotFoundError:
+            continue
+        return all((found := getattr(found, part, None)) is not None for part in parts[k:])
+    return False
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_name_and_file_of_the_code_that_a_page_mentions_exists(page: Path):
+    text = re.sub(r"^ *\| (`hybridlio[^|]*)\|", "", page.read_text(), flags=re.MULTILINE)  # the changes' old names
+    names = set(re.findall(r"`(hybridlio(?:\.\w+)+)`", text))
+    assert {name for name in names if not is_defined(name)} == set()
+    files = set(re.findall(r"`((?:hybridlio|graph|learned|tests|benchmarks|examples|docs)/[\w/.]*)`", text))
+    assert {file for file in files if not (ROOT / file).exists()} == set()
+
+
+def test_the_layout_in_the_readme_is_the_tested_one():
+    tested = re.search(
+        r"^FLOORS = (\{.*?^\})", (ROOT / "tests/test_architecture.py").read_text(), re.DOTALL | re.MULTILINE
+    )
+    assert tested
+    shown = re.findall(r"^\| (\d) \| `(?:hybridlio/)?(\w+)/` \|", README.read_text(), flags=re.MULTILINE)
+    assert {room: int(floor) for floor, room in shown} == ast.literal_eval(tested[1])
 
 
 def test_the_readme_is_short():
