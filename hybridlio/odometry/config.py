@@ -16,8 +16,7 @@ from hybridlio.core.sensors import ImuNoise
 from hybridlio.core.setting_checks import SettingError
 from hybridlio.learned.source_settings import LstmSettings, NetworkResidualSettings
 from hybridlio.record.loop_keyframes import LoopKeyframeSettings
-from hybridlio.sources.recent_scans import RecentScansSettings
-from hybridlio.sources.scan_matching_settings import ScanMatchingSettings
+from hybridlio.sources.settings import RecentScansSettings, ScanMatchingSettings
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails

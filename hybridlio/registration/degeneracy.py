@@ -27,8 +27,9 @@ from numpy.typing import NDArray
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.registration.cost_profile import OFFSETS_M, PROBE_STEP_M, parabola_minimum, weigh_offsets
-from hybridlio.registration.icp import Registration, RegistrationSettings, register
+from hybridlio.registration.icp import Registration, register
 from hybridlio.registration.information import UNKNOWN_SIGMA_M, covariance_of, weak_basis
+from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Surface
 
 _PROBE_ITERATIONS = (

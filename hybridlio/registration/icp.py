@@ -19,9 +19,9 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.setting_checks import check_positive
 from hybridlio.registration.information import newton_step
 from hybridlio.registration.point_to_point import MixedMatches, MixedNeighbours
+from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import LinearSystem, Neighbours, PlaneMatches, Surface
 
 # A step below both has converged: 1 mm at 50 m and 0.3 mm, less than the standard deviation of any registration.
@@ -34,31 +34,6 @@ _MAX_MATCHINGS = 8  # points midway between two neighbours can make the pose alt
 _LONG_STEP = 10.0  # times the way to a rematch: 5 cm or 2 mrad. After such a step most matches are wrong: match at once
 _MATCH_KERNELS = 3  # kernel widths within which neighbours count; the weight of a residual beyond is below 1 %
 _MIN_MATCHES = 6  # as many as unknowns; with fewer the Hessian is singular and the pose stays
-
-
-@dataclass(frozen=True)
-class RegistrationSettings:
-    """Settings of a registration.
-
-    Attributes:
-        kernel_m: width of the Geman-McClure kernel: the residual at which a match has a quarter of its weight.
-        max_distance_m: nearest neighbours farther away are not matched.
-        max_iterations: Gauss-Newton steps.
-        threads: for the nearest-neighbour search.
-
-    Raises:
-        SettingError: a value is out of range.
-    """
-
-    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
-
-    kernel_m: float = 0.1
-    max_distance_m: float = 1.0
-    max_iterations: int = 30
-    threads: int = 2
-
-    def __post_init__(self) -> None:
-        check_positive(self, "kernel_m", "max_distance_m", "max_iterations", "threads")
 
 
 class Fit(NamedTuple):

@@ -7,14 +7,11 @@ keyframe, which has time to spare.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from hybridlio.cloud.plane_fitting import MIN_NEIGHBOURS
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.setting_checks import check_positive, check_setting
+from hybridlio.registration.settings import LocalMapSettings
 from hybridlio.registration.surface import Surface
 from hybridlio.registration.voxel_map import VoxelMap
 
@@ -24,39 +21,6 @@ from hybridlio.registration.voxel_map import VoxelMap
 _REBUILD_APPENDED_RATIO = 0.12
 _REBUILD_DISTANCE_RATIO = 0.12
 _OVERDUE = 2.0  # times that: rebuilt at a keyframe, if every scan has been one
-
-
-@dataclass(frozen=True)
-class LocalMapSettings:
-    """Settings of the local map.
-
-    Attributes:
-        keyframe_m, keyframe_deg: a scan this far from the last keyframe, or turned by this much, becomes a keyframe.
-        voxel_m: side of the map's cells; each holds up to ten points at least 10 cm apart.
-        horizon_keyframes: a cell that this number of keyframes has not hit is dropped at the next rebuild.
-        radius_m: points farther from the keyframe are left out of the surface at a rebuild.
-        neighbours: number of points that a plane is fitted to.
-        threads: for planes and trees.
-
-    Raises:
-        SettingError: a value is out of range.
-    """
-
-    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
-
-    keyframe_m: float = 2.0
-    keyframe_deg: float = 10.0
-    voxel_m: float = 2.0
-    horizon_keyframes: int = 30
-    radius_m: float = 100.0
-    neighbours: int = 10
-    threads: int = 2
-
-    def __post_init__(self) -> None:
-        check_positive(self, "keyframe_m", "keyframe_deg", "voxel_m", "horizon_keyframes", "radius_m", "threads")
-        check_setting(
-            self, "neighbours", self.neighbours >= MIN_NEIGHBOURS, f"{MIN_NEIGHBOURS} or more, as a plane needs"
-        )
 
 
 class LocalMap:

@@ -15,7 +15,8 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.registration.icp import Fit, Registration, RegistrationSettings, fit_at, register
+from hybridlio.registration.icp import Fit, Registration, fit_at, register
+from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Surface
 
 # Candidates' speeds are 2.5 m/s apart: 0.25 m at 10 Hz and 0.5 m at 5 Hz. A kernel of that size reaches from one to the

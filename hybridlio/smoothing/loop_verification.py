@@ -21,9 +21,10 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Index
 from hybridlio.core.setting_checks import check_fraction, check_not_negative, check_positive, check_setting
 from hybridlio.record.loop_keyframes import LoopKeyframes
-from hybridlio.registration.icp import Fit, Registration, RegistrationSettings, fit_at, register
+from hybridlio.registration.icp import Fit, Registration, fit_at, register
 from hybridlio.registration.information import NORMAL_NOISE, covariance_of, degenerate_directions
 from hybridlio.registration.motion_search import CoarseSearch, refine_best
+from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Surface
 from hybridlio.smoothing.step_uncertainty import OdometryChain
 

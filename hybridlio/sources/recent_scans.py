@@ -17,37 +17,10 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import EarlierScanPose, RelativePose, ResidualSource, TakesBack
 from hybridlio.core.motion_limits import PREDICTION_FLOOR_SIGMAS
 from hybridlio.core.sensors import Frame
-from hybridlio.core.setting_checks import check_not_negative, check_positive, check_setting
 from hybridlio.sources.innovation_gate import GATE_NIS, normalised_innovation_squared
+from hybridlio.sources.settings import RecentScansSettings
 
 _FLOOR = np.diag(PREDICTION_FLOOR_SIGMAS**2)
-
-
-@dataclass(frozen=True)
-class RecentScansSettings:
-    """Which recent scans each scan is compared with.
-
-    Attributes:
-        count: number of recent scans; 0 compares with the last scan only.
-        distance_m, angle_deg: a scan this far from the newest recent scan becomes one itself.
-        shared: fraction of a relative pose's covariance that is noise of its two scans, half each, and so is shared by
-            all relative poses of a scan.
-
-    Raises:
-        SettingError: a value is out of range.
-    """
-
-    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
-
-    count: int = 0
-    distance_m: float = 3.0
-    angle_deg: float = 15.0
-    shared: float = 0.75
-
-    def __post_init__(self) -> None:
-        check_not_negative(self, "count")
-        check_positive(self, "distance_m", "angle_deg")
-        check_setting(self, "shared", 0 <= self.shared < 1, "from 0 to below 1")
 
 
 class PairSource(ResidualSource, Protocol):

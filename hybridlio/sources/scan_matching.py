@@ -21,7 +21,7 @@ from hybridlio.registration.icp import Registration
 from hybridlio.registration.local_map import LocalMap
 from hybridlio.registration.motion_search import COARSE_KERNEL_M, best_start, fits_better, motions
 from hybridlio.sources.matching_state import MatchingState, PathPoint
-from hybridlio.sources.scan_matching_settings import ScanMatchingSettings
+from hybridlio.sources.settings import ScanMatchingSettings
 from hybridlio.sources.thinned_scan import ThinnedScan, thin
 
 # An initial rotation less certain than this (all axes together) is searched for as well: 1.1°, which displaces points

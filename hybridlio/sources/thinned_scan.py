@@ -10,9 +10,10 @@ import numpy as np
 from hybridlio.cloud.voxel import voxel_average, voxel_pick
 from hybridlio.core.arrays import Array, Floats, Mask
 from hybridlio.core.sensors import Scan
-from hybridlio.registration.local_map import LocalMap, LocalMapSettings
+from hybridlio.registration.local_map import LocalMap
+from hybridlio.registration.settings import LocalMapSettings
 from hybridlio.registration.surface import Surface
-from hybridlio.sources.scan_matching_settings import ScanMatchingSettings
+from hybridlio.sources.settings import ScanMatchingSettings
 
 _VOXEL_SHRINKAGE = 0.7  # halves a voxel's area, so about doubles its points, at each try to use more of a sparse scan
 # A scan of this many times `least_measured` points is never too sparse: a quarter of them at least is registered with

@@ -11,13 +11,12 @@ import yaml
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.sensors import ImuNoise
 from hybridlio.odometry.config import Config, config_to_yaml, load_config, parse_config
-from hybridlio.registration.icp import RegistrationSettings
-from hybridlio.registration.local_map import LocalMapSettings
+from hybridlio.registration.settings import LocalMapSettings, RegistrationSettings
 from hybridlio.smoothing.loop_candidates import CandidateSettings
 from hybridlio.smoothing.loop_consistency import ConsistencySettings
 from hybridlio.smoothing.loop_verification import VerificationSettings
 from hybridlio.smoothing.place_recognition import DescriptorSettings
-from hybridlio.sources.scan_matching_settings import ScanMatchingSettings
+from hybridlio.sources.settings import ScanMatchingSettings
 
 
 def leaves(settings: Any, above: str = "") -> Iterator[tuple[str, float]]:

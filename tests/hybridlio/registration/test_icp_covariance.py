@@ -3,8 +3,9 @@ import pytest
 from rooms import CORRIDOR, PLAIN, ROOM, scene, seen_from
 
 from hybridlio.core import se3
-from hybridlio.registration.icp import RegistrationSettings, register
+from hybridlio.registration.icp import register
 from hybridlio.registration.information import covariance_of, degenerate_directions, scaled_spectrum
+from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Surface
 
 EXACT = RegistrationSettings(threads=1)

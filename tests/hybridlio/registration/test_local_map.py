@@ -3,7 +3,8 @@ import pytest
 import small_gicp
 
 from hybridlio.core import se3
-from hybridlio.registration.local_map import LocalMap, LocalMapSettings
+from hybridlio.registration.local_map import LocalMap
+from hybridlio.registration.settings import LocalMapSettings
 from hybridlio.registration.voxel_map import MAX_POINTS_PER_CELL
 
 SETTINGS = LocalMapSettings(threads=1)

@@ -4,8 +4,9 @@ import numpy as np
 from rooms import ROOM, scene, seen_from
 
 from hybridlio.core import se3
-from hybridlio.registration.icp import RegistrationSettings, register
+from hybridlio.registration.icp import register
 from hybridlio.registration.point_to_point import MixedNeighbours
+from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Surface
 
 POSE = se3.exp(np.array([0.02, -0.01, 0.3, 1.0, -0.5, 0.2]))

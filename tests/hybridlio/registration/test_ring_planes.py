@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 from hybridlio.core import se3
-from hybridlio.registration.local_map import LocalMap, LocalMapSettings
+from hybridlio.registration.local_map import LocalMap
 from hybridlio.registration.ring_planes import RingPlanes
+from hybridlio.registration.settings import LocalMapSettings
 
 HEIGHT_M = 1.7
 GRADE = np.radians(2.0)  # of the ground, rising ahead

@@ -18,9 +18,9 @@ from hybridlio.odometry.odometry import Odometry
 from hybridlio.odometry.registry import RESIDUAL_SOURCES
 from hybridlio.odometry.setup import Setup
 from hybridlio.record.record import Record
-from hybridlio.sources.recent_scans import RecentScansSettings, WithRecentScans
+from hybridlio.sources.recent_scans import WithRecentScans
 from hybridlio.sources.scan_matching import ScanMatching
-from hybridlio.sources.scan_matching_settings import ScanMatchingSettings
+from hybridlio.sources.settings import RecentScansSettings, ScanMatchingSettings
 
 COVARIANCE = np.diag(np.r_[np.full(3, 1e-3), np.full(3, 0.01)] ** 2)
 STEP = se3.exp(np.array([0.0, 0.0, 0.01, 1.0, 0.0, 0.0]))

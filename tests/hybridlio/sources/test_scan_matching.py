@@ -12,7 +12,7 @@ from hybridlio.core.motion_limits import unknown_motion_covariance
 from hybridlio.core.sensors import Frame, Scan
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.sources.scan_matching import ScanMatching
-from hybridlio.sources.scan_matching_settings import ScanMatchingSettings
+from hybridlio.sources.settings import ScanMatchingSettings
 
 TARGETS = ("local-map", "last-scan")
 SURE = np.diag(np.r_[np.full(3, 0.01), np.full(3, 0.1)] ** 2)

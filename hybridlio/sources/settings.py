@@ -1,4 +1,4 @@
-"""Settings of scan matching."""
+"""Settings of the classical sources. This module imports no algorithm, so that settings load quickly."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from hybridlio.core.setting_checks import check_fraction, check_not_negative, check_positive, check_setting
-from hybridlio.registration.icp import RegistrationSettings
-from hybridlio.registration.local_map import LocalMapSettings
+from hybridlio.registration.settings import LocalMapSettings, RegistrationSettings
 
 
 @dataclass(frozen=True)
@@ -63,3 +62,30 @@ class ScanMatchingSettings:
         )
         for name in ("start_speeds_m_s", "start_rates_deg_s"):
             check_setting(self, name, len(getattr(self, name)) > 0, "a list of one number or more")
+
+
+@dataclass(frozen=True)
+class RecentScansSettings:
+    """Which recent scans each scan is compared with.
+
+    Attributes:
+        count: number of recent scans; 0 compares with the last scan only.
+        distance_m, angle_deg: a scan this far from the newest recent scan becomes one itself.
+        shared: fraction of a relative pose's covariance that is noise of its two scans, half each, and so is shared by
+            all relative poses of a scan.
+
+    Raises:
+        SettingError: a value is out of range.
+    """
+
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
+
+    count: int = 0
+    distance_m: float = 3.0
+    angle_deg: float = 15.0
+    shared: float = 0.75
+
+    def __post_init__(self) -> None:
+        check_not_negative(self, "count")
+        check_positive(self, "distance_m", "angle_deg")
+        check_setting(self, "shared", 0 <= self.shared < 1, "from 0 to below 1")
