@@ -39,7 +39,8 @@ from hybridlio.core.packed_arrays import PackedList
 from hybridlio.core.sensors import Calibration, Frame, ImuSamples, Scan
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.odometry.odometry import Estimate, Odometry
+from hybridlio.odometry.estimate import Estimate
+from hybridlio.odometry.odometry import Odometry
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.simulate import simulate
 

@@ -45,7 +45,8 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time each name l
     from hybridlio.evaluation.evaluate import evaluate
     from hybridlio.graph.run.smooth import smooth
     from hybridlio.odometry.config import Config
-    from hybridlio.odometry.odometry import Estimate, Odometry
+    from hybridlio.odometry.estimate import Estimate
+    from hybridlio.odometry.odometry import Odometry
     from hybridlio.runs.batch import BatchOptions, run_batch
     from hybridlio.runs.batch_table import Batch
     from hybridlio.runs.recordings import Recording, find_recordings
@@ -90,7 +91,8 @@ _HOMES = {
     "evaluation.evaluate": ("evaluate",),
     "graph.run.smooth": ("smooth",),
     "odometry.config": ("Config",),
-    "odometry.odometry": ("Estimate", "Odometry"),
+    "odometry.estimate": ("Estimate",),
+    "odometry.odometry": ("Odometry",),
     "runs.batch": ("BatchOptions", "run_batch"),
     "runs.batch_table": ("Batch",),
     "runs.recordings": ("Recording", "find_recordings"),

@@ -1,11 +1,11 @@
-"""One odometry step: configuration, registry of implementations, start-up, motion compensation."""
+"""Odometry: the estimator, its stages and start-up, the configuration, and the registry of implementations."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from hybridlio.odometry.odometry import Estimate as Estimate
+    from hybridlio.odometry.estimate import Estimate as Estimate
     from hybridlio.odometry.odometry import Odometry as Odometry
 
 __all__ = ["Estimate", "Odometry"]

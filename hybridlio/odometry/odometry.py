@@ -2,68 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from hybridlio.core import se3
-from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError, DataError, EstimationError
-from hybridlio.core.estimates import Backend, InitialPoseSource, RelativePose, ResidualSource, State
+from hybridlio.core.estimates import Backend, InitialPoseSource, ResidualSource, State
 from hybridlio.core.sensors import Frame
 from hybridlio.odometry.config import Config
+from hybridlio.odometry.estimate import Estimate
 from hybridlio.odometry.pipeline import Pipeline, timed
 from hybridlio.odometry.registry import check_names, make_implementations
 from hybridlio.odometry.setup import Setup
-from hybridlio.odometry.start_up import repeat_first_step, start_backend, start_pipeline, take_up_imu
+from hybridlio.odometry.start_up import repeat_first_step, start_backend, start_residual, take_up_imu
 from hybridlio.record.loop_keyframes import LoopKeyframeSelector
 from hybridlio.record.record import Record
 from hybridlio.record.recorder import Recorder
-from hybridlio.sources.innovation_gate import UNTESTED, GateResult
 
 # The first pose defines the frame, so it is exact. GTSAM and the file formats need a positive definite covariance;
 # 1e-6 rad and m are far below any sensor's noise.
 _FIRST_COVARIANCE = np.eye(6) * 1e-12
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """The result of one step.
-
-    Attributes:
-        index, stamp_ns: the frame's.
-        pose: ``(4, 4)`` lidar pose ``T_world_lidar``; world is the lidar frame of the first scan.
-        covariance: ``(6, 6)`` of a right perturbation of ``pose``, rad² and m², rotation first.
-        initial: the initial relative pose ``T̂``; None at the first frame.
-        relative: the relative pose ``T = δT·T̂`` that the backend was given; None at the first frame.
-        step: the same step after the backend's optimisation; None at the first frame.
-        seconds: time spent, by stage.
-        gate: result of comparing the residual source's pose with the IMU; ``relative`` is what passed the gate.
-    """
-
-    index: int
-    stamp_ns: int
-    pose: Array
-    covariance: Array
-    initial: RelativePose | None
-    relative: RelativePose | None
-    step: RelativePose | None
-    seconds: dict[str, float]
-    gate: GateResult = UNTESTED
-
-    def __repr__(self) -> str:
-        x, y, z = self.pose[:3, 3]
-        sigma_m = float(np.sqrt(self.covariance[3:, 3:].trace()))
-        bridged = "" if self.relative is None or self.relative.ok else ", bridged"
-        position = f"({x:.2f}, {y:.2f}, {z:.2f}) m ± {sigma_m:.2g} m"
-        return f"Estimate(frame {self.index}, position {position}, {self.gate.verdict}{bridged})"
-
-    @property
-    def residual(self) -> Array:
-        """``δT`` ``(4, 4)``, by which the residual source moved the initial pose; the identity at the first frame."""
-        if self.initial is None or self.relative is None:
-            return np.eye(4)
-        return np.asarray(self.relative.pose @ se3.inverse(self.initial.pose))
 
 
 class Odometry:
@@ -145,12 +101,15 @@ class Odometry:
         pipeline = self._pipeline
         if pipeline is None or pipeline.start is None or pipeline.state is None:
             raise EstimationError("a record needs at least two frames; call step for more")
-        setup, keyframes = pipeline.setup, self._keyframes.keyframes()
-        return self._recorder.record(pipeline.start, setup.calibration, setup.imu_noise, keyframes, scans)
+        keyframes = self._keyframes.keyframes()
+        return self._recorder.record(pipeline.start, pipeline.calibration, pipeline.imu_noise, keyframes, scans)
 
     def _start(self, first: Frame) -> Pipeline:
         setup = Setup.from_frame(self._config, first)
-        return start_pipeline(make_implementations(self._chosen, setup), setup, first)
+        implementations = make_implementations(self._chosen, setup)
+        pipeline = Pipeline(first, setup.calibration, setup.imu_noise, *implementations, setup.predict_from_imu)
+        start_residual(pipeline)
+        return pipeline
 
     def _state_before(self, frame: Frame, pipeline: Pipeline) -> State:
         """Return the state at the last scan. Start the backend first, or restart it at the first IMU samples."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -11,9 +11,8 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.estimates import Backend, InitialPoseSource, RelativePose, ResidualSource, State, TakesBack
-from hybridlio.core.sensors import Frame
+from hybridlio.core.sensors import Calibration, Frame, ImuNoise
 from hybridlio.odometry.compensation import MotionCompensation
-from hybridlio.odometry.setup import Setup
 from hybridlio.sources.innovation_gate import GateResult, InnovationGate
 
 
@@ -23,8 +22,10 @@ class Pipeline:
 
     Attributes:
         first: the first frame.
-        setup: what the implementations were made from.
+        calibration: the extrinsics.
+        imu_noise: the IMU's noise densities.
         initial_pose, residual, backend: implementations of the three seams.
+        predict_from_imu: predicts the step to a frame from its samples and the state before, for the gate.
         compensation: motion compensation.
         gate: compares relative poses with the IMU.
         start: state at the first scan that the backend started from; None until the second frame.
@@ -32,14 +33,19 @@ class Pipeline:
     """
 
     first: Frame
-    setup: Setup
+    calibration: Calibration
+    imu_noise: ImuNoise
     initial_pose: InitialPoseSource
     residual: ResidualSource
     backend: Backend
-    compensation: MotionCompensation
+    predict_from_imu: Callable[[Frame, State], RelativePose | None]
+    compensation: MotionCompensation = field(init=False)
     gate: InnovationGate = field(default_factory=InnovationGate)
     start: State | None = None
     state: State | None = None
+
+    def __post_init__(self) -> None:
+        self.compensation = MotionCompensation(self.calibration, self.imu_noise)
 
     def predict(self, frame: Frame, state: State) -> RelativePose:
         """Return the initial relative pose of the step to ``frame``.
@@ -82,7 +88,7 @@ class Pipeline:
 
         The prediction is the IMU's whatever the initial-pose source, so that every source is gated alike.
         """
-        predicted = self.setup.inertial_steps.predicted(frame, state) if state.has_imu else None
+        predicted = self.predict_from_imu(frame, state) if state.has_imu else None
         relative, result = self.gate.apply(measured, predicted, initial)
         if result.verdict == "rejected" and isinstance(self.residual, TakesBack):
             self.residual.take_back(initial)
@@ -95,7 +101,7 @@ class Pipeline:
 
     def lidar_pose(self, state: State) -> tuple[Array, Array]:
         """Return the state's lidar pose ``(4, 4)`` in the first scan's frame, and its covariance ``(6, 6)``."""
-        T_imu_lidar = self.setup.calibration.T_imu_lidar
+        T_imu_lidar = self.calibration.T_imu_lidar
         T_lidar_imu = se3.inverse(T_imu_lidar)
         covariance = se3.rotate_covariance(state.covariance[:6, :6], T_lidar_imu)
         return T_lidar_imu @ state.T_world_imu @ T_imu_lidar, covariance

@@ -10,6 +10,7 @@ from hybridlio.core.sensors import Calibration, Frame, ImuNoise
 from hybridlio.core.setting_checks import check_positive
 
 if TYPE_CHECKING:  # the command line imports this module and must start quickly
+    from hybridlio.core.estimates import RelativePose, State
     from hybridlio.graph.run.inertial_steps import InertialSteps
     from hybridlio.odometry.config import Config
 
@@ -48,3 +49,7 @@ class Setup:
         from hybridlio.graph.run.inertial_steps import InertialSteps
 
         return InertialSteps(self.calibration, self.imu_noise)
+
+    def predict_from_imu(self, frame: Frame, state: State) -> RelativePose | None:
+        """Return the step from ``state`` to ``frame`` by the IMU; None if its samples do not cover it."""
+        return self.inertial_steps.predicted(frame, state)

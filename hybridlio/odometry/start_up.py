@@ -11,13 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from hybridlio.core.estimates import Backend, InitialPoseSource, RelativePose, ResidualSource, State
+from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.motion_limits import BRIDGED_ACCELERATION_SIGMA_M_S2
 from hybridlio.core.sensors import NS_PER_S, Frame, ImuSamples, Scan
 from hybridlio.core.start_state import start_state
-from hybridlio.odometry.compensation import MotionCompensation
 from hybridlio.odometry.pipeline import Pipeline
-from hybridlio.odometry.setup import Setup
 from hybridlio.record.record import Record
 from hybridlio.record.recorder import concatenate_imu
 
@@ -29,23 +27,20 @@ _REPETITIONS_WITHOUT_IMU = 3
 _LEVELLING_NS = NS_PER_S  # samples this long before the first scan help to find where down is
 
 
-def start_pipeline(
-    implementations: tuple[InitialPoseSource, ResidualSource, Backend], setup: Setup, first: Frame
-) -> Pipeline:
-    """Give the first frame to the residual source and return the pipeline for the frames after it.
+def start_residual(pipeline: Pipeline) -> None:
+    """Give the first scan to the residual source.
 
-    The first scan is compensated for its rotation alone, because its speed is unknown. The second scan is compensated
-    no better by its first initial pose: two scans that the same speed has distorted fit each other, while one with and
-    one without that distortion would end centimetres and milliradians apart.
+    It is compensated for its rotation alone, because its speed is unknown. The second scan is compensated no better by
+    its first initial pose: two scans that the same speed has distorted fit each other, while one with and one without
+    that distortion would end centimetres and milliradians apart.
 
     Raises:
-        DataError: the residual source cannot start at this scan.
+        DataError: the source cannot start at this scan.
     """
-    initial_pose, residual, backend = implementations
-    compensation = MotionCompensation(setup.calibration, setup.imu_noise)
-    stamp_ns = first.scan.stamp_ns
-    residual.start(compensation.compensate(first, np.eye(4), stamp_ns - NS_PER_S, stamp_ns, np.zeros(3)))
-    return Pipeline(first, setup, initial_pose, residual, backend, compensation)
+    first, stamp_ns = pipeline.first, pipeline.first.scan.stamp_ns
+    pipeline.residual.start(
+        pipeline.compensation.compensate(first, np.eye(4), stamp_ns - NS_PER_S, stamp_ns, np.zeros(3))
+    )
 
 
 def start_backend(pipeline: Pipeline, second: Frame) -> State:
@@ -61,7 +56,7 @@ def start_backend(pipeline: Pipeline, second: Frame) -> State:
     if len(first.imu):
         before = first.imu.between(first.scan.stamp_ns - _LEVELLING_NS, first.scan.stamp_ns)
     samples = concatenate_imu([before, second.imu])
-    pipeline.start = start_state(first.scan.stamp_ns, samples, pipeline.setup.imu_noise)
+    pipeline.start = start_state(first.scan.stamp_ns, samples, pipeline.imu_noise)
     pipeline.backend.start(pipeline.start)
     return pipeline.start
 

@@ -7,6 +7,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import islice
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.evaluation.evaluate import Steps
 from hybridlio.odometry.config import Config
-from hybridlio.odometry.odometry import Estimate, Odometry
+from hybridlio.odometry.estimate import Estimate
 from hybridlio.record.record import Record
 from hybridlio.sources.innovation_gate import GATE_NIS, Verdict
 
@@ -29,6 +30,18 @@ _log = logging.getLogger(__name__)
 _MAX_CLOCK_OFFSET_NS = 30 * NS_PER_S  # more than the 18 s between GPS time and UTC
 _MAX_START_WARNINGS = 3  # enough to see why; later unusable scans are logged as information
 _FROM_IMU, _WITHOUT_IMU = "preintegration", "constant-velocity"
+
+
+class FrameByFrame(Protocol):
+    """What a run needs of its odometry; :class:`hybridlio.Odometry` provides it."""
+
+    def step(self, frame: Frame) -> Estimate:
+        """Estimate the frame's pose."""
+        ...
+
+    def record(self, scans: int | None = None) -> Record:
+        """Return what smoothing needs of all scans so far, or of the first ``scans``."""
+        ...
 
 
 @dataclass(eq=False)
@@ -49,7 +62,7 @@ class Run:
     """
 
     sequence: Sequence
-    odometry: Odometry
+    odometry: FrameByFrame
     estimates: PackedList[Estimate] | list[Estimate] = field(default_factory=PackedList)
     skipped: int = 0
     unreadable: dict[int, str] = field(default_factory=dict)
@@ -139,7 +152,7 @@ class Run:
         return replace(record, gps=tuple(near))
 
 
-def run_odometry(sequence: Sequence, odometry: Odometry, progress: Progress | None = None) -> Run:
+def run_odometry(sequence: Sequence, odometry: FrameByFrame, progress: Progress | None = None) -> Run:
     """Run an odometry over all frames of a sequence.
 
     A scan that cannot be read is bridged by the initial pose, with a warning. An error or interrupt that stops the

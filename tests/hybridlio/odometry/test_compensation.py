@@ -9,6 +9,7 @@ from hybridlio.cloud.deskew import compensation_noise, constant_twist, sweep_mot
 from hybridlio.core import se3
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.sensors import Calibration, Frame, ImuNoise, ImuSamples, Scan
+from hybridlio.odometry.compensation import MotionCompensation
 from hybridlio.odometry.odometry import Odometry
 
 SWEEP_NS = 100_000_000
@@ -88,6 +89,16 @@ def test_the_error_left_by_compensation_has_the_predicted_variance(rng, imu):
         turned = rng.normal(0.0, 0.02, (runs, 1)) * np.linspace(-0.5, 0.5, steps) * SWEEP_NS / 1e9
         once = np.mean(turned**2)  # of one point
     np.testing.assert_allclose(np.diag(said)[:3], 2 * once, rtol=0.1)
+
+
+def test_a_frame_without_point_times_passes_unchanged_and_without_noise(rng):
+    frame, points = sweep(1, rng)
+    compensation = MotionCompensation(Calibration(), ImuNoise())
+    compensated = compensation.compensate(frame, np.eye(4), 0, SWEEP_NS, np.zeros(3))
+    np.testing.assert_allclose(compensated.scan.points, points, atol=1e-4)
+    assert compensation.noise(frame) is not None
+    assert compensation.compensate(compensated, np.eye(4), 0, SWEEP_NS, np.zeros(3)) is compensated
+    assert compensation.noise(compensated) is None
 
 
 def test_the_first_scan_is_compensated_for_rotation(rng):

@@ -14,7 +14,8 @@ from hybridlio.core.sensors import Frame, GpsFix, ImuSamples
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.graph.run.smooth import smooth
 from hybridlio.odometry.config import Config
-from hybridlio.odometry.odometry import Estimate, Odometry
+from hybridlio.odometry.estimate import Estimate
+from hybridlio.odometry.odometry import Odometry
 from hybridlio.record.record import Record
 from hybridlio.sources.residual_chain import NoResidual
 

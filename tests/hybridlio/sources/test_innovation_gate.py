@@ -12,7 +12,8 @@ from hybridlio.core.estimates import EarlierScanPose, RelativePose
 from hybridlio.core.sensors import Frame
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.odometry.config import Config
-from hybridlio.odometry.odometry import Estimate, Odometry
+from hybridlio.odometry.estimate import Estimate
+from hybridlio.odometry.odometry import Odometry
 from hybridlio.sources.innovation_gate import (
     GATE_NIS,
     GROSS_NIS,

@@ -1,0 +1,52 @@
+"""The result of one step of odometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybridlio.core import se3
+from hybridlio.core.arrays import Array
+from hybridlio.core.estimates import RelativePose
+from hybridlio.sources.innovation_gate import UNTESTED, GateResult
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The result of one step.
+
+    Attributes:
+        index, stamp_ns: the frame's.
+        pose: ``(4, 4)`` lidar pose ``T_world_lidar``; world is the lidar frame of the first scan.
+        covariance: ``(6, 6)`` of a right perturbation of ``pose``, rad² and m², rotation first.
+        initial: the initial relative pose ``T̂``; None at the first frame.
+        relative: the relative pose ``T = δT·T̂`` that the backend was given; None at the first frame.
+        step: the same step after the backend's optimisation; None at the first frame.
+        seconds: time spent, by stage.
+        gate: result of comparing the residual source's pose with the IMU; ``relative`` is what passed the gate.
+    """
+
+    index: int
+    stamp_ns: int
+    pose: Array
+    covariance: Array
+    initial: RelativePose | None
+    relative: RelativePose | None
+    step: RelativePose | None
+    seconds: dict[str, float]
+    gate: GateResult = UNTESTED
+
+    def __repr__(self) -> str:
+        x, y, z = self.pose[:3, 3]
+        sigma_m = float(np.sqrt(self.covariance[3:, 3:].trace()))
+        bridged = "" if self.relative is None or self.relative.ok else ", bridged"
+        position = f"({x:.2f}, {y:.2f}, {z:.2f}) m ± {sigma_m:.2g} m"
+        return f"Estimate(frame {self.index}, position {position}, {self.gate.verdict}{bridged})"
+
+    @property
+    def residual(self) -> Array:
+        """``δT`` ``(4, 4)``, by which the residual source moved the initial pose; the identity at the first frame."""
+        if self.initial is None or self.relative is None:
+            return np.eye(4)
+        return np.asarray(self.relative.pose @ se3.inverse(self.initial.pose))

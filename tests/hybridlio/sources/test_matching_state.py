@@ -1,0 +1,92 @@
+"""Transitions of scan matching's state."""
+
+from __future__ import annotations
+
+from dataclasses import FrozenInstanceError
+
+import numpy as np
+import pytest
+
+from hybridlio.core import se3
+from hybridlio.core.estimates import RelativePose
+from hybridlio.sources.matching_state import MatchingState
+
+POINTS = np.zeros((3, 3))
+TWIST = np.array([0.0, 0.0, 0.1, 5.0, 0.0, 0.0])
+STEP = se3.exp(0.1 * TWIST)
+INITIAL = RelativePose(se3.exp([0.0, 0.0, 0.0, 0.4, 0.0, 0.0]), 1e-2 * np.eye(6), "imu")
+
+
+@pytest.fixture
+def started() -> MatchingState:
+    return MatchingState.started(POINTS)
+
+
+@pytest.fixture
+def matched(started: MatchingState) -> MatchingState:
+    return started.keyframe_inserted().matched(STEP, 0.1, is_degenerate=False, is_vague=False)
+
+
+def test_the_first_scan_is_the_origin_and_a_pending_keyframe(started: MatchingState):
+    np.testing.assert_array_equal(started.current.T_map_lidar, np.eye(4))
+    assert started.keyframe is POINTS
+    assert started.current.map_changed
+    assert started.keyframe_inserted().keyframe is None
+
+
+def test_a_state_is_immutable(started: MatchingState):
+    with pytest.raises(FrozenInstanceError):
+        started.adrift = True  # type: ignore[misc]
+
+
+def test_a_match_moves_on_and_measures_the_twist(started: MatchingState, matched: MatchingState):
+    np.testing.assert_array_equal(matched.current.T_map_lidar, STEP)
+    np.testing.assert_allclose(matched.current.twist, TWIST, atol=1e-12)
+    assert matched.previous is started.current
+    assert not matched.current.map_changed
+    assert (matched.doubted, matched.keyframe, matched.adrift) == (None, None, False)
+
+
+@pytest.mark.parametrize(("is_degenerate", "is_vague"), [(False, False), (False, True), (True, False), (True, True)])
+def test_a_state_is_adrift_only_after_a_degenerate_match_from_a_vague_pose(
+    started: MatchingState, is_degenerate: bool, is_vague: bool
+):
+    state = started.matched(STEP, 0.1, is_degenerate, is_vague)
+    assert state.adrift == (is_degenerate and is_vague)
+    assert (state.current.twist is None) == is_degenerate
+
+
+def test_a_pending_keyframe_changes_the_map_before_the_next_match(matched: MatchingState):
+    pending = matched.keyframe_pending(POINTS)
+    assert pending.keyframe is POINTS
+    assert pending.current.map_changed
+    assert not pending.matched(STEP @ STEP, 0.1, is_degenerate=False, is_vague=False).current.map_changed
+
+
+def test_bridges_add_up_until_the_next_match(matched: MatchingState):
+    once = matched.keyframe_pending(POINTS).keyframe_inserted().bridged(INITIAL)
+    twice = once.bridged(INITIAL)
+    np.testing.assert_allclose(twice.current.T_map_lidar, STEP @ INITIAL.pose @ INITIAL.pose)
+    np.testing.assert_array_equal(once.current.bridge_covariance, INITIAL.covariance)
+    assert (np.diag(twice.current.bridge_covariance) >= 2 * np.diag(INITIAL.covariance) - 1e-15).all()
+    assert twice.current.bridged
+    assert twice.current.map_changed  # the keyframe before the first bridge still counts for the next match
+    found = twice.matched(twice.current.T_map_lidar, 0.1, is_degenerate=False, is_vague=False).current
+    assert found.twist is None  # the motion since a bridge is not measured
+    np.testing.assert_array_equal(found.bridge_covariance, np.zeros((6, 6)))
+
+
+def test_while_the_map_is_empty_a_bridged_scan_becomes_its_first_keyframe(started: MatchingState):
+    assert started.keyframe_inserted().bridged(INITIAL, POINTS).keyframe is POINTS
+
+
+def test_a_match_taken_back_is_replaced_by_the_initial_pose_but_remembered(matched: MatchingState):
+    state = matched.keyframe_pending(POINTS).taken_back(INITIAL)
+    np.testing.assert_array_equal(state.current.T_map_lidar, INITIAL.pose)
+    assert state.current.bridged
+    assert state.keyframe is None
+    assert state.doubted is not None
+    np.testing.assert_array_equal(state.last_found.T_map_lidar, STEP)
+    again = state.matched(STEP @ STEP, 0.1, is_degenerate=False, is_vague=False)
+    np.testing.assert_allclose(again.current.twist, TWIST, atol=1e-12)  # from where the scan was found
+    assert again.doubted is None
