@@ -20,7 +20,7 @@ from hybridlio.core.sensors import Frame
 from hybridlio.sources.innovation_gate import GATE_NIS, normalised_innovation_squared
 from hybridlio.sources.settings import RecentScansSettings
 
-_FLOOR = np.diag(PREDICTION_FLOOR_SIGMAS**2)
+_FLOOR = np.diag(PREDICTION_FLOOR_SIGMAS**2)  # of a scan relative to itself: exact, but to be positive definite
 
 
 class PairSource(ResidualSource, Protocol):
