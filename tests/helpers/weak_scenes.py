@@ -6,7 +6,7 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.registration.degeneracy import ObservedRegistration, RegistrationProblem, register_with_degeneracy
-from hybridlio.registration.icp import RegistrationSettings
+from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Surface
 
 SETTINGS = RegistrationSettings(threads=1)

@@ -5,8 +5,9 @@ import pytest
 from rooms import FLOOR, ROOM, scene, seen_from, wall
 
 from hybridlio.core import se3
-from hybridlio.registration.icp import Registration, RegistrationSettings, fit_at, register
+from hybridlio.registration.icp import Registration, fit_at, register
 from hybridlio.registration.point_to_point import MixedNeighbours
+from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Surface
 
 DEFAULTS = RegistrationSettings(threads=1)

@@ -8,8 +8,8 @@ from rooms import ROOM, scene, seen_from, wall
 
 from hybridlio.core import se3
 from hybridlio.registration import motion_search
-from hybridlio.registration.icp import RegistrationSettings
 from hybridlio.registration.motion_search import best_start, fits_better, motions
+from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Surface
 
 SETTINGS = RegistrationSettings(threads=1)

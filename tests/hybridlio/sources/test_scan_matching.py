@@ -295,26 +295,3 @@ def test_a_first_scan_without_planes_is_followed_by_another_first_keyframe(seque
     matching.start(with_points(frames[0], ring))
     known = [matching.refine(frames[k], guess(true_pose(sequence, k - 1, k))).ok for k in (1, 2, 3)]
     assert known == [False, True, True]
-
-
-# ------------------------------------------------------------------------------------------------ a young map
-
-
-def steps_along(sequence: Sequence, frames: list[Frame]) -> list[RelativePose]:
-    matching = ScanMatching()
-    matching.start(frames[0])
-    return [matching.refine(frames[k], guess(true_pose(sequence, k - 1, k))) for k in range(1, len(frames))]
-
-
-def test_a_map_of_one_keyframe_is_trusted_less_than_one_of_several(sequence: Sequence, frames: list[Frame]):
-    steps = steps_along(sequence, frames)
-    first, last = (np.sqrt(np.trace(steps[k].covariance[3:, 3:])) for k in (0, -1))
-    assert first > 1.2 * last  # σ; without the inflation 0.9 times, because the scans differ
-
-
-def test_steps_along_an_unchanged_map_do_not_drift(sequence: Sequence, frames: list[Frame]):
-    steps = steps_along(sequence, frames)
-    shares = np.array([np.trace(step.drift) / np.trace(step.covariance) for step in steps if step.drift is not None])
-    assert shares.min() < 0.01  # no keyframe since the scan before
-    assert shares[0] == pytest.approx(0.5)  # half of the only scan's error
-    assert shares.max() <= 0.5

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hybridlio.sources.scan_matching_settings import ScanMatchingSettings
 
 from hybridlio.core import se3
 from hybridlio.core.estimates import RelativePose
@@ -15,6 +14,7 @@ from hybridlio.core.sensors import Frame, Scan
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.sources import scan_matching
 from hybridlio.sources.scan_matching import ScanMatching
+from hybridlio.sources.settings import ScanMatchingSettings
 from hybridlio.sources.thinned_scan import thin
 
 
