@@ -116,6 +116,15 @@ def test_every_command_and_option_shown_exists():
         assert {word for word in words if re.match(r"--?[a-z]", word)} <= known, (page, name)
 
 
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_script_and_option_of_it_that_a_page_shows_exists(page: Path):
+    text = page.read_text().replace("\\\n", " ")
+    for script, options in re.findall(r"python ((?:benchmarks|examples|docs)/\w+\.py)([^`\n]*)", text):
+        source = (ROOT / script).read_text()
+        words = set(re.findall(r"--[a-z][\w-]*", options.partition("#")[0]))
+        assert {option for option in words if f'"{option}"' not in source} == set(), script
+
+
 def test_every_command_is_shown_in_the_readme():
     text = README.read_text()
     assert [name for name in commands() if f"hybridlio {name}" not in text] == []
