@@ -151,6 +151,7 @@ def test_the_api_reference_holds_everything_public():
     public = {f"hybridlio.{name}" for name in hl.__all__} | {"hybridlio.graph.PoseGraph", "hybridlio.graph.Solution"}
     assert public - shown == {"hybridlio.__version__", "hybridlio.HybridLioError"}
     assert "hybridlio.core.errors" in shown  # every error, HybridLioError first
+    assert {name for name in shown if not is_defined(name)} == set()
 
 
 def keys(tree: dict[str, Any]) -> Iterator[str]:
