@@ -1,4 +1,4 @@
-"""Fuse GPS with an outage: odometry, IMU and fixes whose clock is off and which fail for a third of the drive.
+"""Fuse odometry and IMU with GPS fixes that have a clock offset, an outlier, and an outage for a third of the drive.
 
 python examples/gps_outage.py [FOLDER]
 """
@@ -25,7 +25,7 @@ ORIGIN = GeodeticPoint(49.0, 8.4, 110.0)
 
 
 def main(folder: str | None = None, *_: str) -> None:
-    poor = np.r_[np.full(3, 4e-3), np.full(3, 0.08)]
+    poor = np.r_[np.full(3, 4e-3), np.full(3, 0.08)]  # rad, m: large errors per step
     drive = make_chain(5, ChainSettings(steps=200, step_sigmas=poor))  # 20 s
     stamps = np.array([frame.scan.stamp_ns for frame in drive.frames])
     poses = [np.eye(4)]
@@ -34,10 +34,11 @@ def main(folder: str | None = None, *_: str) -> None:
     odometry, truth = hl.Trajectory(stamps, np.array(poses)), hl.Trajectory(stamps, drive.lidar_poses)
 
     rng = np.random.default_rng(1)
-    antenna = drive.poses[::5, :3, 3] + SIGMA_M * rng.standard_normal((41, 3))  # at the IMU, two fixes a second
+    # two fixes per second, of an antenna at the IMU
+    antenna = drive.poses[::5, :3, 3] + SIGMA_M * rng.standard_normal((41, 3))
     late = stamps[::5] + round(LATE_S * 1e9)
     fixes = tuple(hl.GpsFix(int(t), p, SIGMA_M**2 * np.eye(3), ORIGIN) for t, p in zip(late, antenna, strict=True))
-    fixes = (*fixes[:5], replace(fixes[5], position_m=fixes[5].position_m + 30), *fixes[6:])  # one far off
+    fixes = (*fixes[:5], replace(fixes[5], position_m=fixes[5].position_m + 30), *fixes[6:])  # an outlier
 
     record = Record.from_odometry(
         odometry, drive.record(odometry.poses).imu, fixes, drive.calibration, covariances=drive.relative[0].covariance
@@ -46,10 +47,10 @@ def main(folder: str | None = None, *_: str) -> None:
     for name, gps in (("without GPS", False), ("with GPS", True), ("with an outage", GpsOptions(outages=[outage]))):
         smoothed = hl.smooth(record, gps=gps)
         print(f"{name}: ATE {ate(truth, smoothed.trajectory, lever_m=0.0).rmse_m:.3f} m")
-    print(f"the last: {smoothed.found['gps'].summary()}")
+    print(f"GPS with the outage: {smoothed.found['gps'].summary()}")
     placed = georeference(record, smoothed.trajectory)
     for path in write_georeferenced(Path(folder or tempfile.mkdtemp(prefix="hybridlio-")), placed):
-        print(f"written to {path}")
+        print(f"wrote {path}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Odometry frame by frame: simulate a short drive, estimate it, say how far off the end is.
+"""Run the odometry frame by frame on a short simulated drive, and print the error of the last pose.
 
 python examples/odometry_from_python.py [FOLDER] [SECONDS]
 """
@@ -22,9 +22,9 @@ def main(folder: str | None = None, seconds: str = "5") -> None:
     for frame in sequence:
         estimate = odometry.step(frame)
     sigma_m = np.sqrt(estimate.covariance.diagonal()[3:])
-    off_m = estimate.pose[:3, 3] - sequence.reference.poses[-1, :3, 3]
+    error_m = estimate.pose[:3, 3] - sequence.reference.poses[-1, :3, 3]
     print(f"{drive}: {len(sequence)} scans, {sequence.reference.length_m:.1f} m")
-    print(f"off at the end by {np.linalg.norm(off_m):.3f} m, with a standard deviation of {sigma_m.max():.3f} m")
+    print(f"error of the last position: {np.linalg.norm(error_m):.3f} m, standard deviation {sigma_m.max():.3f} m")
 
 
 if __name__ == "__main__":

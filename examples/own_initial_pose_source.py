@@ -1,7 +1,7 @@
-"""An initial-pose source of one's own: wheel speed and a gyroscope, in place of the built-in ones.
+"""Use your own source of initial poses: wheel speed and a gyroscope.
 
-A source is any object with a name, `predict` and `correct`; nothing is registered or inherited. Here the wheel speed is
-taken from the recording's navigation system.
+A source is any object with a name, `predict` and `correct`; nothing needs to be registered or inherited. Here, the wheel
+speed is the forward speed of the recording's navigation system.
 
     python examples/own_initial_pose_source.py [FOLDER] [SECONDS]
 """
@@ -19,7 +19,7 @@ from hybridlio.core import se3
 
 
 class WheelsAndGyroscope:
-    """Distance from the wheels, turn from the gyroscope."""
+    """Takes the distance from the wheels and the rotation from the gyroscope."""
 
     name = "wheels-and-gyroscope"
 
@@ -28,16 +28,16 @@ class WheelsAndGyroscope:
         self._R_lidar_imu = sequence.calibration.T_imu_lidar[:3, :3].T
 
     def predict(self, frame: hl.Frame, state: hl.State) -> hl.RelativePose:
-        """The step ``T_k_k1`` to ``frame``, with a covariance that says what wheels and a gyroscope are worth."""
+        """Return the relative pose ``T_k_k1`` to ``frame``, with the covariance of wheels and gyroscope."""
         dt_s = (frame.scan.stamp_ns - state.stamp_ns) / 1e9
-        turn = self._R_lidar_imu @ frame.imu.gyro_rad_s.mean(axis=0) * dt_s
-        ahead = np.array([self._speed_m_s[frame.index] * dt_s, 0.0, 0.0])
+        rotation = self._R_lidar_imu @ frame.imu.gyro_rad_s.mean(axis=0) * dt_s
+        translation = np.array([self._speed_m_s[frame.index] * dt_s, 0.0, 0.0])
         sigmas = np.array([2e-3, 2e-3, 2e-3, 0.05, 0.05, 0.05])  # rad, m
-        pose = se3.exp(np.concatenate([turn, ahead]))
+        pose = se3.exp(np.concatenate([rotation, translation]))
         return hl.RelativePose(pose, np.diag(sigmas**2), source=self.name, from_imu=True)
 
     def correct(self, frame: hl.Frame, estimate: hl.RelativePose) -> None:
-        """Here there is nothing to learn; a filter would take the step that was found in the end."""
+        """Do nothing; a filter would use the final estimate of the step here."""
 
 
 def main(folder: str | None = None, seconds: str = "5") -> None:
@@ -51,7 +51,7 @@ def main(folder: str | None = None, seconds: str = "5") -> None:
         initial = np.array([estimate.initial.pose for estimate in estimates[1:]])
         error = se3.log(se3.between(steps, initial))
         name = source if isinstance(source, str) else source.name
-        print(f"{name}: initial poses are off by {np.linalg.norm(error[:, 3:], axis=1).mean():.3f} m a step")
+        print(f"{name}: mean error of the initial poses {np.linalg.norm(error[:, 3:], axis=1).mean():.3f} m per step")
 
 
 if __name__ == "__main__":

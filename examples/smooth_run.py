@@ -1,4 +1,4 @@
-"""Smooth a finished run: a simulated drive, odometry into a run folder, then everything at once from that folder alone.
+"""Smooth a finished run: run the odometry on a simulated drive, save its record, and optimise all poses together.
 
 python examples/smooth_run.py [FOLDER] [SECONDS]
 """
@@ -19,15 +19,13 @@ def main(folder: str | None = None, seconds: str = "6", *_: str) -> None:
     drive = hl.simulate(root, hl.SimulationConfig(seconds=float(seconds), seed=7, lidar="16-beam"))
     sequence = hl.open_sequence(drive)
     run = run_odometry(sequence, hl.Odometry())
-    run.record.save(root / "odometry.npz")  # what `hybridlio odometry` leaves in a run folder
+    run.record.save(root / "odometry.npz")  # as `hybridlio odometry` does in a run folder
 
     smoothed = hl.smooth(Record.load(root / "odometry.npz"))
     for name, trajectory in (("odometry", run.trajectory), ("smoothed", smoothed.trajectory)):
         found = hl.evaluate(sequence.reference, trajectory)
-        print(f"{name}: steps off by {1e3 * found.rpe_m:.1f} mm and {found.rpe_deg:.4f} degrees RMS")
-    print(
-        f"error {smoothed.error_before:.4g} before, {smoothed.error_after:.4g} after {smoothed.iterations} iterations"
-    )
+        print(f"{name}: RMS error per step {1e3 * found.rpe_m:.1f} mm, {found.rpe_deg:.4f} degrees")
+    print(f"error {smoothed.error_before:.4g} -> {smoothed.error_after:.4g} in {smoothed.iterations} iterations")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Solve a g2o file: read, optimise, say how well it fits, write the answer beside it.
+"""Solve a g2o file: read, optimise, print the error, and write the result beside it.
 
-python examples/solve_g2o.py FILE.g2o [SOLVER]      # batch, or gnc where some loops may be wrong
+python examples/solve_g2o.py FILE.g2o [SOLVER]      # batch, or gnc if some loops may be wrong
 
-Without a file it makes one: a robot on a noisy spiral in the plane.
+Without a file, it creates one: a noisy spiral in the plane.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from hybridlio.graph import PoseGraph
 
 
 def make_file(folder: Path) -> Path:
-    """Edges alone, as many g2o files are: the initial values have to be found."""
+    """Write a file that has edges only, like many g2o files, so that initial values must be computed."""
     rng = np.random.default_rng(2)
     sigmas = np.array([0.01, 0.03, 0.03])  # in the plane: heading, x, y
     poses = [se3.exp([0, 0, 0.3 * k, 0, 0, 0]) @ se3.make(np.eye(3), [1 + 0.02 * k, 0, 0]) for k in range(100)]
@@ -45,7 +45,7 @@ def main(source: str | None = None, solver: str = "batch") -> None:
     print(f"worst factor: {graph.factors[worst[0]].label}, chi2 {worst[1]:.2f}; rejected: {len(solution.rejected)}")
     solved = path.with_name(f"{path.stem}-solved.g2o")
     graph.save(solved, solution)
-    print(f"written to {solved}")
+    print(f"wrote {solved}")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""The same recording with its initial poses from four sources, exchanged by one word.
+"""Run the odometry on one recording with four sources of initial poses, chosen by name.
 
     python examples/swap_initial_pose.py [FOLDER] [SECONDS]
 
-`lstm` takes the weights that come with hybridlio, and everything else stays as it is: the scans are matched to a local
-map, and the graph joins all. What differs is how far off a step is before the scans have been looked at.
+`lstm` uses the weights shipped with hybridlio. Everything else is the same: scans are matched with a local map, and the
+factor graph combines all measurements. The sources differ in the error of a step before scan matching.
 """
 
 from __future__ import annotations
@@ -27,9 +27,11 @@ def main(folder: str | None = None, seconds: str = "5") -> None:
         odometry = hl.Odometry(initial_pose=name)
         estimates = [odometry.step(frame) for frame in sequence]
         initial = np.array([estimate.initial.pose for estimate in estimates[1:]])
-        off = np.linalg.norm(se3.log(se3.between(steps, initial))[1:, 3:], axis=1)  # the first one knows no speed
-        end = np.linalg.norm(estimates[-1].pose[:3, 3] - sequence.reference.poses[-1, :3, 3])
-        print(f"{name}: initial poses are off by {off.mean():.3f} m a step, the end by {end:.3f} m")
+        error_m = np.linalg.norm(
+            se3.log(se3.between(steps, initial))[1:, 3:], axis=1
+        )  # the speed is unknown at the first step
+        end_error_m = np.linalg.norm(estimates[-1].pose[:3, 3] - sequence.reference.poses[-1, :3, 3])
+        print(f"{name}: mean error of the initial poses {error_m.mean():.3f} m, of the last pose {end_error_m:.3f} m")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# The main job by the public commands: simulate a drive, run the odometry, smooth it, say how good both are, leave reports.
+# Demonstration: simulate a drive, run the odometry, smooth the run, and print the errors of both; each writes a report.
 # Usage: demo.sh [FOLDER] [SECONDS]
 set -euo pipefail
 
@@ -18,4 +18,4 @@ step odometry "$folder/drive-${seconds}s" -o "$folder/odometry" --overwrite
 step smooth "$folder/odometry"
 
 echo
-echo "Everything is in $folder; open $folder/odometry/report.html and $folder/odometry/smoothed/report.html"
+echo "Open the reports: $folder/odometry/report.html and $folder/odometry/smoothed/report.html"

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Install the system libraries that Open3D cannot be imported without, where apt-get and rights allow; else say how.
+# Install the system libraries that Open3D needs to be imported, by apt-get if possible; otherwise print how.
 # Usage: system-libraries.sh PYTHON
 set -euo pipefail
 
@@ -24,5 +24,5 @@ if command -v apt-get >/dev/null && "${root[@]}" true 2>/dev/null; then
     { "${root[@]}" apt-get update -qq && "${root[@]}" apt-get install -y -qq --no-install-recommends "${packages[@]}"; } >/dev/null || true
 fi
 all_there 2>/dev/null && exit 0
-echo "Open3D needs system libraries that are missing here; run: sudo apt-get install ${packages[*]}" >&2
+echo "Open3D needs missing system libraries; run: sudo apt-get install ${packages[*]}" >&2
 exit 1

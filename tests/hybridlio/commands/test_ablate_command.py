@@ -1,4 +1,4 @@
-"""`hybridlio ablate` trains rows at one budget, shows them beside the published ones, and goes on where it was."""
+"""`hybridlio ablate`: trains rows with the same number of steps, shows published results beside them, and resumes."""
 
 import json
 
@@ -17,7 +17,7 @@ def run(*words):
 
 @pytest.fixture
 def tiny(monkeypatch):
-    """Maps and encoders that train in a second."""
+    """Use maps and encoders that train within a second."""
     reduced = ablation.reduced
     cells = MapGeometry(15.0, -15.0, 16, 90)
     monkeypatch.setattr(ablation, "reduced", lambda recipe: reduced(recipe, cells, batch=2))
@@ -28,7 +28,7 @@ def cache(tmp_path_factory):
     return tmp_path_factory.mktemp("shards")
 
 
-def test_rows_are_trained_shown_beside_the_published_and_not_trained_again(tiny_drive, tiny, cache, tmp_path):
+def test_rows_are_trained_once_and_shown_beside_published_results(tiny_drive, tiny, cache, tmp_path):
     words = (
         tiny_drive,
         "--table",
@@ -48,8 +48,8 @@ def test_rows_are_trained_shown_beside_the_published_and_not_trained_again(tiny_
     for name in ("paper", "imu-feature", "no-imu"):
         assert f"measured ({name})" in done.output
     assert "2.03 / 1.14" in done.output
-    said = json.loads((tmp_path / "table-2.json").read_text())
-    assert [line["result"]["steps"] for line in said["lines"]] == [2, 2, 2]
+    output = json.loads((tmp_path / "table-2.json").read_text())
+    assert [line["result"]["steps"] for line in output["lines"]] == [2, 2, 2]
     assert "2 steps per row, reduced size" in (tmp_path / "table-2.md").read_text()
     stamps = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/result.json")}
     assert len(stamps) == 3
@@ -71,21 +71,21 @@ def test_a_row_that_fails_does_not_stop_the_others(tiny_drive, tiny, cache, tmp_
     done = run(tiny_drive, *words)
     assert done.exit_code == 1
     assert "error: imu-feature: training diverged at step 1" in done.output
-    said = json.loads((tmp_path / "table-2.json").read_text())
-    assert [line["result"] is None for line in said["lines"]] == [False, True, False]
+    output = json.loads((tmp_path / "table-2.json").read_text())
+    assert [line["result"] is None for line in output["lines"]] == [False, True, False]
 
 
-def test_the_first_table_has_the_predecessors_rows_and_figures_of_those_that_are_no_presets(
+def test_table_1_has_rows_of_earlier_methods_and_published_results_of_methods_without_preset(
     tiny_drive, tiny, cache, tmp_path
 ):
     words = ("--table", 1, "--test", tiny_drive, "--steps", 1, "--reduced", "--rows", "cho,nubert", "-o", tmp_path)
     done = run(tiny_drive, *words, "--cache", cache)
     assert done.exit_code == 0, done.output
-    said = {line["method"]: line for line in json.loads((tmp_path / "table-1.json").read_text())["lines"]}
-    assert said["Cho et al."]["preset"] == "cho"
-    assert said["Nubert et al."]["result"]["steps"] == 1
-    assert said["LOAM(w/ map)"]["preset"] is None
-    assert said["SelfVoxeLO"]["published"]["t_rel_percent"]["09"] == 3.01
+    output = {line["method"]: line for line in json.loads((tmp_path / "table-1.json").read_text())["lines"]}
+    assert output["Cho et al."]["preset"] == "cho"
+    assert output["Nubert et al."]["result"]["steps"] == 1
+    assert output["LOAM(w/ map)"]["preset"] is None
+    assert output["SelfVoxeLO"]["published"]["t_rel_percent"]["09"] == 3.01
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ def test_the_first_table_has_the_predecessors_rows_and_figures_of_those_that_are
     ],
     ids=str,
 )
-def test_wrong_words_are_named(words, named, tiny_drive, tmp_path):
+def test_the_error_for_invalid_options_names_them(words, named, tiny_drive, tmp_path):
     refused = run(tiny_drive, *words, "-o", tmp_path)
     assert refused.exit_code == 2
     assert named in refused.output

@@ -1,4 +1,4 @@
-"""The command line: from simulation to smoothing, its settings, and how errors end."""
+"""The command line: from simulation to smoothing, settings, and errors."""
 
 import errno
 import json
@@ -16,7 +16,7 @@ from hybridlio.runs.folder import FILES
 pytestmark = pytest.mark.usefixtures("plain_logging")
 
 
-def test_the_whole_job_from_simulation_to_smoothing(tmp_path, monkeypatch):
+def test_simulation_odometry_smoothing_evaluation_and_view_work_together(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     drive = Path(ok("simulate", "town", "--seconds", "1.2", "--lidar", "16-beam").splitlines()[-1])
     assert drive.is_dir()
@@ -34,7 +34,7 @@ def test_the_whole_job_from_simulation_to_smoothing(tmp_path, monkeypatch):
         assert ok("view", path).strip().endswith("report.html")
 
 
-def test_simulating_again_leaves_the_drive_as_it_is_and_other_settings_are_refused(tiny_drive):
+def test_simulating_again_keeps_the_drive_and_other_settings_are_an_error(tiny_drive):
     root, same = tiny_drive.parent.parent, ("--seconds", 2.5, "--seed", 3, "--lidar", "16-beam")
     stamp = (tiny_drive / "poses.txt").stat().st_mtime_ns
     ok("simulate", root, *same)
@@ -52,11 +52,11 @@ def test_simulating_again_leaves_the_drive_as_it_is_and_other_settings_are_refus
         (("--poses", "none.txt"), "none.txt"),
     ],
 )
-def test_a_wrong_setting_of_the_simulation_is_named_by_its_option(options, named, tmp_path):
+def test_the_error_for_an_invalid_simulation_setting_names_the_option(options, named, tmp_path):
     assert named in refused(2, "simulate", tmp_path, *options)
 
 
-def test_a_configuration_is_printed_changed_and_used(tiny_drive, tmp_path, without_pages):
+def test_the_printed_configuration_can_be_edited_and_used(tiny_drive, tmp_path, without_pages):
     text = ok("config")
     import yaml
 
@@ -91,7 +91,7 @@ def test_a_configuration_is_printed_changed_and_used(tiny_drive, tmp_path, witho
         (("odometry", "DRIVE", "--sequence", "7"), "'7'"),
         (("odometry", "DRIVE", "--reader", "rosbag"), "'rosbag'"),
         (("odometry", "DRIVE", "--frames", "x"), "'x'"),
-        (("odometry", "nowhere", "--frames", "x"), "'x'"),  # which is known before the recording is looked for
+        (("odometry", "nowhere", "--frames", "x"), "'x'"),  # checked before the recording is opened
         (("odometry", "DRIVE", "--config", "none.yaml"), "none.yaml"),
         (("compare", "DRIVE", "--initial-pose", "kalman,guess"), "'guess'"),
         (("compare", "DRIVE", "--residual", ","), "no name given"),
@@ -100,14 +100,14 @@ def test_a_configuration_is_printed_changed_and_used(tiny_drive, tmp_path, witho
         (("view", "DRIVE"), "report.html"),
     ],
 )
-def test_input_that_cannot_be_used_is_one_line_and_leaves_nothing(words, named, tiny_drive, tmp_path, monkeypatch):
+def test_unusable_input_prints_one_line_and_writes_nothing(words, named, tiny_drive, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert named in refused(2, *(tiny_drive if word == "DRIVE" else word for word in words))
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(("flag", "level"), [("-v", "info"), ("-vv", "debug")])
-def test_verbose_says_more_on_stderr(flag, level, tiny_drive, tmp_path, without_pages):
+def test_verbose_prints_more_to_stderr(flag, level, tiny_drive, tmp_path, without_pages):
     quiet = run("odometry", tiny_drive, "--residual", "none", "--frames", ":4", "-o", tmp_path / "a")
     loud = run("odometry", tiny_drive, "--residual", "none", "--frames", ":4", "-o", tmp_path / "b", flag)
     assert f"{level}: " in loud.stderr
@@ -115,12 +115,12 @@ def test_verbose_says_more_on_stderr(flag, level, tiny_drive, tmp_path, without_
     assert ("frame 3" in loud.stderr) == (flag == "-vv")
 
 
-def test_a_fault_shows_its_traceback_only_when_asked_to(tiny_drive, tmp_path, monkeypatch):
+def test_an_unexpected_error_prints_its_traceback_only_with_vv(tiny_drive, tmp_path, monkeypatch):
     def fail(*_):
-        raise ZeroDivisionError("a fault")
+        raise ZeroDivisionError("a bug")
 
     monkeypatch.setattr("hybridlio.odometry.config.config_to_yaml", fail)
-    assert "ZeroDivisionError: a fault" in refused(1, "config")
+    assert "ZeroDivisionError: a bug" in refused(1, "config")
     for words in (("-vv", "config"), ("config", "-vv")):
         result = run(*words)
         assert result.exit_code == 1
@@ -128,27 +128,27 @@ def test_a_fault_shows_its_traceback_only_when_asked_to(tiny_drive, tmp_path, mo
 
 
 @pytest.mark.parametrize(
-    ("error", "said"),
+    ("error", "message"),
     [
         (PermissionError(errno.EACCES, "Permission denied", "/root/map"), "error: /root/map: Permission denied"),
         (OSError(errno.ENOSPC, "No space left on device"), "error: No space left on device"),
         (MemoryError(), "error: out of memory"),
     ],
 )
-def test_what_the_system_refuses_is_no_fault_of_the_librarys(error, said, monkeypatch):
+def test_errors_of_the_system_are_not_reported_as_bugs(error, message, monkeypatch):
     def fail(*_):
         raise error
 
     monkeypatch.setattr("hybridlio.odometry.config.config_to_yaml", fail)
-    assert said in (words := refused(1, "config"))
+    assert message in (words := refused(1, "config"))
     assert "bug" not in words
 
 
-def test_progress_goes_to_stderr_so_that_results_can_be_piped(tiny_drive, tmp_path, without_pages):
+def test_progress_is_printed_to_stderr_only(tiny_drive, tmp_path, without_pages):
     result = run("odometry", tiny_drive, "--residual", "none", "-o", tmp_path / "run")
     assert "25/25 scans (100 %)" in result.stderr
     assert "(100 %)" not in result.stdout
 
 
-def test_the_version_is_the_packages():
+def test_version_prints_the_package_version():
     assert ok("--version").split() == ["hybridlio", hybridlio.__version__]

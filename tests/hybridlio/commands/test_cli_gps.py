@@ -1,4 +1,4 @@
-"""What the commands are told of GPS fixes."""
+"""Options of the commands about GPS fixes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ OPTIONS = ("--antenna", "-0.5,0.4,1.2", "--max-shift", 0)
 
 @pytest.fixture
 def with_fixes(finished_run: Path, tmp_path: Path) -> Path:
-    """The run with a fix at every other scan, of an antenna away from the IMU."""
+    """Return a run with a GPS fix at every second scan, of an antenna that is not at the IMU."""
     folder = shutil.copytree(finished_run, tmp_path / "run")
     record = Record.load(folder / "odometry.npz")
     lever = se3.transform(se3.inverse(record.calibration.T_imu_lidar), LEVER_M[None])
@@ -37,11 +37,11 @@ def with_fixes(finished_run: Path, tmp_path: Path) -> Path:
     return folder
 
 
-def test_smoothing_is_told_of_antenna_clock_and_outages(with_fixes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_smooth_passes_on_antenna_clock_and_outages(with_fixes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given, smooth = [], offline.smooth
     monkeypatch.setattr(offline, "smooth", lambda *a, gps, **k: (given.append(gps), smooth(*a, gps=gps, **k))[1])
-    said = ok("smooth", with_fixes, "--gps", *OPTIONS, "--outage", "0.55:0.85", "--outage", "1.95:9")
-    assert "8 of 13 fixes used" in said  # those at 0.6, 0.8, 2.0, 2.2 and 2.4 s are left out
+    output = ok("smooth", with_fixes, "--gps", *OPTIONS, "--outage", "0.55:0.85", "--outage", "1.95:9")
+    assert "8 of 13 fixes used" in output  # those at 0.6, 0.8, 2.0, 2.2 and 2.4 s are ignored
     start_ns = Record.load(with_fixes / "odometry.npz").online.stamps_ns[0]
     (options,) = given
     assert options.antenna_m.tolist() == LEVER_M.tolist()
@@ -53,7 +53,7 @@ def test_smoothing_is_told_of_antenna_clock_and_outages(with_fixes: Path, monkey
     )
 
 
-def test_georeferencing_is_told_of_the_antenna(with_fixes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_georeference_passes_on_antenna_and_clock(with_fixes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given, place = [], georeference.georeference
     monkeypatch.setattr(georeference, "georeference", lambda *a, **k: (given.append(k), place(*a, **k))[1])
     assert "13 of 13 fixes are inliers" in ok("georeference", with_fixes, *OPTIONS)
@@ -62,7 +62,7 @@ def test_georeferencing_is_told_of_the_antenna(with_fixes: Path, monkeypatch: py
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (("--gps", "--antenna", "1,2"), "--antenna '1,2': give X,Y,Z"),
         (("--gps", "--antenna", "1,2,nan"), "antenna_m: must be three finite numbers"),
@@ -72,6 +72,6 @@ def test_georeferencing_is_told_of_the_antenna(with_fixes: Path, monkeypatch: py
         (("--outage", "1:2"), "give --gps too"),
     ],
 )
-def test_malformed_options_about_fixes_are_refused(finished_run: Path, options: tuple[str, ...], said: str) -> None:
-    assert said in refused(2, "smooth", finished_run, *options)
+def test_malformed_gps_options_are_an_error(finished_run: Path, options: tuple[str, ...], message: str) -> None:
+    assert message in refused(2, "smooth", finished_run, *options)
     assert not (finished_run / "smoothed").exists()

@@ -1,4 +1,4 @@
-"""The command line as a process: interrupted, quick to answer, and what its help lists."""
+"""The command line as a process: interrupts, start-up time and help."""
 
 import json
 import os
@@ -19,7 +19,7 @@ INTERRUPTED = """
 import os, signal, sys
 from hybridlio.odometry.odometry import Odometry
 name = sys.argv.pop(1)
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs, and what they start, ignore it
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore SIGINT
 step = Odometry.step
 def interrupted(self, frame):
     if frame.index == 8:
@@ -34,7 +34,7 @@ app()
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-def test_an_interrupted_run_keeps_what_was_estimated(name, tiny_drive, project_root, tmp_path):
+def test_an_interrupted_process_writes_its_estimates(name, tiny_drive, project_root, tmp_path):
     words = [name, "odometry", str(tiny_drive), "--residual", "none", "-o", str(tmp_path / "run")]
     env = {**os.environ, "PYTHONPATH": str(project_root)}
     command = [sys.executable, "-c", INTERRUPTED, *words]
@@ -70,6 +70,6 @@ def test_help_and_version_load_no_heavy_library(words, project_root):
         ("simulate", LIDAR_MODELS),
     ],
 )
-def test_help_lists_what_there_is_to_choose_from(command, names):
+def test_help_lists_all_choices(command, names):
     text = " ".join(CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200", "TERM": "dumb"}).stdout.split())
     assert [name for name in names if name not in text] == []

@@ -1,4 +1,4 @@
-"""What the commands make of a recording and of a run."""
+"""Commands on recordings and run folders."""
 
 import errno
 import json
@@ -26,7 +26,7 @@ def test_the_learned_front_end_runs_without_a_graph_and_can_be_smoothed(tiny_dri
     assert "smoothed" in ok("smooth", folder)
 
 
-def test_the_runs_own_reference_and_the_same_in_a_file_or_recording_give_the_same_figures(finished_run, tiny_drive):
+def test_the_reference_of_the_run_of_a_file_or_of_a_recording_gives_equal_metrics(finished_run, tiny_drive):
     figures = json.loads(ok("evaluate", finished_run, "--json"))
     assert {"t_rel_percent", "r_rel_deg_per_100m", "ate_m", "rpe_m", "step_anees_rotation"} <= set(figures)
     assert figures["ate_m"] < 0.1
@@ -41,18 +41,18 @@ def test_the_runs_own_reference_and_the_same_in_a_file_or_recording_give_the_sam
         assert again["anees_position"] is None
 
 
-def test_drift_over_lengths_asked_for_is_reported(finished_run):
+def test_drift_over_given_lengths_is_reported(finished_run):
     figures = json.loads(ok("evaluate", finished_run, "--lengths", "5,10", "--json"))
     assert figures["chosen_lengths_m"] == [5, 10]
     for wrong in ("5,x", "0", ""):
         assert "--lengths" in refused(2, "evaluate", finished_run, "--lengths", wrong)
 
 
-def test_a_file_alone_cannot_be_evaluated(finished_run):
+def test_a_trajectory_file_needs_a_reference(finished_run):
     assert "--reference" in refused(2, "evaluate", finished_run / "poses_tum.txt")
 
 
-def test_a_run_is_not_overwritten_unasked(finished_run, tiny_drive, tmp_path, without_pages):
+def test_a_run_is_overwritten_only_with_the_option(finished_run, tiny_drive, tmp_path, without_pages):
     folder = shutil.copytree(finished_run, tmp_path / "run")
     before = (folder / "metrics.json").read_bytes()
     assert "--overwrite" in refused(2, "odometry", tiny_drive, "-o", folder)
@@ -61,7 +61,7 @@ def test_a_run_is_not_overwritten_unasked(finished_run, tiny_drive, tmp_path, wi
     assert json.loads((folder / "metrics.json").read_text())["frames"] == 5
 
 
-def test_a_smoothed_run_never_takes_another_runs_place_unasked(finished_run, tmp_path, without_pages):
+def test_a_smoothed_run_replaces_another_run_only_with_overwrite(finished_run, tmp_path, without_pages):
     other = shutil.copytree(finished_run, tmp_path / "other")
     assert "--overwrite" in refused(2, "smooth", finished_run, "-o", other)
     assert "the run itself" in refused(2, "smooth", finished_run, "-o", finished_run)
@@ -70,7 +70,7 @@ def test_a_smoothed_run_never_takes_another_runs_place_unasked(finished_run, tmp
     assert not (other / "odometry.npz").exists()
 
 
-def test_a_recording_without_inertial_data_goes_on_by_constant_velocity_unless_told_otherwise(
+def test_a_recording_without_imu_uses_constant_velocity_unless_preintegration_is_requested(
     tiny_drive, tmp_path, without_pages
 ):
     drive = shutil.copytree(tiny_drive, tmp_path / "date" / tiny_drive.name)
@@ -86,7 +86,7 @@ def test_a_recording_without_inertial_data_goes_on_by_constant_velocity_unless_t
 
 @pytest.fixture
 def damaged(tiny_drive, tmp_path) -> Path:
-    """The drive with a truncated scan, 7, and a missing one, 12."""
+    """Return the drive with scan 7 truncated and scan 12 empty."""
     date = shutil.copytree(tiny_drive.parent, tmp_path / tiny_drive.parent.name)
     scans = date / tiny_drive.name / "velodyne_points/data"
     with (scans / "0000000007.bin").open("r+b") as file:
@@ -95,7 +95,7 @@ def damaged(tiny_drive, tmp_path) -> Path:
     return date
 
 
-def test_scans_that_cannot_be_read_are_bridged_told_and_have_rows(damaged, tmp_path):
+def test_unreadable_scans_are_bridged_reported_and_have_rows(damaged, tmp_path):
     result = run("odometry", damaged, "-o", tmp_path / "run")
     assert result.exit_code == 0, result.output
     for name in ("0000000007.bin", "0000000012.bin"):
@@ -109,7 +109,7 @@ def test_scans_that_cannot_be_read_are_bridged_told_and_have_rows(damaged, tmp_p
     assert len(read_tum(tmp_path / "run/poses_tum.txt")) == 25
 
 
-def test_a_run_that_starts_late_is_evaluated_against_a_file_of_all_scans(damaged, tmp_path, without_pages):
+def test_a_run_that_starts_late_can_be_compared_with_a_file_of_all_scans(damaged, tmp_path, without_pages):
     scans = damaged / next(path.name for path in damaged.glob("*_sync")) / "velodyne_points/data"
     for k in (0, 1):
         (scans / f"{k:010d}.bin").write_bytes(b"")
@@ -119,7 +119,7 @@ def test_a_run_that_starts_late_is_evaluated_against_a_file_of_all_scans(damaged
     assert itself["ate_m"] < 1e-6
 
 
-def test_an_error_in_the_middle_keeps_what_was_estimated(tiny_drive, tmp_path, monkeypatch, without_pages):
+def test_an_error_during_the_run_keeps_the_estimates(tiny_drive, tmp_path, monkeypatch, without_pages):
     from hybridlio.core.errors import GraphError
     from hybridlio.graph.run.isam_backend import IncrementalBackend
 
@@ -138,7 +138,7 @@ def test_an_error_in_the_middle_keeps_what_was_estimated(tiny_drive, tmp_path, m
     ok("smooth", tmp_path / "run")
 
 
-def test_a_disk_without_links_keeps_the_run_and_says_so(tiny_drive, tmp_path, monkeypatch, without_pages):
+def test_a_file_system_without_links_keeps_the_run_and_logs_a_warning(tiny_drive, tmp_path, monkeypatch, without_pages):
     def fail(*_, **__):
         raise OSError(errno.EPERM, "Operation not permitted")
 
@@ -151,8 +151,8 @@ def test_a_disk_without_links_keeps_the_run_and_says_so(tiny_drive, tmp_path, mo
 
 
 def test_the_vertical_angle_can_be_set(tiny_drive, tmp_path, without_pages):
-    said = refused(2, "odometry", tiny_drive, "--vertical-angle", 9)
-    assert "vertical_angle_deg: must be within ±5°, got 9.0" in said
+    output = refused(2, "odometry", tiny_drive, "--vertical-angle", 9)
+    assert "vertical_angle_deg: must be within ±5°, got 9.0" in output
     heights = []
     for name, angle in (("as-is", 0), ("raised", 1)):
         ok("odometry", tiny_drive, "--vertical-angle", angle, "--frames", ":3", "-o", tmp_path / name)
@@ -160,7 +160,7 @@ def test_the_vertical_angle_can_be_set(tiny_drive, tmp_path, without_pages):
     assert heights[1] > heights[0] + 0.05
 
 
-def test_a_reason_that_combinations_share_is_said_once(tiny_drive, monkeypatch):
+def test_a_reason_shared_by_combinations_is_printed_once(tiny_drive, monkeypatch):
     from hybridlio.core.errors import GraphError
     from hybridlio.graph.run.isam_backend import IncrementalBackend
 
@@ -168,27 +168,27 @@ def test_a_reason_that_combinations_share_is_said_once(tiny_drive, monkeypatch):
         raise GraphError("no")
 
     monkeypatch.setattr(IncrementalBackend, "update", fail)
-    said = refused(1, "compare", tiny_drive, "--initial-pose", "kalman,identity", "--residual", "none",
+    output = refused(1, "compare", tiny_drive, "--initial-pose", "kalman,identity", "--residual", "none",
                    "--backend", "incremental", "--frames", ":3")  # fmt: skip
-    assert "kalman + none, identity + none ended after" in said
-    assert said.count("error: ") == 1
+    assert "kalman + none, identity + none ended after" in output
+    assert output.count("error: ") == 1
 
 
-def test_scans_that_are_bridged_are_logged_with_the_reason(tiny_drive, tmp_path, without_pages):
+def test_bridged_scans_are_logged_with_the_reason(tiny_drive, tmp_path, without_pages):
     few = tmp_path / "few.yaml"
     few.write_text("{initial_pose: identity, scan_matching: {min_matched: 0.999}}")
-    said = run("odometry", tiny_drive, "--config", few, "--frames", ":6", "-v", "-o", tmp_path / "run").stderr
-    assert re.search(r"frame 3: bridged by the initial pose: \d+% of \d+ points match", said)
+    output = run("odometry", tiny_drive, "--config", few, "--frames", ":6", "-v", "-o", tmp_path / "run").stderr
+    assert re.search(r"frame 3: bridged by the initial pose: \d+% of \d+ points match", output)
 
 
-def test_a_recording_that_cannot_be_started_at_is_told_of_a_few_times(tiny_drive, tmp_path):
+def test_unusable_scans_at_the_start_cause_at_most_three_warnings(tiny_drive, tmp_path):
     many = tmp_path / "many.yaml"
     many.write_text("scan_matching: {min_points: 10000000}")
-    said = run("odometry", tiny_drive, "--config", many, "-o", tmp_path / "run").stderr
-    assert said.count("cannot start at this scan") == 3
-    assert "no usable scan" in said
+    output = run("odometry", tiny_drive, "--config", many, "-o", tmp_path / "run").stderr
+    assert output.count("cannot start at this scan") == 3
+    assert "no usable scan" in output
 
 
-def test_the_way_is_that_of_the_unit_that_the_forward_speed_is_of(finished_run):
+def test_the_imu_path_length_agrees_with_the_forward_speed(finished_run):
     figures = json.loads((finished_run / "metrics.json").read_text())
     assert figures["imu_path_length_m"] == pytest.approx(figures["forward_speed_length_m"], rel=0.01)

@@ -1,4 +1,4 @@
-"""`hybridlio train` from a recording to weights that the odometry takes, resumed, adapted, and refused by name."""
+"""`hybridlio train`: training, resuming, adaptation and errors."""
 
 import json
 
@@ -44,24 +44,24 @@ def cache(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def trained(tiny_drive, recipe, cache, tmp_path_factory):
-    """A run of two epochs, and what it said."""
+    """Return the folder of a run of two epochs, its common options, and its output."""
     folder = tmp_path_factory.mktemp("run")
     common = ("--preset", "paper", "--config", recipe, "--cache", cache)
-    said = ok(tiny_drive, *common, "--epochs", 2, "--validate", tiny_drive, "-o", folder)
-    return folder, common, said
+    output = ok(tiny_drive, *common, "--epochs", 2, "--validate", tiny_drive, "-o", folder)
+    return folder, common, output
 
 
-def test_a_recording_becomes_weights_with_recipe_data_and_figures(trained):
-    folder, _, said = trained
+def test_training_writes_weights_with_recipe_data_and_log(trained):
+    folder, _, output = trained
     weights = load_weights(folder / "weights.safetensors")
     assert weights.recipe.network.stages == (8,)
     assert weights.recipe.optimiser.epochs == 2
-    assert weights.recipe.loss.lambda_ == 0.1  # the preset's, as the file leaves it out
+    assert weights.recipe.loss.lambda_ == 0.1  # the preset's value, which the file does not change
     assert "2026_01_01_drive_0003" in weights.about["data"]
     assert weights.about["steps"] == "6"
-    assert "23 pairs" in said
-    assert said.count("validation loss") == 2
-    assert str(folder / "weights.safetensors") in said
+    assert "23 pairs" in output
+    assert output.count("validation loss") == 2
+    assert str(folder / "weights.safetensors") in output
     assert len([row for row in read_log(folder / "log.jsonl") if "loss" in row]) == 6
 
 
@@ -70,7 +70,7 @@ def test_tensorboard_reads_the_log(trained):
 
     (file,) = (trained[0] / "tensorboard").glob("events.out.tfevents.*")
     data, found = file.read_bytes(), {}
-    while data:  # records of length, its checksum, an event, its checksum
+    while data:  # each record: length, its checksum, event, its checksum
         size = int.from_bytes(data[:8], "little")
         event = Event.FromString(data[12 : 12 + size])
         found |= {(value.tag, event.step): value.simple_value for value in event.summary.value}
@@ -80,11 +80,11 @@ def test_tensorboard_reads_the_log(trained):
     assert ("validation/translation_rms_m", 6) in found
 
 
-def test_the_same_command_goes_on_and_comes_to_the_same(tiny_drive, trained, tmp_path):
+def test_the_same_command_resumes_and_gives_the_same_result(tiny_drive, trained, tmp_path):
     _, common, _ = trained
     ok(tiny_drive, *common, "--epochs", 2, "-o", tmp_path / "a")
     once = read_log(tmp_path / "a" / "log.jsonl")
-    ok(tiny_drive, *common, "--epochs", 2, "-o", tmp_path / "a")  # finished: nothing more to do
+    ok(tiny_drive, *common, "--epochs", 2, "-o", tmp_path / "a")  # finished, so that nothing is done
     assert read_log(tmp_path / "a" / "log.jsonl") == once
     refused = run(tiny_drive, *common, "--epochs", 3, "-o", tmp_path / "a")
     assert refused.exit_code == 2
@@ -93,7 +93,7 @@ def test_the_same_command_goes_on_and_comes_to_the_same(tiny_drive, trained, tmp
     assert load_weights(tmp_path / "a" / "weights.safetensors").about["steps"] == "4"
 
 
-def test_weights_adapt_to_other_recordings_and_say_where_they_come_from(tiny_drive, trained, cache, tmp_path):
+def test_weights_can_be_adapted_and_record_their_origin(tiny_drive, trained, cache, tmp_path):
     path = trained[0] / "weights.safetensors"
     ok(tiny_drive, "--init-from", path, "--cache", cache, "--epochs", 1, "-o", tmp_path / "b")
     before, after = load_weights(path), load_weights(tmp_path / "b" / "weights.safetensors")
@@ -105,7 +105,7 @@ def test_weights_adapt_to_other_recordings_and_say_where_they_come_from(tiny_dri
     assert 0 < moved < 0.01
 
 
-def test_lstm_and_preintegration_are_interchangeable_by_one_word(tiny_drive, trained, tmp_path):
+def test_the_initial_pose_option_switches_between_lstm_and_preintegration(tiny_drive, trained, tmp_path):
     _, common, _ = trained
     for name, imu in (("lstm", "initial-pose"), ("preintegration", "given")):
         ok(tiny_drive, *common, "--initial-pose", name, "--steps", 1, "-o", tmp_path / name)
@@ -116,7 +116,7 @@ def test_lstm_and_preintegration_are_interchangeable_by_one_word(tiny_drive, tra
     ok(tiny_drive, *start, *common[4:], "--steps", 1, "-o", tmp_path / "both")
 
 
-def test_weights_that_do_not_fit_are_named(tiny_drive, trained, tmp_path):
+def test_the_error_for_weights_of_another_shape_names_the_tensor(tiny_drive, trained, tmp_path):
     other = {**SMALL, "network": {**SMALL["network"], "features": 16}}
     (tmp_path / "other.yaml").write_text(yaml.safe_dump(other))
     _, common, _ = trained
@@ -138,13 +138,13 @@ def test_weights_that_do_not_fit_are_named(tiny_drive, trained, tmp_path):
     ],
     ids=str,
 )
-def test_wrong_words_are_named(words, named, tiny_drive, tmp_path):
+def test_the_error_for_invalid_options_names_them(words, named, tiny_drive, tmp_path):
     refused = run(tiny_drive, "--preset", "paper", "-o", tmp_path, *words)
     assert refused.exit_code == 2
     assert named in refused.output
 
 
-def test_a_wrong_key_in_the_file_is_named_with_the_file(tiny_drive, tmp_path):
+def test_the_error_for_an_unknown_key_names_it_and_the_file(tiny_drive, tmp_path):
     (tmp_path / "my.yaml").write_text(json.dumps({"network": {"imu_hiden": 3}}))
     refused = run(tiny_drive, "--preset", "paper", "--config", tmp_path / "my.yaml", "-o", tmp_path)
     assert refused.exit_code == 2

@@ -13,7 +13,7 @@ from hybridlio.evaluation.ate_rpe import associate, ate, rpe
 
 
 def curve(n: int = 300, seed: int = 1) -> Trajectory:
-    """A winding path of 1 m steps at 10 Hz."""
+    """Return a winding path with steps of 1 m at 10 Hz."""
     turns = np.cumsum(np.random.default_rng(seed).normal(0, 0.004, (n, 3)), axis=0)
     steps = se3.exp(np.hstack([turns, np.tile([1.0, 0, 0], (n, 1))]))
     poses = [np.eye(4)]
@@ -39,7 +39,7 @@ def for_evo(trajectory: Trajectory) -> PoseTrajectory3D:
 
 
 @pytest.mark.parametrize("how", ["se3", "sim3", "first", "none"])
-def test_ate_is_evos_for_every_alignment(how: str) -> None:
+def test_ate_agrees_with_evo_for_every_alignment(how: str) -> None:
     reference = curve()
     estimate = scaled(noisy(reference), 1.05 if how == "sim3" else 1.0)
     ours = ate(reference, estimate, how, lever_m=0.0)
@@ -55,7 +55,7 @@ def test_ate_is_evos_for_every_alignment(how: str) -> None:
 
 
 @pytest.mark.parametrize("delta", [1, 7])
-def test_rpe_over_frames_is_evos(delta: int) -> None:
+def test_rpe_over_frames_agrees_with_evo(delta: int) -> None:
     reference, estimate = curve(), noisy(curve())
     ours = rpe(reference, estimate, delta)
     for relation, value in (("translation_part", ours.rmse_m), ("rotation_angle_deg", ours.rmse_deg)):
@@ -80,7 +80,7 @@ def test_on_a_real_drive_ate_agrees_with_evo_and_with_kiss_icps_log(shared_data:
     assert np.radians(ours.rmse_deg) == pytest.approx(0.019, abs=5e-4)
 
 
-def test_seconds_frames_and_metres_are_the_same_where_a_frame_is_a_tenth_of_a_second_and_a_metre() -> None:
+def test_rpe_agrees_between_equivalent_units() -> None:
     reference, estimate = curve(), noisy(curve())
     frames = rpe(reference, estimate, 20, "frames")
     for delta, unit in ((2.0, "seconds"), (19.9, "metres")):
@@ -89,7 +89,7 @@ def test_seconds_frames_and_metres_are_the_same_where_a_frame_is_a_tenth_of_a_se
         np.testing.assert_array_equal(other.rows, frames.rows)
 
 
-def test_a_rigid_motion_of_the_whole_is_undone_exactly_and_a_scale_too() -> None:
+def test_alignment_undoes_a_rigid_motion_and_a_scale() -> None:
     reference = curve()
     moved = Trajectory(reference.stamps_ns, se3.exp([1, 2, -0.5, 100, 50, -20]) @ reference.poses)
     assert ate(reference, moved).rmse_m < 1e-6
@@ -98,7 +98,7 @@ def test_a_rigid_motion_of_the_whole_is_undone_exactly_and_a_scale_too() -> None
 
 
 @pytest.mark.parametrize("speed_m", [0.0, 1.0])
-def test_noise_of_the_positions_does_not_turn_a_straight_path_or_one_at_rest(speed_m: float) -> None:
+def test_position_noise_does_not_rotate_a_straight_path_or_one_at_rest(speed_m: float) -> None:
     poses = se3.make(np.tile(np.eye(3), (80, 1, 1)), np.outer(np.arange(80) * speed_m, [1, 0, 0]))
     reference = Trajectory(np.arange(80), poses)
     noise = np.random.default_rng(4).normal(0, [0.001] * 3 + [0.05] * 3, (80, 6))
@@ -116,7 +116,7 @@ def test_association_at_equal_stamps_changes_nothing() -> None:
     assert both.estimate is estimate
 
 
-def test_a_faster_or_slower_reference_is_brought_to_common_stamps_by_interpolation() -> None:
+def test_the_trajectory_with_more_poses_is_interpolated_at_the_stamps_of_the_other() -> None:
     fine = curve(1001)
     a_quarter_later = se3.interpolate(fine.poses[:-4:4], fine.poses[1:-3:4], np.full(250, 0.25))
     coarse = Trajectory(fine.stamps_ns[:-4:4] + 25_000_000, a_quarter_later)
@@ -128,7 +128,7 @@ def test_a_faster_or_slower_reference_is_brought_to_common_stamps_by_interpolati
     assert (associate(coarse, fine).estimate_rows == np.arange(0, 1000, 4)).all()
 
 
-def test_moments_in_a_gap_of_the_reference_or_outside_it_are_left_out() -> None:
+def test_stamps_in_a_gap_of_the_reference_or_outside_it_are_dropped() -> None:
     estimate = curve(100)
     rows = np.r_[10:40, 70:90]
     reference = Trajectory(estimate.stamps_ns[rows], estimate.poses[rows])
@@ -137,7 +137,7 @@ def test_moments_in_a_gap_of_the_reference_or_outside_it_are_left_out() -> None:
     np.testing.assert_allclose(both.reference.poses, both.estimate.poses, atol=1e-12)
 
 
-def test_covariances_stay_with_their_poses_when_associated() -> None:
+def test_association_keeps_covariances_with_their_poses() -> None:
     path = curve(50)
     covariances = np.arange(1, 51)[:, None, None] * np.eye(6)
     estimate = Trajectory(path.stamps_ns, path.poses, covariances)
@@ -145,7 +145,7 @@ def test_covariances_stay_with_their_poses_when_associated() -> None:
     np.testing.assert_array_equal(both.estimate.covariances, covariances[5:20])
 
 
-def test_times_that_never_meet_are_refused_with_both_spans() -> None:
+def test_disjoint_time_spans_are_an_error_that_names_both() -> None:
     reference = curve()
     estimate = Trajectory(np.arange(300) * 100_000_000, reference.poses)
     with pytest.raises(DataError, match=r"from 1317384506\.000 to .* from 0\.000 to 29\.900 s; check"):
@@ -154,7 +154,7 @@ def test_times_that_never_meet_are_refused_with_both_spans() -> None:
         associate(reference, Trajectory(reference.stamps_ns[:1], reference.poses[:1]))
 
 
-def test_wrong_requests_say_what_is_possible() -> None:
+def test_errors_for_invalid_arguments_list_the_choices() -> None:
     reference = curve(20)
     with pytest.raises(ConfigError, match="unknown alignment 'yaw'; choose one of se3, sim3, first, none"):
         ate(reference, reference, "yaw")  # type: ignore[arg-type]

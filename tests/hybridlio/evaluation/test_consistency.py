@@ -25,7 +25,7 @@ def test_errors_drawn_from_their_covariances_are_consistent(rng: np.random.Gener
     assert result.value == pytest.approx(1, abs=0.05)
 
 
-def test_the_bounds_hold_in_ninety_five_of_a_hundred_draws(rng: np.random.Generator) -> None:
+def test_the_bounds_contain_95_percent_of_consistent_averages(rng: np.random.Generator) -> None:
     covariances = random_covariances(rng, 40, 3)
     inside = np.mean([anees(draw(rng, covariances), covariances).consistent for _ in range(1000)])
     assert inside == pytest.approx(0.95, abs=0.02)
@@ -40,7 +40,7 @@ def test_covariances_k_times_too_small_give_an_anees_of_k(rng: np.random.Generat
     assert not result.consistent
 
 
-def test_rotation_and_position_are_told_apart(rng: np.random.Generator) -> None:
+def test_rotation_and_position_are_evaluated_separately(rng: np.random.Generator) -> None:
     covariances = random_covariances(rng, 4000, 6)
     errors = draw(rng, covariances)
     claimed = covariances.copy()
@@ -52,13 +52,13 @@ def test_rotation_and_position_are_told_apart(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(result.sigmas[:, 0] ** 2, claimed[:, 0, 0])
 
 
-def test_the_bounds_close_in_on_one_as_samples_grow() -> None:
+def test_the_bounds_approach_one_with_more_samples() -> None:
     wide, narrow = bounds(10, 3), bounds(10_000, 3)
     assert wide[0] < narrow[0] < 1 < narrow[1] < wide[1]
-    assert bounds(1, 1) == pytest.approx((0.00098, 5.0239), rel=1e-2)  # a table of χ² with one degree of freedom
+    assert bounds(1, 1) == pytest.approx((0.00098, 5.0239), rel=1e-2)  # from a table of χ² with one degree of freedom
 
 
-def test_steps_with_right_perturbations_are_consistent_and_their_chain_too(rng: np.random.Generator) -> None:
+def test_steps_with_right_perturbations_and_their_chain_are_consistent(rng: np.random.Generator) -> None:
     runs, n = 300, 12
     covariances = random_covariances(rng, n, 6)
     chained, per_step, position = [], [], []
@@ -83,7 +83,7 @@ def test_steps_with_right_perturbations_are_consistent_and_their_chain_too(rng: 
     assert low < np.mean(position) < high
 
 
-def test_a_bad_row_is_named(rng: np.random.Generator) -> None:
+def test_the_error_for_an_invalid_row_names_it(rng: np.random.Generator) -> None:
     covariances = random_covariances(rng, 10, 6)
     errors = draw(rng, covariances)
     covariances[7, 0, 0] = -1.0
@@ -98,7 +98,7 @@ def test_a_bad_row_is_named(rng: np.random.Generator) -> None:
         anees(errors[:0], covariances[:0])
 
 
-def test_steps_and_covariances_that_do_not_fit_the_reference_are_refused() -> None:
+def test_numbers_of_steps_and_covariances_that_do_not_match_are_an_error() -> None:
     reference = Trajectory(np.arange(5), np.tile(np.eye(4), (5, 1, 1)))
     with pytest.raises(DataError, match="5 steps do not match 5 reference poses"):
         step_consistency(reference, reference.poses, np.tile(np.eye(6), (5, 1, 1)))

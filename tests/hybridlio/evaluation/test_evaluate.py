@@ -17,7 +17,7 @@ STEP_COVARIANCE = np.diag([1e-4, 1e-4, 4e-4, 1e-4, 1e-4, 4e-4])
 
 
 def drive(rng: np.random.Generator, n: int, speed_m: float = 1.0) -> tuple[Trajectory, Trajectory, Steps]:
-    """A winding reference, an estimate whose steps err by a known covariance, and those steps."""
+    """Return a winding reference, an estimate with step errors of known covariance, and its steps."""
     bends = np.cumsum(rng.normal(0, [0.001, 0.001, 0.004], (n - 1, 3)), axis=0)
     true_steps = se3.exp(np.hstack([bends, np.tile([speed_m, 0, 0], (n - 1, 1))]))
     errors = rng.normal(size=(n - 1, 6)) * np.sqrt(np.diag(STEP_COVARIANCE))
@@ -39,7 +39,7 @@ def rendered(evaluations: dict[str, Evaluation]) -> str:
     return text.get()
 
 
-def test_the_whole_evaluation_is_the_sum_of_its_parts(rng: np.random.Generator) -> None:
+def test_the_evaluation_agrees_with_the_single_metrics(rng: np.random.Generator) -> None:
     reference, estimate, steps = drive(rng, 600)
     result = evaluate(reference, estimate, steps=steps)
     assert result.t_rel_percent == kitti_drift(reference, estimate).t_rel_percent
@@ -53,14 +53,14 @@ def test_the_whole_evaluation_is_the_sum_of_its_parts(rng: np.random.Generator) 
     assert [s.at for s in result.segments] == [100, 200, 300, 400, 500]
 
 
-def test_an_estimate_equal_to_the_reference_has_no_error_at_all(rng: np.random.Generator) -> None:
+def test_an_estimate_equal_to_the_reference_has_zero_error(rng: np.random.Generator) -> None:
     reference, _, _ = drive(rng, 300)
     result = evaluate(reference, Trajectory(reference.stamps_ns, se3.exp([0, 0, 1, 5, 5, 0]) @ reference.poses))
     for name in ("t_rel_percent", "r_rel_deg_per_100m", "ate_m", "ate_deg", "rpe_m", "rpe_deg", "end_error_m"):
         assert getattr(result, name) == pytest.approx(0, abs=1e-5), name
 
 
-def test_a_short_run_has_no_kitti_drift_but_one_over_lengths_that_fit_and_say_so(rng: np.random.Generator) -> None:
+def test_a_short_run_has_drift_over_fitting_lengths_instead_of_kittis(rng: np.random.Generator) -> None:
     reference, estimate, _ = drive(rng, 80)
     result = evaluate(reference, estimate)
     assert result.t_rel_percent is None
@@ -73,7 +73,7 @@ def test_a_short_run_has_no_kitti_drift_but_one_over_lengths_that_fit_and_say_so
     assert "t_rel [%]" not in text
 
 
-def test_lengths_asked_for_stand_beside_kittis(rng: np.random.Generator) -> None:
+def test_given_lengths_are_evaluated_in_addition_to_kittis(rng: np.random.Generator) -> None:
     reference, estimate, _ = drive(rng, 300)
     result = evaluate(reference, estimate, lengths_m=(10, 20))
     own = kitti_drift(reference, estimate, (10, 20), step=1)
@@ -89,7 +89,7 @@ def test_a_vehicle_at_rest_is_evaluated_without_drift(rng: np.random.Generator) 
     json.dumps(result.to_json_dict(), allow_nan=False)
 
 
-def test_the_json_has_the_figures_and_nothing_that_json_cannot_hold(rng: np.random.Generator) -> None:
+def test_the_json_has_all_metrics_as_plain_values(rng: np.random.Generator) -> None:
     reference, estimate, steps = drive(rng, 300)
     result = evaluate(reference, estimate, steps=steps)
     back = json.loads(json.dumps(result.to_json_dict(), allow_nan=False))
@@ -103,7 +103,7 @@ def test_the_json_has_the_figures_and_nothing_that_json_cannot_hold(rng: np.rand
     }
 
 
-def test_camera_poses_against_lidar_poses_are_warned_of_and_like_against_like_is_not(
+def test_comparing_camera_with_lidar_poses_gives_a_warning(
     rng: np.random.Generator,
 ) -> None:
     reference, estimate, _ = drive(rng, 300)
@@ -115,7 +115,7 @@ def test_camera_poses_against_lidar_poses_are_warned_of_and_like_against_like_is
     assert evaluate(still, shaken).warnings == []
 
 
-def test_steps_are_judged_only_where_the_reference_has_both_ends(rng: np.random.Generator) -> None:
+def test_steps_are_evaluated_only_where_the_reference_has_both_ends(rng: np.random.Generator) -> None:
     reference, estimate, steps = drive(rng, 300)
     rows = np.r_[0:100, 150:300]
     partial = Trajectory(reference.stamps_ns[rows], reference.poses[rows])
@@ -126,20 +126,20 @@ def test_steps_are_judged_only_where_the_reference_has_both_ends(rng: np.random.
     assert result.step_anees_position == pytest.approx(expected.position.value)
 
 
-def test_covariances_relative_to_a_pose_that_the_reference_lacks_are_not_judged(rng: np.random.Generator) -> None:
+def test_covariances_are_not_evaluated_without_a_reference_for_the_first_pose(rng: np.random.Generator) -> None:
     reference, estimate, _ = drive(rng, 300)
     late = Trajectory(reference.stamps_ns[5:], reference.poses[5:])
     assert evaluate(late, estimate).anees_rotation is None
     assert evaluate(reference, estimate).anees_rotation is not None
 
 
-def test_steps_that_do_not_fit_the_estimate_are_refused(rng: np.random.Generator) -> None:
+def test_steps_that_do_not_match_the_estimate_are_an_error(rng: np.random.Generator) -> None:
     reference, estimate, steps = drive(rng, 30)
     with pytest.raises(DataError, match="28 steps with 29 covariances do not match 30 poses"):
         evaluate(reference, estimate, steps=Steps(steps.poses[1:], steps.covariances))
 
 
-def test_a_covariance_that_is_none_leaves_the_other_figures_standing(rng: np.random.Generator) -> None:
+def test_an_invalid_covariance_does_not_affect_the_other_metrics(rng: np.random.Generator) -> None:
     reference, estimate, steps = drive(rng, 300)
     assert estimate.covariances is not None
     broken = Trajectory(estimate.stamps_ns, estimate.poses, -estimate.covariances)
@@ -151,18 +151,18 @@ def test_a_covariance_that_is_none_leaves_the_other_figures_standing(rng: np.ran
     assert "consistency of the steps: ANEES: row 0: " in result.warnings[1]
 
 
-def test_the_table_has_a_line_for_each_figure_and_a_column_for_each_run(rng: np.random.Generator) -> None:
+def test_the_table_has_a_row_per_metric_and_a_column_per_run(rng: np.random.Generator) -> None:
     reference, estimate, steps = drive(rng, 300)
     full, bare = evaluate(reference, estimate, steps=steps), evaluate(reference, reference)
     lines = rendered({"with": full, "without": bare}).splitlines()
     for heading, value in format_metrics(full).items():
         line = next(line for line in lines if heading in line)
         assert value in line
-        # the reference has no covariances to judge
+        # the reference has no covariances, so that some metrics are missing
         assert format_metrics(bare).get(heading, "–") in line
 
 
-def test_without_a_reference_there_is_one_clear_error():
+def test_evaluation_without_a_reference_is_an_error():
     path = Trajectory(np.arange(3), np.tile(np.eye(4), (3, 1, 1)))
     with pytest.raises(DataError, match="no reference to compare with"):
         evaluate(None, path)

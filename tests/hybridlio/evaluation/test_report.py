@@ -17,7 +17,7 @@ SIGMAS = [*np.radians([0.03, 0.03, 0.05]).tolist(), 0.02, 0.01, 0.02]
 
 
 def run(n: int = 400, seed: int = 5, claim: float = 1.0) -> ReportData:
-    """A drive through bends at 10 Hz, estimated with step errors whose covariance is ``claim`` times what it says."""
+    """Return a drive through bends at 10 Hz, whose step covariances are ``claim`` times too small."""
     rng = np.random.default_rng(seed)
     time = np.arange(n - 1) * 0.1
     yaw_rate = 0.05 * np.sin(time / 7) + 0.04 * np.sin(time / 23)
@@ -57,7 +57,7 @@ def run(n: int = 400, seed: int = 5, claim: float = 1.0) -> ReportData:
 
 
 class Page(HTMLParser):
-    """Collects what a page would fetch, and checks that what opens is closed."""
+    """Collect what a page would load, and check that its tags are closed."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -87,7 +87,7 @@ def html(data: ReportData, tmp_path_factory: pytest.TempPathFactory) -> str:
     return path.read_text()
 
 
-def test_the_page_is_whole_and_fetches_nothing(html: str) -> None:
+def test_the_page_is_well_formed_and_loads_nothing(html: str) -> None:
     page = Page(html)
     assert page.open == []
     assert len(page.sources) == 7
@@ -95,7 +95,7 @@ def test_the_page_is_whole_and_fetches_nothing(html: str) -> None:
     assert not re.search(r"https?:|url\(|@import|<script|<link", html)
 
 
-def test_the_page_holds_the_figures_that_the_evaluation_gives(data: ReportData, html: str) -> None:
+def test_the_page_contains_the_metrics_of_the_evaluation(data: ReportData, html: str) -> None:
     assert data.reference is not None
     assert data.final_poses is not None
     assert data.step_covariances is not None
@@ -107,26 +107,26 @@ def test_the_page_holds_the_figures_that_the_evaluation_gives(data: ReportData, 
         assert f"<td>{average.t_rel_percent:.3f}</td>" in html
 
 
-def test_the_page_says_what_went_wrong_where_and_with_which_settings(html: str) -> None:
-    assert "<b>100, 200–202</b>" in html  # step k leads to scan k+1
+def test_the_page_lists_bridged_and_degenerate_scans_warnings_and_settings(html: str) -> None:
+    assert "<b>100, 200–202</b>" in html  # step k leads to scan k + 1
     assert "<b>301–310</b>" in html
     for text in ("gap of 0.42 s", "voxel_m: 0.5", "preintegration", "before smoothing", "numpy"):
         assert text in html
 
 
-def test_scans_to_look_at_are_counted_as_the_recording_counts_them(data: ReportData, tmp_path: Path) -> None:
+def test_listed_scans_are_numbered_as_in_the_recording(data: ReportData, tmp_path: Path) -> None:
     write_report(tmp_path / "r.html", dataclasses.replace(data, first_scan=7))
     html = (tmp_path / "r.html").read_text()
     assert "<b>107, 207–209</b>" in html
     assert "<b>308–317</b>" in html
 
 
-def test_names_are_text_and_never_markup(html: str) -> None:
+def test_names_are_escaped(html: str) -> None:
     assert "town &lt;1&gt;" in html
     assert "town <1>" not in html
 
 
-def test_wrong_covariances_are_called_so(data: ReportData, tmp_path: Path) -> None:
+def test_inconsistent_covariances_get_a_verdict(data: ReportData, tmp_path: Path) -> None:
     assert analyse(data).steps.consistency.rotation.consistent  # type: ignore[union-attr]
     write_report(tmp_path / "r.html", dataclasses.replace(run(claim=9.0), others={}, timings_s={}, initial_poses=None))
     assert re.search(r"<td>σ (2\.9\d?|3|3\.\d+) times too small</td>", (tmp_path / "r.html").read_text())
@@ -144,7 +144,7 @@ GONE_WITH = {
 
 
 @pytest.mark.parametrize("absent", GONE_WITH)
-def test_whatever_is_absent_only_takes_its_own_pictures_away(data: ReportData, absent: str) -> None:
+def test_missing_data_remove_only_the_figures_that_need_them(data: ReportData, absent: str) -> None:
     assert set(figures(data, analyse(data))) == EVERY_FIGURE
     less = dataclasses.replace(data, **{absent: None})
     assert set(figures(less, analyse(less))) == EVERY_FIGURE - GONE_WITH[absent]
@@ -162,22 +162,20 @@ def test_an_estimate_alone_has_a_report(data: ReportData, tmp_path: Path) -> Non
     ("poses", "text"),
     [(1, "the estimate has 1 pose;"), (2, "ATE [m]"), (40, "too short for KITTI")],
 )
-def test_a_run_of_one_pose_and_a_short_one_still_have_a_report(
-    data: ReportData, tmp_path: Path, poses: int, text: str
-) -> None:
+def test_a_short_run_has_a_report(data: ReportData, tmp_path: Path, poses: int, text: str) -> None:
     short = Trajectory(data.estimate.stamps_ns[:poses], data.estimate.poses[:poses])
     write_report(tmp_path / "r.html", ReportData("short", short, data.reference))
     assert text in (tmp_path / "r.html").read_text()
 
 
-def test_a_reference_of_another_time_is_a_warning_and_not_the_end(data: ReportData, tmp_path: Path) -> None:
+def test_a_reference_at_other_times_is_a_warning(data: ReportData, tmp_path: Path) -> None:
     assert data.reference is not None
     elsewhen = Trajectory(data.reference.stamps_ns - 10**18, data.reference.poses)
     write_report(tmp_path / "r.html", dataclasses.replace(data, reference=elsewhen))
     assert "only 0 poses at common times" in (tmp_path / "r.html").read_text()
 
 
-def test_the_drawn_lines_are_the_data(data: ReportData) -> None:
+def test_the_trajectory_figure_shows_the_data(data: ReportData) -> None:
     figure = figures(data, analyse(data))["trajectory"]
     lines = {line.get_label(): line.get_xydata() for line in figure.axes[0].lines}
     assert data.reference is not None
@@ -187,7 +185,7 @@ def test_the_drawn_lines_are_the_data(data: ReportData) -> None:
     np.testing.assert_allclose(lines["bridged scan"], laid[[100, 200, 201, 202], :2, 3], atol=1e-9)
 
 
-def test_arrays_that_do_not_fit_the_poses_are_refused_by_name(data: ReportData) -> None:
+def test_the_error_for_arrays_of_wrong_shape_names_them(data: ReportData) -> None:
     with pytest.raises(DataError, match=r"final_poses must have the shape \(399, 4, 4\) for 400 poses, not \(400"):
         dataclasses.replace(data, final_poses=data.estimate.poses)
     with pytest.raises(DataError, match=r"timings_s\['match'\]"):

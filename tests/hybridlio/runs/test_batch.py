@@ -28,7 +28,7 @@ def two(tiny_drive) -> tuple[Recording, ...]:
 
 @pytest.fixture(autouse=True)
 def without_pages(monkeypatch) -> None:
-    """Spare the tests the reports, where no other process writes them."""
+    """Skip the reports, which are slow, in runs within this process."""
     monkeypatch.setattr("hybridlio.runs.write.write_pages", lambda *_: None)
 
 
@@ -36,7 +36,7 @@ def statuses(done) -> list[str]:
     return [row.status for row in done.rows]
 
 
-def test_one_that_fails_stops_no_other_and_a_second_batch_does_only_what_is_missing(two, tmp_path):
+def test_a_failed_recording_does_not_stop_the_others_and_a_second_batch_runs_only_what_is_missing(two, tmp_path):
     recordings = (two[0], Recording(str(tmp_path / "gone"), name="gone"), two[1])
     first = run_batch(recordings, tmp_path / "out", QUICK, BatchOptions(jobs=2))
     assert statuses(first) == [DONE, FAILED, DONE]
@@ -48,7 +48,7 @@ def test_one_that_fails_stops_no_other_and_a_second_batch_does_only_what_is_miss
     assert {folder: (folder / "metrics.json").stat().st_mtime_ns for folder in written} == written
 
 
-def test_batch_json_and_batch_md_hold_every_recording_with_its_figures_and_reasons(two, tmp_path):
+def test_batch_json_and_batch_md_contain_every_recording_with_metrics_or_reason(two, tmp_path):
     run_batch((two[0], Recording("/gone", name="gone")), tmp_path, QUICK, BatchOptions(engine="threading"))
     first, gone = json.loads((tmp_path / "batch.json").read_text())["recordings"]
     assert first["frames"] == 4
@@ -60,7 +60,7 @@ def test_batch_json_and_batch_md_hold_every_recording_with_its_figures_and_reaso
     assert "/gone: no such folder" in text
 
 
-def test_runs_with_other_settings_are_not_taken_for_the_same_nor_overwritten_unasked(two, tmp_path):
+def test_a_run_with_other_settings_is_an_error_unless_overwrite_is_set(two, tmp_path):
     run_batch(two[:1], tmp_path, QUICK, BatchOptions(engine="threading"))
     other = QUICK.model_copy(update={"initial_pose": "identity"})
     with pytest.raises(ConfigError, match="other settings"):
@@ -68,7 +68,7 @@ def test_runs_with_other_settings_are_not_taken_for_the_same_nor_overwritten_una
     assert statuses(run_batch(two[:1], tmp_path, other, BatchOptions(engine="threading", overwrite=True))) == [DONE]
 
 
-def test_a_run_that_did_not_reach_its_end_is_done_again(two, tmp_path):
+def test_an_interrupted_run_is_run_again(two, tmp_path):
     (row,) = run_batch(two[:1], tmp_path, QUICK, BatchOptions(engine="threading")).rows
     metrics = row.folder / "metrics.json"
     metrics.write_text(json.dumps({**json.loads(metrics.read_text()), "interrupted": True}))
@@ -83,7 +83,7 @@ def run_or_die(job: Job) -> tuple[Recording, str | None]:
     return run_job(job)
 
 
-def test_a_process_that_ends_by_force_takes_no_other_recording_with_it(two, tmp_path, monkeypatch):
+def test_a_process_that_dies_fails_only_its_own_recording(two, tmp_path, monkeypatch):
     monkeypatch.setattr(batch, "run_job", run_or_die)
     done = run_batch((Recording("/gone", name="deadly"), two[0]), tmp_path, QUICK, BatchOptions(jobs=2))
     assert statuses(done) == [FAILED, DONE]
@@ -97,7 +97,7 @@ def interrupt_the_second(job: Job) -> tuple[Recording, str | None]:
     return run_job(job)
 
 
-def test_an_interrupt_keeps_what_is_done(two, tmp_path, monkeypatch):
+def test_an_interrupt_keeps_complete_runs(two, tmp_path, monkeypatch):
     monkeypatch.setattr(batch, "run_job", interrupt_the_second)
     stopped = run_batch(two, tmp_path, QUICK, BatchOptions(jobs=1, engine="sequential"))
     assert isinstance(stopped.stopped, KeyboardInterrupt)
@@ -110,27 +110,27 @@ def threads_of(_: int) -> tuple[int, str | None]:
     return os.getpid(), os.environ.get("OMP_NUM_THREADS")
 
 
-def test_a_process_of_its_own_runs_each_job_with_as_many_threads_as_it_was_given():
+def test_each_job_runs_in_its_own_process_with_the_given_threads():
     with engines.engine("loky", 1, 1):
         ((process, threads),) = engines.run_tasks([(threads_of, (0,))])
     assert process != os.getpid()
     assert threads == "1"
 
 
-def test_no_part_of_a_run_uses_more_threads_than_it_was_given():
+def test_the_thread_limit_applies_to_all_parts_of_the_settings():
     matching = batch._with_thread_limit(Config(), 1).scan_matching
     assert (matching.registration.threads, matching.local_map.threads) == (1, 1)
     assert batch._with_thread_limit(Config(), 99) == Config()
 
 
-def test_the_same_batch_runs_on_a_dask_cluster(two, tmp_path):
+def test_a_batch_runs_on_a_dask_cluster(two, tmp_path):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
         done = run_batch(two[:1], tmp_path, QUICK, BatchOptions(engine="dask", scheduler=cluster.scheduler_address))
     assert statuses(done) == [DONE]
 
 
-def test_a_folder_that_cannot_be_made_is_named_whoever_runs_the_batch(two, tmp_path):
+def test_the_error_for_a_folder_that_cannot_be_created_names_it_with_every_engine(two, tmp_path):
     distributed = pytest.importorskip("distributed")
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match=r"cannot make the folder .*file/runs"):
@@ -144,13 +144,13 @@ def test_a_folder_that_cannot_be_made_is_named_whoever_runs_the_batch(two, tmp_p
 
 
 @pytest.mark.parametrize(("engine", "module"), [("dask", "distributed"), ("ray", "ray")])
-def test_an_engine_that_is_not_installed_says_what_to_install(two, tmp_path, monkeypatch, engine, module):
+def test_the_error_for_a_missing_engine_says_what_to_install(two, tmp_path, monkeypatch, engine, module):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(MissingDependencyError, match="pip install"):
         run_batch(two, tmp_path, QUICK, BatchOptions(engine=engine))
 
 
-def test_an_unknown_engine_and_a_scheduler_for_none_are_refused(two, tmp_path):
+def test_an_unknown_engine_or_a_scheduler_for_a_local_engine_is_an_error(two, tmp_path):
     with pytest.raises(ConfigError, match="unknown engine 'steam'"):
         run_batch(two, tmp_path, QUICK, BatchOptions(engine="steam"))
     with pytest.raises(ConfigError, match="no scheduler"):
@@ -162,14 +162,14 @@ def command(*words: object) -> tuple[int, str]:
     return result.exit_code, result.output
 
 
-def test_the_exit_code_says_whether_any_recording_failed(tiny_drive, tmp_path):
+def test_the_exit_code_shows_whether_any_recording_failed(tiny_drive, tmp_path):
     options = ("-o", tmp_path / "out", "--residual", "none", "--frames", ":4", "--engine", "threading")
-    code, said = command(tiny_drive, *options)
-    assert code == 0, said
-    assert "1 recording: 1 done" in said
-    code, said = command(tiny_drive, "/gone", *options)
+    code, output = command(tiny_drive, *options)
+    assert code == 0, output
+    assert "1 recording: 1 done" in output
+    code, output = command(tiny_drive, "/gone", *options)
     assert code == 1
-    assert "1 done before, 1 failed" in said
+    assert "1 done before, 1 failed" in output
     assert command(tiny_drive, *options, "--residual", "nonsense")[0] == 2
 
 
@@ -185,14 +185,14 @@ def test_the_exit_code_says_whether_any_recording_failed(tiny_drive, tmp_path):
         (("--config", "/gone.yaml"), "/gone.yaml: cannot be read"),
     ],
 )
-def test_an_option_that_no_recording_can_be_run_with_fails_once_before_anything(options, words, tmp_path):
-    code, said = command("/one", "/two", "-o", tmp_path / "out", *options)
+def test_an_invalid_option_fails_once_before_any_run(options, words, tmp_path):
+    code, output = command("/one", "/two", "-o", tmp_path / "out", *options)
     assert code == 2
-    assert said.count(words) == 1, said
+    assert output.count(words) == 1, output
     assert not (tmp_path / "out").exists()
 
 
-def test_settings_that_no_recording_can_be_run_with_remove_no_run(two, tmp_path):
+def test_invalid_settings_do_not_remove_existing_runs(two, tmp_path):
     run_batch(two[:1], tmp_path, QUICK, BatchOptions(engine="threading"))
     without_weights = Config.model_validate({"residual": "network", "network": {"weights": "/gone.safetensors"}})
     for settings, engine in ((without_weights, "threading"), (QUICK, "steam")):
@@ -201,14 +201,14 @@ def test_settings_that_no_recording_can_be_run_with_remove_no_run(two, tmp_path)
     assert statuses(run_batch(two[:1], tmp_path, QUICK, BatchOptions(engine="threading"))) == [DONE_BEFORE]
 
 
-def test_what_one_recording_lacks_fails_for_it_alone(two, tmp_path):
+def test_a_range_outside_one_recording_fails_for_that_recording_only(two, tmp_path):
     beyond = Recording(two[0].path, frames="900:", name="beyond")
     done = run_batch((beyond, two[0]), tmp_path, QUICK, BatchOptions(engine="threading"))
     assert statuses(done) == [FAILED, DONE]
     assert "no scans in 900:" in done.rows[0].reason
 
 
-def test_a_fault_is_one_recordings_reason_and_its_log_shows_where(two, tmp_path, monkeypatch):
+def test_an_unexpected_error_is_the_recordings_reason_with_a_traceback_in_its_log(two, tmp_path, monkeypatch):
     monkeypatch.setattr("hybridlio.runs.write.write_run", lambda *_: 1 // 0)
     done = run_batch(two[:1], tmp_path, QUICK, BatchOptions(engine="sequential"))
     assert "ZeroDivisionError" in done.rows[0].reason

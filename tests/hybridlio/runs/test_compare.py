@@ -42,26 +42,26 @@ def test_every_combination_has_a_row_in_order(compared):
     assert all(row.scans == 12 and row.error is None for row in compared.rows)
 
 
-def test_a_row_says_what_the_run_alone_says(compared, sequence):
+def test_a_row_has_the_values_of_a_single_run(compared, sequence):
     run = run_odometry(sequence, Odometry("kalman", "scan-matching"))
     row = compared.rows[0]
     assert row.path_length_m == pytest.approx(run.trajectory.length_m, rel=1e-6)
     assert row.bridged == len(run.bridged)
     true = se3.between(sequence.reference.poses[:-1], sequence.reference.poses[1:])
-    for said, poses in ((row.initial, run.initial_poses), (row.final, run.steps.poses)):
+    for errors, poses in ((row.initial, run.initial_poses), (row.final, run.steps.poses)):
         off_m = np.linalg.norm(se3.log(se3.between(poses, true))[:, 3:], axis=1)
-        assert said.median_m == pytest.approx(np.median(off_m), rel=1e-3)
-        assert said.rms_m == pytest.approx(np.sqrt(np.mean(off_m**2)), rel=1e-3)
+        assert errors.median_m == pytest.approx(np.median(off_m), rel=1e-3)
+        assert errors.rms_m == pytest.approx(np.sqrt(np.mean(off_m**2)), rel=1e-3)
     assert 0 < row.ms_median <= row.ms_p90
 
 
-def test_looking_at_the_scans_helps(compared):
+def test_scan_matching_reduces_the_step_error(compared):
     for row in compared.rows:
         if row.residual == "scan-matching":
             assert row.final.median_m < row.initial.median_m
 
 
-def test_table_and_markdown_show_every_row_without_columns_that_say_nothing(compared):
+def test_table_and_markdown_show_every_row_without_empty_columns(compared):
     console = Console(width=400)
     with console.capture() as text:
         console.print(table(compared))
@@ -73,7 +73,7 @@ def test_table_and_markdown_show_every_row_without_columns_that_say_nothing(comp
     assert "ended early" not in cells(compared)[0]
 
 
-def test_without_reference_paths_and_times_are_still_compared(sequence):
+def test_without_a_reference_path_lengths_and_times_are_compared(sequence):
     bare = replace(sequence, reference=None)
     result = compare_configs(bare, combinations(["identity"], ["none"], ["incremental"], Config()))
     (row,) = cells(result)
@@ -81,7 +81,7 @@ def test_without_reference_paths_and_times_are_still_compared(sequence):
     assert "ATE [m]" not in row
 
 
-def test_a_run_that_fails_has_a_row_with_the_reason_and_the_others_go_on(sequence, monkeypatch):
+def test_a_failed_run_has_a_row_with_the_reason_and_the_others_continue(sequence, monkeypatch):
     from hybridlio.sources.kalman import Kalman
 
     def fail(self, frame, state):
@@ -94,7 +94,7 @@ def test_a_run_that_fails_has_a_row_with_the_reason_and_the_others_go_on(sequenc
     assert cells(result)[1]["ended early"] == "–"
 
 
-def test_a_recording_that_cannot_be_started_at_has_rows_too(sequence):
+def test_a_recording_without_usable_scans_has_rows(sequence):
     def load(k):
         raise DataError(f"{k}.bin: truncated")
 
@@ -104,18 +104,20 @@ def test_a_recording_that_cannot_be_started_at_has_rows_too(sequence):
     assert "0.bin: truncated" in row.error
 
 
-def test_a_wrong_name_is_refused_before_any_run(sequence):
-    told = []
+def test_an_unknown_source_is_an_error_before_any_run(sequence):
+    reports = []
     with pytest.raises(ConfigError, match="guess"):
-        compare_configs(sequence, combinations(["identity", "guess"], ["none"], ["incremental"], Config()), told.append)
-    assert told == []
+        compare_configs(
+            sequence, combinations(["identity", "guess"], ["none"], ["incremental"], Config()), reports.append
+        )
+    assert reports == []
 
 
-def test_progress_counts_over_all_runs_and_an_interrupt_ends_the_comparison(sequence):
-    told = []
+def test_progress_is_summed_over_all_runs_and_an_interrupt_ends_the_comparison(sequence):
+    reports = []
 
     def show(name, done, total):
-        told.append((name, done, total))
+        reports.append((name, done, total))
         if done == 15:
             raise KeyboardInterrupt
 
@@ -124,16 +126,16 @@ def test_progress_counts_over_all_runs_and_an_interrupt_ends_the_comparison(sequ
     assert [(row.initial_pose, row.scans, row.error) for row in found.rows] == [
         (SOURCES[0], 12, None), (SOURCES[1], 3, "interrupted"),
     ]  # fmt: skip
-    assert [done for _, done, _ in told] == list(range(1, 16))
-    assert {total for _, _, total in told} == {36}
-    assert told[-1][0] == "constant-velocity + none"
+    assert [done for _, done, _ in reports] == list(range(1, 16))
+    assert {total for _, _, total in reports} == {36}
+    assert reports[-1][0] == "constant-velocity + none"
 
 
-def test_the_files_hold_every_figure(compared, tmp_path):
+def test_the_files_contain_all_metrics(compared, tmp_path):
     write_comparison(tmp_path, compared)
-    said = json.loads((tmp_path / "compare.json").read_text())
-    assert said["sequence"] == compared.sequence
-    for row, expected in zip(said["rows"], compared.rows, strict=True):
+    output = json.loads((tmp_path / "compare.json").read_text())
+    assert output["sequence"] == compared.sequence
+    for row, expected in zip(output["rows"], compared.rows, strict=True):
         assert row["evaluation"]["ate_m"] == expected.evaluation.ate_m
         assert row["initial"]["median_m"] == expected.initial.median_m
     assert (tmp_path / "compare.md").read_text() == to_markdown(compared)

@@ -44,11 +44,11 @@ def folder(run, tmp_path_factory) -> Path:
     return path
 
 
-def test_a_run_leaves_every_file_that_was_promised_and_nothing_else(folder):
+def test_a_run_folder_has_exactly_the_documented_files(folder):
     assert sorted(path.name for path in folder.iterdir()) == sorted(run_folder.FILES)
 
 
-def test_both_pose_files_have_a_row_for_each_scan_with_nine_decimals_at_least(folder, run):
+def test_pose_files_have_one_row_per_scan_with_at_least_nine_decimals(folder, run):
     for name, columns in (("poses_tum.txt", 8), ("poses_kitti.txt", 12)):
         rows = [line.split() for line in (folder / name).read_text().splitlines() if not line.startswith("#")]
         assert len(rows) == len(run.sequence)
@@ -56,14 +56,14 @@ def test_both_pose_files_have_a_row_for_each_scan_with_nine_decimals_at_least(fo
         assert min(len(number.partition(".")[2]) for row in rows for number in row) >= 9
 
 
-def test_the_pose_files_hold_the_estimate(folder, run):
+def test_pose_files_contain_the_estimate(folder, run):
     tum = read_tum(folder / "poses_tum.txt")
     assert tum.stamps_ns.tolist() == run.trajectory.stamps_ns.tolist()
     np.testing.assert_allclose(tum.poses, run.trajectory.poses, atol=1e-9)
     np.testing.assert_allclose(read_kitti(folder / "poses_kitti.txt").poses, run.trajectory.poses, atol=1e-9)
 
 
-def test_covariances_are_those_of_the_poses_and_of_the_steps(folder, run):
+def test_covariances_npz_has_covariances_of_poses_and_steps(folder, run):
     with np.load(folder / "covariances.npz") as file:
         assert file["stamps_ns"].tolist() == run.sequence.stamps_ns.tolist()
         np.testing.assert_array_equal(file["absolute"], run.trajectory.covariances)
@@ -72,29 +72,29 @@ def test_covariances_are_those_of_the_poses_and_of_the_steps(folder, run):
         assert file["estimated"].all()
 
 
-def test_the_record_and_the_configuration_can_be_used_again(folder, run):
+def test_record_and_configuration_can_be_loaded(folder, run):
     record = Record.load(folder / "odometry.npz")
     np.testing.assert_allclose(record.online.poses, run.trajectory.poses, atol=1e-12)
     assert load_config(folder / "config.yaml") == CONFIG
 
 
-def test_the_metrics_say_what_was_done_and_how_good_it_is(folder, run):
-    said = json.loads((folder / "metrics.json").read_text())
-    assert (said["frames_done"], said["frames"], said["interrupted"]) == (12, 12, False)
-    assert (said["initial_pose"], said["residual"], said["backend"]) == (
+def test_metrics_json_has_settings_counts_lengths_and_errors(folder, run):
+    output = json.loads((folder / "metrics.json").read_text())
+    assert (output["frames_done"], output["frames"], output["interrupted"]) == (12, 12, False)
+    assert (output["initial_pose"], output["residual"], output["backend"]) == (
         CONFIG.initial_pose, CONFIG.residual, CONFIG.backend,
     )  # fmt: skip
     path, true = run.trajectory.poses[:, :3, 3], run.sequence.reference.poses[:, :3, 3]
-    assert said["path_length_m"] == pytest.approx(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    assert output["path_length_m"] == pytest.approx(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
     driven = trapezoid(run.sequence.forward_speed_m_s, run.sequence.stamps_ns / 1e9)
-    assert said["forward_speed_length_m"] == pytest.approx(driven)
-    assert said["forward_speed_length_m"] == pytest.approx(run.sequence.reference.length_m, rel=0.02)
+    assert output["forward_speed_length_m"] == pytest.approx(driven)
+    assert output["forward_speed_length_m"] == pytest.approx(run.sequence.reference.length_m, rel=0.02)
     _, left = Rotation.align_vectors(true - true.mean(0), path - path.mean(0))
-    assert said["ate_m"] == pytest.approx(left / np.sqrt(len(path)), rel=1e-6)
-    assert said["ms_per_scan"]["total"] > said["ms_per_scan"]["graph"] > 0
+    assert output["ate_m"] == pytest.approx(left / np.sqrt(len(path)), rel=1e-6)
+    assert output["ms_per_scan"]["total"] > output["ms_per_scan"]["graph"] > 0
 
 
-def test_a_run_is_read_as_it_was_written(folder, run):
+def test_a_run_is_read_as_written(folder, run):
     stored = run_folder.read_run(folder)
     np.testing.assert_allclose(stored.trajectory.poses, run.trajectory.poses, atol=1e-9)
     np.testing.assert_array_equal(stored.trajectory.covariances, run.trajectory.covariances)
@@ -104,7 +104,7 @@ def test_a_run_is_read_as_it_was_written(folder, run):
     assert stored.T_camera_lidar is None
 
 
-def test_a_recording_without_reference_or_speed_is_written_without_them(tiny_drive, without_pages, tmp_path):
+def test_a_run_without_reference_or_forward_speed_is_written_without_them(tiny_drive, without_pages, tmp_path):
     run = run_of(tiny_drive, reference=None, forward_speed_m_s=None)
     write_run(tmp_path, run, CONFIG)
     assert not (tmp_path / "reference_tum.txt").exists()
@@ -114,7 +114,7 @@ def test_a_recording_without_reference_or_speed_is_written_without_them(tiny_dri
     assert "ate_m" not in stored.metrics
 
 
-def test_kitti_poses_of_an_odometry_sequence_are_the_cameras(tiny_drive, without_pages, run, tmp_path):
+def test_kitti_pose_files_of_odometry_sequences_are_in_the_camera_frame(tiny_drive, without_pages, run, tmp_path):
     calibration = Calibration(run.sequence.calibration.T_imu_lidar, T_CAMERA_LIDAR)
     seen = run_of(tiny_drive, calibration=calibration, pose_file_frame="camera")
     write_run(tmp_path, seen, CONFIG)
@@ -124,7 +124,9 @@ def test_kitti_poses_of_an_odometry_sequence_are_the_cameras(tiny_drive, without
     np.testing.assert_allclose(run_folder.read_run(tmp_path).T_camera_lidar, T_CAMERA_LIDAR)
 
 
-def test_scans_before_the_first_usable_one_have_rows_that_claim_nothing(tiny_drive, without_pages, tmp_path):
+def test_scans_before_the_first_usable_one_have_rows_with_the_covariance_of_an_unknown_motion(
+    tiny_drive, without_pages, tmp_path
+):
     sequence = open_sequence(tiny_drive).part(0, 12)
 
     def load(k):
@@ -142,7 +144,7 @@ def test_scans_before_the_first_usable_one_have_rows_that_claim_nothing(tiny_dri
         assert file["estimated"].tolist() == [False] * 3 + [True] * 9
         sigmas_m = np.sqrt(file["absolute"][:, 3, 3])
     assert (sigmas_m[:3] > 1).all()
-    assert (np.diff(sigmas_m[:4]) < 0).all()  # the longer before, the less is known
+    assert (np.diff(sigmas_m[:4]) < 0).all()  # the earlier, the more uncertain
     stored = run_folder.read_run(tmp_path)
     assert stored.trajectory.stamps_ns.tolist() == sequence.stamps_ns[3:].tolist()
     assert len(stored.steps.poses) == 8
@@ -151,7 +153,7 @@ def test_scans_before_the_first_usable_one_have_rows_that_claim_nothing(tiny_dri
     assert list(map(int, vertices)) == list(range(3, 12))
 
 
-def test_a_single_estimate_is_written_without_record_and_graph(tiny_drive, tmp_path):
+def test_a_run_of_one_estimate_is_written_without_record_and_graph(tiny_drive, tmp_path):
     run = run_odometry(open_sequence(tiny_drive).part(0, 1), Odometry(config=CONFIG))
     write_run(tmp_path, run, CONFIG)
     assert len(read_tum(tmp_path / "poses_tum.txt")) == 1
@@ -159,20 +161,20 @@ def test_a_single_estimate_is_written_without_record_and_graph(tiny_drive, tmp_p
     assert (tmp_path / "report.html").exists()
 
 
-def test_a_run_without_estimates_is_refused_and_leaves_an_older_one_alone(folder, tiny_drive):
+def test_writing_a_run_without_estimates_is_an_error_and_keeps_an_older_run(folder, tiny_drive):
     run = Run(open_sequence(tiny_drive), Odometry())
     with pytest.raises(EstimationError, match="no estimate to write"):
         write_run(folder, run, CONFIG)
     assert run_folder.is_run_folder(folder)
 
 
-def test_a_run_is_never_replaced_unasked(folder):
+def test_a_run_is_replaced_only_with_overwrite(folder):
     with pytest.raises(ConfigError, match="--overwrite"):
         run_folder.new_run_folder("town", folder, overwrite=False)
     assert run_folder.new_run_folder("town", folder, overwrite=True) == folder
 
 
-def test_a_new_run_in_an_old_ones_folder_leaves_nothing_of_it_but_what_others_put_there(without_pages, run, tmp_path):
+def test_a_new_run_removes_the_files_of_an_old_one_and_keeps_other_files(without_pages, run, tmp_path):
     write_run(tmp_path, run, CONFIG)
     (tmp_path / "smoothed").mkdir()
     (tmp_path / "smoothed/poses_tum.txt").write_text("old")
@@ -185,7 +187,7 @@ def test_a_new_run_in_an_old_ones_folder_leaves_nothing_of_it_but_what_others_pu
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "smoothed/thesis.txt"])
-def test_a_folder_with_files_of_a_runs_names_that_is_no_run_is_refused_unasked(tmp_path, name):
+def test_a_folder_with_files_named_like_a_runs_is_used_only_with_overwrite(tmp_path, name):
     mine = tmp_path / name
     mine.parent.mkdir(exist_ok=True)
     mine.write_text("mine")
@@ -195,7 +197,7 @@ def test_a_folder_with_files_of_a_runs_names_that_is_no_run_is_refused_unasked(t
     assert mine.read_text() == "mine"
 
 
-def test_what_is_cleared_is_a_runs_alone(without_pages, run, tmp_path):
+def test_clear_removes_only_files_of_a_run(without_pages, run, tmp_path):
     write_run(tmp_path, run, CONFIG)
     (tmp_path / "smoothed").mkdir()
     for name in ("poses_tum.txt", "metrics.json", "thesis.txt"):
@@ -204,7 +206,7 @@ def test_what_is_cleared_is_a_runs_alone(without_pages, run, tmp_path):
     assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.*")] == ["smoothed/thesis.txt"]
 
 
-def test_default_folders_are_named_after_the_sequence_and_never_shared(tmp_path, monkeypatch):
+def test_default_folders_are_named_after_the_sequence_and_unique_within_a_second(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     made = [run_folder.new_run_folder("town", None, overwrite=False) for _ in range(3)]
     assert len(set(made)) == 3
@@ -212,7 +214,7 @@ def test_default_folders_are_named_after_the_sequence_and_never_shared(tmp_path,
     assert all(path.is_dir() for path in made)
 
 
-def test_runs_that_begin_at_once_get_folders_of_their_own(tmp_path, monkeypatch):
+def test_runs_that_begin_at_once_get_different_folders(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     ready = Barrier(8)
 
@@ -224,7 +226,7 @@ def test_runs_that_begin_at_once_get_folders_of_their_own(tmp_path, monkeypatch)
         assert len(set(runs.map(begin, range(8)))) == 8
 
 
-def test_a_place_where_no_folder_can_be_made_is_named(tmp_path, monkeypatch):
+def test_the_error_for_a_run_folder_that_cannot_be_created_names_it(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("runs").write_text("a file")
     for out in (None, Path("runs/mine")):
@@ -232,7 +234,7 @@ def test_a_place_where_no_folder_can_be_made_is_named(tmp_path, monkeypatch):
             run_folder.new_run_folder("town", out, overwrite=False)
 
 
-def test_latest_points_at_the_newest_and_works_after_the_folder_above_moved(tmp_path):
+def test_latest_links_to_the_newest_run_by_a_relative_path(tmp_path):
     for name in ("a", "b"):
         (tmp_path / "runs" / name).mkdir(parents=True)
         run_folder.link_latest(tmp_path / "runs" / name)
@@ -241,7 +243,7 @@ def test_latest_points_at_the_newest_and_works_after_the_folder_above_moved(tmp_
     assert sorted(path.name for path in (tmp_path / "moved").iterdir()) == ["a", "b", "latest"]
 
 
-def test_a_folder_that_is_called_latest_is_left_alone(tmp_path):
+def test_an_existing_folder_named_latest_is_kept(tmp_path):
     (tmp_path / "latest").mkdir()
     (tmp_path / "a").mkdir()
     run_folder.link_latest(tmp_path / "a")
@@ -251,14 +253,14 @@ def test_a_folder_that_is_called_latest_is_left_alone(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text"), [("metrics.json", "{"), ("covariances.npz", "no zip"), ("poses_tum.txt", "1 2")]
 )
-def test_a_damaged_run_is_refused_by_name(name, text, folder, tmp_path):
+def test_reading_a_malformed_run_names_the_folder(name, text, folder, tmp_path):
     damaged = shutil.copytree(folder, tmp_path / "run")
     (damaged / name).write_text(text)
     with pytest.raises(DataError, match=str(damaged)):
         run_folder.read_run(damaged)
 
 
-def test_a_folder_without_a_run_is_refused(tmp_path):
+def test_reading_a_folder_without_a_run_is_an_error(tmp_path):
     with pytest.raises(DataError, match="not a run folder"):
         run_folder.read_run(tmp_path)
     with pytest.raises(DataError, match="no such folder"):
@@ -287,7 +289,7 @@ def _flipped(path: Path) -> None:
         ("poses_tum.txt", lambda path: path.write_text("".join(path.read_text().splitlines(True)[:5]))),
     ],
 )
-def test_a_damaged_run_is_refused_with_its_folder(folder, tmp_path, name, damage):
+def test_reading_a_damaged_file_names_folder_and_files(folder, tmp_path, name, damage):
     damaged = shutil.copytree(folder, tmp_path / "run")
     damage(damaged / name)
     with pytest.raises(DataError, match=rf"{damaged}: metrics.json, poses_tum.txt or covariances.npz cannot"):

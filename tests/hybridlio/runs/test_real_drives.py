@@ -1,4 +1,4 @@
-"""The whole odometry on real recordings, by the public function behind the command."""
+"""The odometry on real recordings."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from hybridlio.runs.run import run_odometry
 from hybridlio.runs.write import forward_speed_length_m
 
 
-def test_a_standing_car_hardly_moves(kitti_raw_root):
+def test_a_standing_car_has_a_constant_pose(kitti_raw_root):
     run = run_odometry(open_sequence(kitti_raw_root, sequence="0060"), Odometry())
     assert run.stopped is None
     assert run.done == 20
@@ -18,7 +18,7 @@ def test_a_standing_car_hardly_moves(kitti_raw_root):
     assert run.trajectory.length_m < 0.05
 
 
-def test_a_driving_car_goes_as_far_as_its_own_speed_says(kitti_raw_root):
+def test_the_path_length_of_a_driving_car_agrees_with_its_forward_speed(kitti_raw_root):
     run = run_odometry(open_sequence(kitti_raw_root, sequence="0048"), Odometry())
     assert run.stopped is None
     assert run.ok.all()

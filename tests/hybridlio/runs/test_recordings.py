@@ -11,7 +11,7 @@ from hybridlio.runs.recordings import Recording, find_recordings
 
 
 def make_recording(folder: Path) -> Path:
-    """A folder of one scan, as the folder reader takes it."""
+    """Write a recording of one scan for the folder reader."""
     (folder / "scans").mkdir(parents=True)
     np.zeros((1, 4), np.float32).tofile(folder / "scans/000000.bin")
     (folder / "timestamps.txt").write_text("0.0\n")
@@ -29,39 +29,37 @@ def names(found) -> list[str]:
     return [recording.name for recording in found]
 
 
-def test_a_folder_of_several_recordings_stands_for_all_of_them(drives):
+def test_a_folder_of_several_recordings_gives_all_of_them(drives):
     assert names(find_recordings([drives])) == ["north", "south", "west"]
 
 
-def test_sequences_choose_among_them_in_the_order_asked_for(drives):
+def test_sequence_names_choose_recordings_in_the_given_order(drives):
     found = find_recordings([drives], sequence="west,north")
     assert names(found) == ["west", "north"]
     assert all(len(recording.open()) == 1 for recording in found)
 
 
-def test_a_pattern_stands_for_what_it_matches(drives):
+def test_a_pattern_gives_all_its_matches(drives):
     assert names(find_recordings([f"{drives}/*th"])) == ["north", "south"]
 
 
-def test_each_recording_is_found_once_however_often_it_is_meant(drives):
+def test_a_recording_given_twice_is_found_once(drives):
     assert names(find_recordings([f"{drives}/*th", drives / "north"])) == ["north", "south"]
 
 
-def test_a_text_list_holds_paths_from_its_own_folder_with_sequences_and_comments(drives):
+def test_a_text_list_has_paths_relative_to_its_folder_with_sequences_and_comments(drives):
     (drives / "list.txt").write_text("# mine\nnorth\n. west  # by name\n\n'south'\n")
     assert names(find_recordings([drives / "list.txt"])) == ["north", "west", "south"]
 
 
-def test_a_yaml_list_holds_paths_or_mappings(drives):
+def test_a_yaml_list_has_paths_or_mappings(drives):
     (drives / "list.yaml").write_text("- north\n- {path: ., sequence: west, frames: '0:1'}\n")
     first, second = find_recordings([drives / "list.yaml"], frames=":")
     assert (first.name, first.frames) == ("north", ":")
     assert (second.name, second.frames) == ("west", "0:1")
 
 
-def test_the_raw_root_of_a_list_starts_from_its_own_folder_and_that_of_an_option_from_the_current_one(
-    drives, monkeypatch
-):
+def test_raw_root_in_a_list_is_relative_to_its_folder_and_as_an_option_to_the_current_one(drives, monkeypatch):
     (drives / "list.yaml").write_text("- {path: north, raw_root: raw}\n- south\n")
     monkeypatch.chdir(drives.parent)
     one, two = find_recordings([drives / "list.yaml"], raw_root="drives")
@@ -69,7 +67,7 @@ def test_the_raw_root_of_a_list_starts_from_its_own_folder_and_that_of_an_option
     assert two.raw_root == str(drives)
 
 
-def test_points_are_raised_as_a_recording_says_and_else_as_the_option_does(drives, monkeypatch):
+def test_the_vertical_angle_of_an_entry_takes_precedence_over_the_option(drives, monkeypatch):
     (drives / "list.yaml").write_text("- {path: north, vertical_angle_deg: 0}\n- south\n")
     own, other = find_recordings([drives / "list.yaml"], vertical_angle_deg=1.0)
     assert (own.vertical_angle_deg, other.vertical_angle_deg) == (0, 1.0)
@@ -79,7 +77,7 @@ def test_points_are_raised_as_a_recording_says_and_else_as_the_option_does(drive
         assert np.rad2deg(np.arctan2(z, x)) == pytest.approx(angle_deg or 0.0, abs=1e-5)
 
 
-def test_an_angle_that_is_no_calibration_error_is_refused_before_any_recording_is_looked_for(tmp_path):
+def test_an_implausible_vertical_angle_is_an_error_before_any_recording_is_opened(tmp_path):
     with pytest.raises(ConfigError, match="vertical_angle_deg: must be within"):
         find_recordings([tmp_path / "gone"], vertical_angle_deg=9.0)
 
@@ -99,26 +97,26 @@ def test_an_angle_that_is_no_calibration_error_is_refused_before_any_recording_i
         ("a.yaml", "- [", r"a\.yaml: not YAML at line 1"),
     ],
 )
-def test_a_malformed_list_is_refused_with_the_place(tmp_path, file, text, words):
+def test_the_error_for_a_malformed_list_names_the_entry(tmp_path, file, text, words):
     (tmp_path / file).write_text(text)
     with pytest.raises(DataError, match=words):
         find_recordings([tmp_path / file])
 
 
-def test_what_holds_no_recording_is_kept_and_fails_when_it_is_opened(tmp_path):
+def test_a_path_without_recording_is_kept_and_fails_when_opened(tmp_path):
     (gone,) = find_recordings([tmp_path / "gone"])
     assert gone.name == "gone"
     with pytest.raises(DataError, match="no such folder"):
         gone.open()
 
 
-def test_an_empty_list_is_refused(tmp_path):
+def test_an_empty_list_is_an_error(tmp_path):
     (tmp_path / "empty.txt").write_text("# nothing\n")
     with pytest.raises(ConfigError, match="no recording"):
         find_recordings([tmp_path / "empty.txt"])
 
 
-def test_recordings_of_one_name_get_names_of_their_own_that_depend_on_nothing_else(tmp_path):
+def test_recordings_with_equal_names_get_unique_names_independent_of_their_order(tmp_path):
     one, two = make_recording(tmp_path / "a/drive"), make_recording(tmp_path / "b/drive")
     there, back = find_recordings([one, two]), find_recordings([two, one])
     assert len(set(names(there))) == 2
@@ -126,16 +124,16 @@ def test_recordings_of_one_name_get_names_of_their_own_that_depend_on_nothing_el
     assert all(name.startswith("drive-") for name in names(there))
 
 
-def test_names_are_good_for_folders():
+def test_names_are_valid_folder_names():
     (odd,) = find_recordings([Recording("/nowhere/../a b:c")])
     assert odd.name == "a_b_c"
 
 
-def test_a_single_path_as_text_is_one_recording_and_not_its_letters(drives):
+def test_a_single_path_as_text_is_one_recording(drives):
     assert names(find_recordings(str(drives / "north"))) == ["north"]
 
 
 @pytest.mark.parametrize(("given", "words"), [("none.yaml", "no such list file"), ("nope/*", "no path matches")])
-def test_a_list_or_pattern_that_stands_for_nothing_is_refused(tmp_path, given, words):
+def test_a_missing_list_or_a_pattern_without_match_is_an_error(tmp_path, given, words):
     with pytest.raises(ConfigError, match=words):
         find_recordings([tmp_path / given])

@@ -29,7 +29,7 @@ def whole(sequence) -> Run:
 
 
 def with_scans(sequence: Sequence, bad: dict[int, Exception | Scan]) -> Sequence:
-    """The sequence, with what ``bad`` says in place of some scans."""
+    """Return the sequence with some scans replaced, or failing to load, by ``bad``."""
 
     def load(k: int) -> Scan:
         scan = bad[k] if k in bad else sequence.load_scan(k)
@@ -41,7 +41,7 @@ def with_scans(sequence: Sequence, bad: dict[int, Exception | Scan]) -> Sequence
 
 
 def end_error_m(run: Run) -> float:
-    """Distance of the last pose from the reference's, both in the first estimate's frame."""
+    """Return the position error of the last pose, relative to the first estimate."""
     true = se3.between(run.sequence.reference.poses[run.skipped], run.sequence.reference.poses[run.done - 1])
     return float(np.linalg.norm(run.trajectory.poses[-1, :3, 3] - true[:3, 3]))
 
@@ -54,11 +54,11 @@ def test_every_scan_has_an_estimate_at_its_stamp(whole, sequence):
     assert end_error_m(whole) < 0.2
 
 
-def test_progress_is_told_of_each_scan_and_of_the_distance(sequence, tiny_drive):
-    told = []
-    run = run_odometry(sequence, Odometry(residual="none"), lambda *values: told.append(values))
-    assert [(done, total) for _, done, total in told] == [(k + 1, len(sequence)) for k in range(len(sequence))]
-    assert told[-1][0] == f"{run.trajectory.length_m:.1f} m"
+def test_progress_reports_each_scan_and_the_distance(sequence, tiny_drive):
+    reports = []
+    run = run_odometry(sequence, Odometry(residual="none"), lambda *values: reports.append(values))
+    assert [(done, total) for _, done, total in reports] == [(k + 1, len(sequence)) for k in range(len(sequence))]
+    assert reports[-1][0] == f"{run.trajectory.length_m:.1f} m"
 
 
 def test_every_stage_is_timed_at_every_scan_after_the_first(whole, sequence):
@@ -86,7 +86,7 @@ def test_a_scan_without_points_is_bridged_by_the_initial_pose(kind, whole, seque
         assert "frame 15: bridged by the initial pose: scans/15.bin: truncated" in caplog.text
 
 
-def test_the_run_starts_at_the_first_scan_that_can_be_used(sequence, caplog):
+def test_the_run_starts_at_the_first_usable_scan(sequence, caplog):
     few = Scan(int(sequence.stamps_ns[1]), np.ones((5, 3), np.float32))
     bad = {0: DataError("scans/0.bin: no such scan"), 1: few, 12: DataError("scans/12.bin: truncated")}
     with caplog.at_level(logging.WARNING, logger="hybridlio"):
@@ -101,7 +101,7 @@ def test_the_run_starts_at_the_first_scan_that_can_be_used(sequence, caplog):
     assert "scans/0.bin: no such scan" in caplog.text
 
 
-def test_a_recording_without_a_single_usable_scan_ends_in_an_error_that_says_why(sequence):
+def test_a_recording_without_usable_scan_ends_with_the_reason(sequence):
     bad = {k: DataError(f"scans/{k}.bin: truncated") for k in range(len(sequence))}
     for residual in ("scan-matching", "none"):
         run = run_odometry(with_scans(sequence, bad), Odometry(residual=residual))
@@ -110,7 +110,7 @@ def test_a_recording_without_a_single_usable_scan_ends_in_an_error_that_says_why
         assert "scans/0.bin: truncated" in str(run.stopped)
 
 
-def test_an_interrupt_keeps_what_was_estimated(whole, sequence):
+def test_an_interrupt_keeps_the_estimates(whole, sequence):
     def interrupt(stage: str, done: int, total: int) -> None:
         if done == 9:
             raise KeyboardInterrupt
@@ -123,8 +123,8 @@ def test_an_interrupt_keeps_what_was_estimated(whole, sequence):
 
 
 @pytest.mark.parametrize("within", [LoopKeyframeSelector.offer, PackedCloud.of, Recorder.add, Odometry.step])
-def test_an_interrupt_at_the_end_of_any_bookkeeping_leaves_a_run_that_can_be_smoothed(within, sequence, tmp_path):
-    """When a call returns for the seventh time, its work done, and its caller's not."""
+def test_an_interrupt_inside_the_bookkeeping_leaves_a_run_that_can_be_smoothed(within, sequence, tmp_path):
+    """The interrupt comes at the seventh return of the function, before its caller uses the result."""
     returned = iter(range(1, 100))
 
     def tracer(frame, event, _arg):
@@ -150,7 +150,7 @@ def test_an_interrupt_at_the_end_of_any_bookkeeping_leaves_a_run_that_can_be_smo
 
 
 class Failing(NoResidual):
-    """Raises at frame 8."""
+    """A residual source that raises an error at frame 8."""
 
     def __init__(self, error: BaseException) -> None:
         self._error = error
@@ -161,15 +161,15 @@ class Failing(NoResidual):
         return initial
 
 
-@pytest.mark.parametrize("error", [GraphError("no"), ValueError("a fault"), KeyboardInterrupt()])
-def test_trouble_in_the_middle_of_a_step_keeps_the_steps_before_and_nothing_of_it(error, sequence):
+@pytest.mark.parametrize("error", [GraphError("no"), ValueError("a bug"), KeyboardInterrupt()])
+def test_an_error_within_a_step_keeps_the_steps_before_it_only(error, sequence):
     run = run_odometry(sequence, Odometry(residual=Failing(error)))
     assert run.stopped is error
     assert run.done == 8
     assert run.record.imu.stamps_ns[-1] == run.record.online.stamps_ns[-1] == sequence.stamps_ns[7]
 
 
-def test_less_than_two_estimates_are_no_record(sequence):
+def test_fewer_than_two_estimates_have_no_record(sequence):
     run = run_odometry(sequence.part(0, 1), Odometry(config=Config(residual="none")))
     assert run.done == 1
     assert run.record is None
@@ -178,7 +178,7 @@ def test_less_than_two_estimates_are_no_record(sequence):
 
 
 @pytest.mark.parametrize(("text", "rows"), [("5:9", (5, 9)), ("20:", (20, 25)), (":4", (0, 4)), ("-3:", (22, 25))])
-def test_part_of_a_recording_is_the_same_frames_in_the_first_ones_frame(text, rows, sequence):
+def test_part_of_a_recording_has_the_same_frames_relative_to_its_first(text, rows, sequence):
     part = part_of(sequence, text)
     start, stop = rows
     assert part.stamps_ns.tolist() == sequence.stamps_ns[start:stop].tolist()
@@ -189,35 +189,35 @@ def test_part_of_a_recording_is_the_same_frames_in_the_first_ones_frame(text, ro
     assert len(part.forward_speed_m_s) == stop - start
 
 
-def test_without_a_range_the_recording_is_whole(sequence):
+def test_without_a_range_the_whole_recording_is_used(sequence):
     assert part_of(sequence, None) is sequence
 
 
 @pytest.mark.parametrize(
     ("text", "error"), [("5", ConfigError), ("1:2:3", ConfigError), ("a:b", ConfigError), ("9:9", DataError)]
 )
-def test_a_range_that_is_none_or_holds_no_scan_is_refused(text, error, sequence):
+def test_a_malformed_or_empty_range_is_an_error(text, error, sequence):
     with pytest.raises(error, match=r"range such as|no scans in"):
         part_of(sequence, text)
 
 
-def test_an_imu_that_many_scans_contradict_is_named_as_what_may_be_wrong(whole):
+def test_many_conflicts_with_the_imu_add_a_note_to_check_its_data(whole):
     estimates = list(whole.estimates)
-    for count, told in ((1, False), (5, True)):
+    for count, has_hint in ((1, False), (5, True)):
         doubted = [replace(e, gate=GateResult("trusted again", 1e3)) for e in estimates[-count:]]
-        said = notes(replace(whole, estimates=[*estimates[:-count], *doubted]))
-        assert f"{count} scan" in said[0]
-        assert ("check T_imu_lidar, units and clock" in said[-1]) == told
+        lines = notes(replace(whole, estimates=[*estimates[:-count], *doubted]))
+        assert f"{count} scan" in lines[0]
+        assert ("check T_imu_lidar, units and clock" in lines[-1]) == has_hint
 
 
-def test_fixes_by_another_clock_stay_with_the_run_for_smoothing_to_place(sequence):
+def test_gps_fixes_shortly_before_and_after_the_run_are_kept_for_smoothing(sequence):
     stamps = [sequence.stamps_ns[0] + round(seconds * 1e9) for seconds in (-40, -18, 1, 18, 40)]
     fixes = tuple(GpsFix(int(stamp), np.zeros(3), np.eye(3)) for stamp in stamps)
     run = run_odometry(replace(sequence, gps=fixes), Odometry(residual="none"))
     assert run.record.gps == fixes[1:4]
 
 
-def test_a_scan_that_is_delivered_twice_is_bridged_and_told(sequence, caplog):
+def test_a_scan_delivered_twice_is_bridged_and_logged(sequence, caplog):
     again = with_scans(sequence, {6: replace(sequence.load_scan(5), stamp_ns=int(sequence.stamps_ns[6]))})
     run = run_odometry(again, Odometry())
     assert run.bridged == [6]

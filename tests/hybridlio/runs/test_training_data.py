@@ -1,4 +1,4 @@
-"""Recordings become shards once, for whom they are, and whoever asks at the same time waits."""
+"""Recordings are prepared once as shards, also by concurrent processes."""
 
 import json
 import subprocess
@@ -37,30 +37,30 @@ def given(tiny_drive, options):
 
 def test_a_recording_is_prepared_once_and_found_again(tiny_drive, options, given):
     stamp = (given.folder / "shard.json").stat().st_mtime_ns
-    told = []
-    again = prepare_shards([tiny_drive], GIVEN, options, lambda *where: told.append(where))
+    reports = []
+    again = prepare_shards([tiny_drive], GIVEN, options, lambda *where: reports.append(where))
     assert [shard.folder for shard in again] == [given.folder]
     assert (given.folder / "shard.json").stat().st_mtime_ns == stamp
-    assert told == []
+    assert reports == []
     assert len(given) == len(open_sequence(tiny_drive))
 
 
-def test_the_folder_of_shards_and_a_shard_itself_are_data_too(options, given):
+def test_shards_and_folders_of_shards_are_accepted_as_data(options, given):
     assert given.folder in [shard.folder for shard in prepare_shards([options.cache], GIVEN, options)]
     assert [shard.folder for shard in prepare_shards([given.folder], GIVEN, options)] == [given.folder]
 
 
-def test_given_initial_poses_are_those_of_an_odometry_run_and_not_the_truth(tiny_drive, given):
+def test_given_initial_poses_come_from_an_odometry_run_and_not_from_the_reference(tiny_drive, given):
     sequence = open_sequence(tiny_drive)
     true = se3.between(sequence.reference.poses[:-1], sequence.reference.poses[1:])
     off = np.linalg.norm(se3.log(se3.between(given.initial[3:], true[2:]))[:, 3:], axis=1)
     assert off.min() > 1e-5
     assert off.max() < 0.15
-    # nothing is known of the speed at the first step
+    # the speed is unknown at the first step
     assert np.isnan(given.initial[:2]).all()
 
 
-def test_the_velocity_is_that_of_the_step_that_odometry_found(tiny_drive, given):
+def test_the_velocity_comes_from_the_steps_of_the_odometry(tiny_drive, given):
     sequence = open_sequence(tiny_drive)
     true = se3.between(sequence.reference.poses[:-1], sequence.reference.poses[1:])
     ahead = np.array([T[:3, :3].T @ T[:3, 3] for T in true]) / 0.1
@@ -68,7 +68,7 @@ def test_the_velocity_is_that_of_the_step_that_odometry_found(tiny_drive, given)
     assert not np.allclose(given.velocity_m_s[3:], ahead[1:-1], atol=1e-4)
 
 
-def test_a_step_that_scans_do_not_tell_gives_no_velocity(tiny_drive, tmp_path, monkeypatch):
+def test_a_poorly_constrained_step_gives_no_velocity(tiny_drive, tmp_path, monkeypatch):
     def half_blind(*args):
         run = run_odometry(*args)
         lost = [replace(e, relative=e.relative.wider(added=np.eye(6))) if e.index == 4 else e for e in run.estimates]
@@ -77,7 +77,7 @@ def test_a_step_that_scans_do_not_tell_gives_no_velocity(tiny_drive, tmp_path, m
     monkeypatch.setattr(training_data, "run_odometry", half_blind)
     shard = prepare_shards([tiny_drive], MOVING, DataOptions(tmp_path))[0]
     known = np.isfinite(shard.velocity_m_s).all(axis=1)
-    assert not known[5]  # at the scan that the fourth step leads to
+    assert not known[5]  # the fourth step leads to this scan
     assert known[2:5].all()
     assert known[6:].all()
 
@@ -86,7 +86,7 @@ def later_larger(scan: Scan, k: int) -> Scan:
     return scan if k == 0 else replace(scan, points=1.1 * scan.points)
 
 
-def test_another_drive_other_cells_or_another_source_have_another_name(tiny_drive):
+def test_shard_names_differ_by_data_geometry_and_source(tiny_drive):
     sequence = open_sequence(tiny_drive)
     names = {
         shard_name(sequence, RECIPE),
@@ -110,38 +110,38 @@ def test_another_drive_other_cells_or_another_source_have_another_name(tiny_driv
     }
     assert len(others - names) == 4
     assert shard_name(sequence, GIVEN, "preintegration") == shard_name(sequence, MOVING) == shard_name(sequence, GIVEN)
-    # a network that is told of neither needs no odometry, whatever its source is called
+    # a network without initial pose and velocity as input needs no odometry, so that its source does not matter
     assert shard_name(sequence, RECIPE, "kalman") == shard_name(sequence, RECIPE)
 
 
-def test_processes_that_ask_at_once_get_one_shard(tiny_drive, tmp_path, project_root):
+def test_concurrent_processes_prepare_a_shard_once(tiny_drive, tmp_path, project_root):
     code = (
         "import sys; from pathlib import Path\n"
         "from hybridlio.learned.settings import NetworkSettings, Recipe\n"
         "from hybridlio.cloud.projection import MAP_GEOMETRIES\n"
         "from hybridlio.runs.training_data import DataOptions, prepare_shards\n"
-        "told = []\n"
+        "reports = []\n"
         "recipe = Recipe(network=NetworkSettings(geometry=MAP_GEOMETRIES['16-beam']))\n"
         "shards = prepare_shards([Path(sys.argv[1])], recipe,\n"
-        "                   DataOptions(Path(sys.argv[2])), lambda *where: told.append(where))\n"
-        "print(len(shards[0]), bool(told))\n"
+        "                   DataOptions(Path(sys.argv[2])), lambda *where: reports.append(where))\n"
+        "print(len(shards[0]), bool(reports))\n"
     )
     command = [sys.executable, "-c", code, str(tiny_drive), str(tmp_path / "cache")]
     both = [subprocess.Popen(command, cwd=project_root, stdout=subprocess.PIPE, text=True) for _ in range(2)]
-    said = sorted(process.communicate(timeout=120)[0].split() for process in both)
-    assert said == [["25", "False"], ["25", "True"]]
+    output = sorted(process.communicate(timeout=120)[0].split() for process in both)
+    assert output == [["25", "False"], ["25", "True"]]
     assert len(list((tmp_path / "cache").glob("*/shard.json"))) == 1
 
 
-def test_a_place_without_recordings_is_named(tmp_path, options):
+def test_the_error_for_a_path_without_recordings_names_it(tmp_path, options):
     with pytest.raises(DataError, match="nowhere"):
         prepare_shards([tmp_path / "nowhere"], RECIPE, options)
 
 
-def test_an_unknown_split_is_refused(tiny_drive, options):
+def test_an_unknown_split_is_an_error(tiny_drive, options):
     with pytest.raises(ConfigError, match="easy, hard"):
         training_pairs([tiny_drive], None, "middling", RECIPE, options)
 
 
-def test_a_shard_says_where_its_initial_poses_come_from(given):
+def test_a_shard_records_the_source_of_its_initial_poses(given):
     assert "preintegration" in json.loads((given.folder / "shard.json").read_text())["made_by"]
