@@ -1,7 +1,7 @@
 """Use your own source of initial poses: wheel speed and a gyroscope.
 
-A source is any object with a name, `predict` and `correct`; it is neither registered nor inherited. Here, the wheel speed
-is the forward speed of the recording's navigation system.
+A source is any object with a name, `predict` and `correct`; it is neither registered nor inherited. Here, the wheel
+speed is the forward speed of the recording's navigation system.
 
     python examples/own_initial_pose_source.py [FOLDER] [SECONDS]
 """
