@@ -12,7 +12,7 @@ Recordings:
     simulate           simulate a drive as KITTI raw data, as SimulationConfig says
 
 Estimation:
-    Odometry           estimates frame by frame; Config has its settings
+    Odometry           estimates frame by frame; Config has its settings, load_config reads them from a YAML file
     Estimate           the result of a step: pose, covariance and how they came about
     smooth             smooth a finished run (odometry.record()) over its whole length, with loops and GPS
     run_batch          run many recordings in parallel, as BatchOptions says; each is a Recording, the result a Batch
@@ -44,7 +44,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time each name l
     from hybridlio.datasets.sequence import Sequence
     from hybridlio.evaluation.evaluate import evaluate
     from hybridlio.graph.run.smooth import smooth
-    from hybridlio.odometry.config import Config
+    from hybridlio.odometry.config import Config, load_config
     from hybridlio.odometry.estimate import Estimate
     from hybridlio.odometry.odometry import Odometry
     from hybridlio.runs.batch import BatchOptions, run_batch
@@ -75,6 +75,7 @@ __all__ = [
     "__version__",
     "evaluate",
     "find_recordings",
+    "load_config",
     "open_sequence",
     "run_batch",
     "simulate",
@@ -90,7 +91,7 @@ _HOMES = {
     "datasets.sequence": ("Sequence",),
     "evaluation.evaluate": ("evaluate",),
     "graph.run.smooth": ("smooth",),
-    "odometry.config": ("Config",),
+    "odometry.config": ("Config", "load_config"),
     "odometry.estimate": ("Estimate",),
     "odometry.odometry": ("Odometry",),
     "runs.batch": ("BatchOptions", "run_batch"),

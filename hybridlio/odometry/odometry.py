@@ -44,9 +44,7 @@ class Odometry:
     ) -> None:
         config = config or Config()
         if not isinstance(config, Config):
-            raise ConfigError(
-                f"config must be a Config, got {config!r}; hybridlio.odometry.config.load_config reads one from a file"
-            )
+            raise ConfigError(f"config must be a Config, got {config!r}; hybridlio.load_config reads one from a file")
         self._config = config
         self._chosen = (initial_pose or config.initial_pose, residual or config.residual, backend or config.backend)
         check_names(*self._chosen)

@@ -38,3 +38,9 @@ def test_every_public_name_is_that_of_its_module(name):
 def test_an_unknown_name_raises_an_attribute_error_that_names_it():
     with pytest.raises(AttributeError, match="open_squence"):
         _ = hybridlio.open_squence
+
+
+def test_a_configuration_file_is_read_by_its_path_as_text(tmp_path: Path):
+    path = tmp_path / "my.yaml"
+    path.write_text("residual: none\n")
+    assert hybridlio.load_config(str(path)) == hybridlio.Config(residual="none")
