@@ -1,13 +1,13 @@
-"""Recipes by name: the published set-up, what ships, every row of tables 2 to 5, and the methods compared with there.
+"""Recipes by name: the paper's set-up, the shipped ones, and the rows of the paper's tables.
 
-Source: UnDeepLIO, "Implementation Details" and "Ablation Study". What the paper leaves open (sizes of the LSTMs and of
-the encoder, how many epochs) stands at the defaults of :mod:`hybridlio.learned.settings`, the same in every row.
+Source: UnDeepLIO, "Implementation Details" and "Ablation Study". Sizes that the paper does not state (LSTMs, encoder,
+number of epochs) are the defaults of :mod:`hybridlio.learned.settings`, the same in every row.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
@@ -16,9 +16,9 @@ from hybridlio.core.errors import ConfigError
 from hybridlio.learned.settings import LossSettings, NetworkSettings, OptimiserSettings, Recipe
 
 PAPER = Recipe("paper", NetworkSettings(), LossSettings(normal_thin_m=0.0), OptimiserSettings())
-"""The published set-up: shared weights where it says siamese, Euler angles, one pass, sums, Adam with halved steps.
+"""The paper's set-up: shared weights in siamese parts, Euler angles, one pass, summed loss, Adam with halved steps.
 
-Where the text cannot be meant as printed, ``paper-element-wise`` and ``paper-rows-as-printed`` follow it to the letter.
+Where the text can hardly be meant as printed, ``paper-element-wise`` and ``paper-rows-as-printed`` follow it literally.
 """
 
 
@@ -114,9 +114,9 @@ PUBLISHED = Recipe(
     ),
 )
 """The published method without any registration step, reduced so that a CPU can train it: siamese LSTMs, a siamese
-ResNet encoder of vertex and normal maps, pooling, attention and ``T = δT·T̂``, taught by the paper's loss alone.
+ResNet encoder of vertex and normal maps, pooling, attention and ``T = δT·T̂``, trained by the paper's loss alone.
 
-Each departure from ``paper`` is in docs/learned.md.
+docs/concepts/one_loss.md lists each departure from ``paper``.
 """
 
 _ENCODER: Mapping[str, Any] = MappingProxyType(
@@ -161,7 +161,7 @@ DEPARTURES = (
     ),
     replace(DEFAULT, name="default-halved", optimiser=replace(DEFAULT.optimiser, schedule="step")),
 )
-"""``default``, and what becomes of it without each of its departures from ``paper``, or with one more."""
+"""``default``, and ``default`` without one of its departures from ``paper`` or with one more."""
 
 _ALL = (
     PAPER,
@@ -191,119 +191,19 @@ _ALL = (
 PRESETS: Mapping[str, Recipe] = MappingProxyType({recipe.name: recipe for recipe in _ALL})
 """Every preset by name.
 
-``cho`` and ``nubert`` are the two predecessors as the paper describes them, on this encoder: the former with same-pixel
-matching and the distance to planes alone, the latter with nearest neighbours among the projected points and both terms,
-from vertices alone. ``without-point-to-plane`` leaves translations without any gradient: the difference of normals does
-not change with them.
-"""
-
-
-SPLITS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = MappingProxyType(
-    {
-        "easy": (tuple(f"{n:02}" for n in range(9)), ("09", "10")),
-        "hard": (tuple(f"{n:02}" for n in range(7)), ("07", "08", "09", "10")),
-    }
-)
-"""KITTI odometry sequences to train on and to test on, by the split's name."""
-
-
-@dataclass(frozen=True)
-class TableRow:
-    """A row of one of the paper's tables.
-
-    Attributes:
-        published: its name there, as in the published figures.
-        preset: the name of what it compares.
-        split: of KITTI odometry, where a table has rows of both; else the one that is asked for.
-    """
-
-    published: str
-    preset: str
-    split: str | None = None
-
-    @property
-    def name(self) -> str:
-        """Its own among the table's rows."""
-        return self.preset if self.split is None else f"{self.preset}-{self.split}"
-
-
-TABLES: Mapping[int, tuple[TableRow, ...]] = MappingProxyType(
-    {
-        1: (
-            TableRow("Nubert et al.", "nubert", "easy"),
-            TableRow("Cho et al.", "cho", "easy"),
-            TableRow("Ours-easy", "no-imu", "easy"),
-            TableRow("Ours-easy+imu", "paper", "easy"),
-            TableRow("Ours-hard", "no-imu", "hard"),
-            TableRow("Ours-hard+imu", "paper", "hard"),
-        ),
-        2: (
-            TableRow("imu(w preprocess)", "paper"),
-            TableRow("imu(w/o preprocess)", "imu-feature"),
-            TableRow("noimu", "no-imu"),
-        ),
-        3: (
-            TableRow("imu(w normal, w dist)", "paper"),
-            TableRow("imu(w normal, w/o dist)", "normals-joined"),
-            TableRow("imu(w/o normal, w/o dist)", "normals-none"),
-            TableRow("noimu(w normal, w dist)", "no-imu"),
-            TableRow("noimu(w normal, w/o dist)", "no-imu-normals-joined"),
-            TableRow("noimu(w/o normal, w/o dist)", "no-imu-normals-none"),
-        ),
-        4: (
-            TableRow("imu(w attention)", "paper"),
-            TableRow("imu(w fc+activation)", "mlp"),
-            TableRow("noimu(w attention)", "no-imu"),
-            TableRow("noimu(w fc+activation)", "no-imu-mlp"),
-        ),
-        5: (
-            TableRow("imu(w point-to-plane))+point-to-point", "paper"),
-            TableRow("imu(w/o point-to-plane)+point-to-point", "without-plane-to-plane"),
-            TableRow("imu(w point-to-plane)+pixel-to-pixel", "same-pixel"),
-            TableRow("noimu(w point-to-plane)+point-to-point", "no-imu"),
-            TableRow("noimu(w/o point-to-plane)+point-to-point", "no-imu-without-plane-to-plane"),
-            TableRow("noimu(w point-to-plane))+pixel-to-pixel", "no-imu-same-pixel"),
-        ),
-    }
-)
-"""Rows of tables 1 to 5 that are presets. The others of table 1 have published figures alone.
-
-Table 5's "w/o point-to-plane" is taken as without plane-to-plane: without the distance to planes nothing would teach a
-translation, yet its published drift is 2 %; the paper mixes up the two names in its overall loss as well. The literal
-reading is the preset ``without-point-to-plane``.
+``cho`` and ``nubert`` are the two predecessors as the paper describes them, with this encoder: the first matches the
+same pixel and minimises the distance to planes only; the second sees vertices only, matches nearest neighbours among
+the projected points and minimises both terms. ``without-point-to-plane`` gives translations no gradient, because the
+difference of normals does not depend on them.
 """
 
 
 def preset(name: str) -> Recipe:
-    """The recipe of a name.
+    """Return the recipe of a preset.
 
     Raises:
-        ConfigError: there is none; lists those there are.
+        ConfigError: the preset is unknown; lists the known ones.
     """
     if name not in PRESETS:
-        raise ConfigError(f"no preset named {name!r}; there are {', '.join(PRESETS)}")
+        raise ConfigError(f"unknown preset {name!r}; choose one of {', '.join(PRESETS)}")
     return PRESETS[name]
-
-
-def split(name: str, network: NetworkSettings) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """KITTI odometry sequences to train on and to test on; 03, which has no IMU, is left out where one is needed.
-
-    Raises:
-        ConfigError: there is no such split.
-    """
-    if name not in SPLITS:
-        raise ConfigError(f"no split named {name!r}; there are {', '.join(SPLITS)}")
-    train, test = SPLITS[name]
-    needs_imu = network.imu in ("initial-pose", "feature")
-    return tuple(s for s in train if not (needs_imu and s == "03")), test
-
-
-def table(number: int) -> tuple[TableRow, ...]:
-    """The rows of one of the paper's comparisons.
-
-    Raises:
-        ConfigError: it is not one of tables 1 to 5.
-    """
-    if number not in TABLES:
-        raise ConfigError(f"no comparison in table {number}; there are tables {', '.join(map(str, TABLES))}")
-    return TABLES[number]

@@ -19,7 +19,7 @@ from hybridlio.core.errors import ConfigError, HybridLioError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from hybridlio.learned.presets import TableRow
+    from hybridlio.learned.paper_tables import TableRow
     from hybridlio.learned.settings import Recipe
     from hybridlio.learned.training.ablation import RowData, RowResult
     from hybridlio.learned.training.comparison import Line
@@ -85,8 +85,9 @@ def ablate(
 
 def _choose_rows(number: int, presets: tuple[str, ...] | None, split: str | None) -> list[TableRow]:
     """Return the rows to train: with a split, all of them; without one, one row per preset, whatever its split."""
-    from hybridlio.learned.presets import preset, table
-    from hybridlio.learned.presets import split as sequences_of
+    from hybridlio.learned.paper_tables import split as sequences_of
+    from hybridlio.learned.paper_tables import table
+    from hybridlio.learned.presets import preset
 
     rows = [row for row in table(number) if presets is None or row.preset in presets]
     if not rows:

@@ -12,7 +12,8 @@ from hybridlio.cloud.projection import map_geometry
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.files import read_yaml
 from hybridlio.learned.presets import preset
-from hybridlio.learned.settings import Recipe, from_dict, to_dict
+from hybridlio.learned.setting_values import from_dict, to_dict
+from hybridlio.learned.settings import Recipe
 
 if TYPE_CHECKING:
     from hybridlio.learned.networks.weights import Weights

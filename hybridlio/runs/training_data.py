@@ -32,7 +32,7 @@ from hybridlio.datasets.sequence import Sequence
 from hybridlio.learned.data.pairs import Pairs
 from hybridlio.learned.data.preparing import KnownMotion, prepare_shard
 from hybridlio.learned.data.shards import FORMAT, Shard
-from hybridlio.learned.presets import split as sequences_of
+from hybridlio.learned.paper_tables import split as sequences_of
 from hybridlio.learned.settings import NetworkSettings, Recipe
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.odometry import Odometry

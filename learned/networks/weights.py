@@ -18,7 +18,8 @@ from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.files import write_atomically
 from hybridlio.core.version import __version__
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
-from hybridlio.learned.settings import NetworkSettings, Recipe, from_dict, to_dict
+from hybridlio.learned.setting_values import from_dict, to_dict
+from hybridlio.learned.settings import NetworkSettings, Recipe
 from hybridlio.learned.source_settings import SHIPPED
 
 _LISTED = 6  # mismatches that a message names

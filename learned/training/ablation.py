@@ -15,7 +15,8 @@ from hybridlio.core.errors import ConfigError
 from hybridlio.core.files import write_atomically
 from hybridlio.learned.data.pairs import Pairs
 from hybridlio.learned.data.shards import Shard
-from hybridlio.learned.settings import Recipe, from_dict, to_dict
+from hybridlio.learned.setting_values import from_dict, to_dict
+from hybridlio.learned.settings import Recipe
 from hybridlio.learned.training import checkpoints
 from hybridlio.learned.training.driving import drive
 from hybridlio.learned.training.train import RunOptions, TrainingProgress, Watchers, train

@@ -15,7 +15,8 @@ from torch.optim import Optimizer
 
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.files import write_atomically
-from hybridlio.learned.settings import Recipe, from_dict, to_dict
+from hybridlio.learned.setting_values import from_dict, to_dict
+from hybridlio.learned.settings import Recipe
 
 FORMAT = 1
 

@@ -28,7 +28,8 @@ from hybridlio.learned.data.pairs import PairBatch, Pairs
 from hybridlio.learned.losses.loss import LossValue
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
 from hybridlio.learned.networks.weights import put_weights, save_weights
-from hybridlio.learned.settings import Recipe, to_dict
+from hybridlio.learned.setting_values import to_dict
+from hybridlio.learned.settings import Recipe
 from hybridlio.learned.training import checkpoints
 from hybridlio.learned.training.best_weights import BestWeights
 from hybridlio.learned.training.checkpoints import Checkpoint

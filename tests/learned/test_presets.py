@@ -6,8 +6,10 @@ import torch
 
 from hybridlio.core.errors import ConfigError
 from hybridlio.learned.networks.odometry_network import OdometryNetwork, parameter_count
-from hybridlio.learned.presets import PAPER, PRESETS, TABLES, preset, split, table
-from hybridlio.learned.settings import LossSettings, NetworkSettings, OptimiserSettings, Recipe, from_dict, to_dict
+from hybridlio.learned.paper_tables import TABLES, split, table
+from hybridlio.learned.presets import PAPER, PRESETS, preset
+from hybridlio.learned.setting_values import from_dict, to_dict
+from hybridlio.learned.settings import LossSettings, NetworkSettings, OptimiserSettings, Recipe
 from hybridlio.learned.training.published import published
 
 

@@ -129,7 +129,7 @@ def test_the_error_for_weights_of_another_shape_names_the_tensor(tiny_drive, tra
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (("--preset", "papr"), "no preset named 'papr'"),
+        (("--preset", "papr"), "unknown preset 'papr'"),
         (("--steps", "3", "--epochs", "2"), "--epochs"),
         (("--device", "abacus"), "abacus"),
         (("--init-from", "absent.safetensors"), "absent.safetensors"),

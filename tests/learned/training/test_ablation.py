@@ -9,7 +9,8 @@ from hybridlio.core import se3
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.learned.data.pairs import Pairs
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
-from hybridlio.learned.presets import PRESETS, TABLES
+from hybridlio.learned.paper_tables import TABLES
+from hybridlio.learned.presets import PRESETS
 from hybridlio.learned.training.ablation import RowData, RowResult, reduced, run_rows
 from hybridlio.learned.training.driving import drift_of, drive
 from hybridlio.learned.training.train import RunOptions

@@ -3,7 +3,7 @@ import csv
 import pytest
 
 from hybridlio.core.errors import ConfigError
-from hybridlio.learned.presets import TABLES
+from hybridlio.learned.paper_tables import TABLES
 from hybridlio.learned.training.published import published
 
 

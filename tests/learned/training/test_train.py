@@ -13,7 +13,8 @@ from hybridlio.core.errors import ConfigError, DataError, EstimationError
 from hybridlio.learned.data.pairs import Pairs
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
 from hybridlio.learned.networks.weights import load_weights
-from hybridlio.learned.settings import OptimiserSettings, to_dict
+from hybridlio.learned.setting_values import to_dict
+from hybridlio.learned.settings import OptimiserSettings
 from hybridlio.learned.training import checkpoints
 from hybridlio.learned.training.schedule import epoch_order, learning_rate
 from hybridlio.learned.training.train import RunOptions, Watchers, train
@@ -80,7 +81,8 @@ def test_two_processes_agree_with_one_on_the_same_batches(rooms, room_shards, ti
     script.write_text(
         "import json, sys, torch\n"
         "from hybridlio.learned.data.pairs import Pairs\n"
-        "from hybridlio.learned.settings import Recipe, from_dict\n"
+        "from hybridlio.learned.setting_values import from_dict\n"
+        "from hybridlio.learned.settings import Recipe\n"
         "from hybridlio.learned.data.shards import Shard\n"
         "from hybridlio.learned.training.train import RunOptions, train\n"
         "torch.set_num_threads(1)\n"
