@@ -27,8 +27,9 @@ from hybridlio.core.sensors import LIDAR_MODELS, Calibration, ImuSamples, LidarM
 from hybridlio.core.trajectory_files import read_tum
 from hybridlio.datasets.gps_csv import note_fixes, read_gps_csv
 from hybridlio.datasets.imu_csv import read_imu_csv
+from hybridlio.datasets.kitti.vertical_angle import raised
 from hybridlio.datasets.notes import Notes
-from hybridlio.datasets.point_files import SUFFIXES, read_scan
+from hybridlio.datasets.points.point_files import SUFFIXES, read_scan
 from hybridlio.datasets.reference import poses_at
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.datasets.stamps import (
@@ -39,7 +40,6 @@ from hybridlio.datasets.stamps import (
     read_stamps,
     usable_scans,
 )
-from hybridlio.datasets.vertical_angle import raised
 
 LAYOUT = "a folder with timestamps.txt, and scans .bin, .npy, .pcd or .ply in it or in scans/"
 

@@ -11,11 +11,12 @@ from pathlib import Path
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.tables import counted
-from hybridlio.datasets import folder, kitti_odometry, kitti_raw
+from hybridlio.datasets import folder
 from hybridlio.datasets.imu_faults import without_spikes
+from hybridlio.datasets.kitti import odometry, raw
+from hybridlio.datasets.kitti.vertical_angle import check_angle
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.datasets.vertical_angle import check_angle
 
 
 @dataclass(frozen=True)
@@ -35,8 +36,8 @@ class Reader:
 
 
 READERS: dict[str, Reader] = {  # tried in this order
-    "kitti-raw": Reader(kitti_raw.LAYOUT, kitti_raw.find, kitti_raw.open_drive),
-    "kitti-odometry": Reader(kitti_odometry.LAYOUT, kitti_odometry.find, kitti_odometry.open_sequence_folder),
+    "kitti-raw": Reader(raw.LAYOUT, raw.find, raw.open_drive),
+    "kitti-odometry": Reader(odometry.LAYOUT, odometry.find, odometry.open_sequence_folder),
     "folder": Reader(folder.LAYOUT, folder.find, folder.open_folder),
 }
 

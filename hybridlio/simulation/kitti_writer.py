@@ -79,7 +79,7 @@ def oxts_rows(motion: Motion, origin_m: Array, gyro_rad_s: Array, accel_m_s2: Ar
     """Return navigation rows ``(N, 30)``: exact, except for the inertial columns, which are given.
 
     Latitude and longitude are the inverse of KITTI's Mercator projection at the first row's latitude
-    (:mod:`hybridlio.datasets.oxts`).
+    (:mod:`hybridlio.datasets.kitti.oxts`).
 
     Args:
         motion: of the IMU at ``N`` times.

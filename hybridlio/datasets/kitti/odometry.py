@@ -19,8 +19,8 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import Calibration, ImuSamples
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.core.trajectory_files import read_kitti
-from hybridlio.datasets.drive_imu import drive_imu
-from hybridlio.datasets.kitti_files import (
+from hybridlio.datasets.kitti.drive_imu import drive_imu
+from hybridlio.datasets.kitti.files import (
     KITTI_LIDAR,
     BinScans,
     numbered,
@@ -28,11 +28,11 @@ from hybridlio.datasets.kitti_files import (
     read_drive_calibration,
     rows_of,
 )
+from hybridlio.datasets.kitti.oxts import read_oxts
+from hybridlio.datasets.kitti.vertical_angle import kitti_raised
 from hybridlio.datasets.notes import Notes
-from hybridlio.datasets.oxts import read_oxts
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.datasets.stamps import SCAN_GAP_FACTOR, note_coverage, note_gaps, read_stamps, usable_scans
-from hybridlio.datasets.vertical_angle import kitti_raised
 
 LAYOUT = (
     "a sequence folder with velodyne/NNNNNN.bin and times.txt, or the folder above it, or its sequences/ beside poses/"
@@ -85,7 +85,7 @@ def open_sequence_folder(
             raw drive that the sequence was cut from, shifted to the sequence's clock. Without it there are no samples,
             and ``T_imu_lidar`` is the identity.
         vertical_angle_deg: angle by which points are raised; by default KITTI's known error if the sequence is KITTI's
-            own, else 0 (:mod:`hybridlio.datasets.vertical_angle`).
+            own, else 0 (:mod:`hybridlio.datasets.kitti.vertical_angle`).
 
     Raises:
         DataError: no scans, too few stamps or poses, stamps that do not increase, a missing calibration, or a missing

@@ -14,7 +14,7 @@ from hybridlio.core import se3
 from hybridlio.core.errors import DataError
 from hybridlio.core.trajectory_files import read_kitti, write_kitti
 from hybridlio.datasets import open_sequence
-from hybridlio.datasets.kitti_odometry import RAW_DRIVES
+from hybridlio.datasets.kitti.odometry import RAW_DRIVES
 
 MS = 1_000_000
 

@@ -17,8 +17,8 @@ from hybridlio.core.arrays import Array, Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.geodesy import EARTH_RADIUS_M
 from hybridlio.core.sensors import NS_PER_S, ImuSamples
-from hybridlio.datasets.gyro_lag import SLOW_ROWS_S, gyro_lag_ns
-from hybridlio.datasets.kitti_files import numbered
+from hybridlio.datasets.kitti.files import numbered
+from hybridlio.datasets.kitti.gyro_lag import SLOW_ROWS_S, gyro_lag_ns
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.stamps import IMU_GAP_FACTOR, MISSING_STAMP, note_gaps, read_stamps, sorted_unique
 
@@ -61,7 +61,7 @@ class OxtsRows:
 
     @property
     def gyro_lag_ns(self) -> int:
-        """Lag of the angular rates against the attitudes (:func:`hybridlio.datasets.gyro_lag.gyro_lag_ns`)."""
+        """Lag of the angular rates against the attitudes (:func:`hybridlio.datasets.kitti.gyro_lag.gyro_lag_ns`)."""
         known = np.isfinite(self.values[:, _ATTITUDE]).all(axis=1)
         values = self.values[known]
         return gyro_lag_ns(self.stamps_ns[known], values[:, _ATTITUDE], values[:, _GYRO])

@@ -15,9 +15,9 @@ from scipy.integrate import trapezoid
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import ImuSamples
 from hybridlio.datasets import open_sequence
-from hybridlio.datasets.kitti_raw import find
+from hybridlio.datasets.kitti.oxts import read_oxts
+from hybridlio.datasets.kitti.raw import find
 from hybridlio.datasets.notes import Notes
-from hybridlio.datasets.oxts import read_oxts
 
 MS = 1_000_000
 

@@ -26,9 +26,9 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import Calibration
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.core.trajectory_files import read_kitti
-from hybridlio.datasets.drive_imu import drive_imu, fast_rows
 from hybridlio.datasets.gps_csv import note_fixes, read_gps_csv
-from hybridlio.datasets.kitti_files import (
+from hybridlio.datasets.kitti.drive_imu import drive_imu, fast_rows
+from hybridlio.datasets.kitti.files import (
     KITTI_LIDAR,
     BinScans,
     calibration_file,
@@ -38,8 +38,9 @@ from hybridlio.datasets.kitti_files import (
     read_simulation,
     rows_of,
 )
+from hybridlio.datasets.kitti.oxts import OxtsRows, read_oxts
+from hybridlio.datasets.kitti.vertical_angle import kitti_raised
 from hybridlio.datasets.notes import Notes
-from hybridlio.datasets.oxts import OxtsRows, read_oxts
 from hybridlio.datasets.reference import poses_at
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.datasets.stamps import (
@@ -50,7 +51,6 @@ from hybridlio.datasets.stamps import (
     read_stamps,
     usable_scans,
 )
-from hybridlio.datasets.vertical_angle import kitti_raised
 
 LAYOUT = "a drive folder with velodyne_points/data/NNNNNNNNNN.bin, or the date or root folder above it"
 
@@ -73,13 +73,13 @@ def open_drive(drive: Path, raw_root: Path | None = None, vertical_angle_deg: fl
 
     The scans' stamps are their own, or those of the navigation rows with the same numbers. IMU samples are the 100 Hz
     ones of the sibling ``*_extract`` folder if it exists, else the 10 Hz ones, with a note
-    (:func:`hybridlio.datasets.drive_imu.drive_imu`).
+    (:func:`hybridlio.datasets.kitti.drive_imu.drive_imu`).
 
     Args:
         drive: the drive's folder.
         raw_root: not used, because calibration and 100 Hz data are beside the drive.
         vertical_angle_deg: angle by which points are raised; by default KITTI's known error if the drive is KITTI's
-            own, else 0 (:mod:`hybridlio.datasets.vertical_angle`).
+            own, else 0 (:mod:`hybridlio.datasets.kitti.vertical_angle`).
 
     Raises:
         DataError: no scans, scans without stamps, malformed navigation rows, or a missing calibration.

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from hybridlio.core import se3
 from hybridlio.core.sensors import ImuSamples
+from hybridlio.datasets.kitti.oxts import OxtsRows, read_oxts
 from hybridlio.datasets.notes import Notes
-from hybridlio.datasets.oxts import OxtsRows, read_oxts
 
 START_NS = 1_317_042_272_000_000_000
 MS = 1_000_000

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from hybridlio.core.sensors import NS_PER_S, ImuSamples
-from hybridlio.datasets.gyro_lag import SLOW_ROWS_S
+from hybridlio.datasets.kitti.gyro_lag import SLOW_ROWS_S
+from hybridlio.datasets.kitti.oxts import OxtsRows, read_oxts
 from hybridlio.datasets.notes import Notes
-from hybridlio.datasets.oxts import OxtsRows, read_oxts
 from hybridlio.datasets.stamps import note_coverage
 
 _FILL_NS = 30_000_000  # three samples of 100 Hz: a slow sample farther from any fast one fills a hole
@@ -30,8 +30,8 @@ def drive_imu(drive: Path, oxts: OxtsRows | None, notes: Notes) -> ImuSamples:
     """Return the IMU samples of a drive: the 100 Hz ones of :func:`fast_rows`, or those of ``oxts``.
 
     Holes in the 100 Hz recording, and times before and after it, are filled from ``oxts``. Angular rates that lag the
-    attitudes, as KITTI's do, are shifted back (:func:`hybridlio.datasets.gyro_lag.gyro_lag_ns`). Each correction and
-    substitute is noted.
+    attitudes, as KITTI's do, are shifted back (:func:`hybridlio.datasets.kitti.gyro_lag.gyro_lag_ns`). Each
+    correction and substitute is noted.
 
     Args:
         drive: the drive's ``*_sync`` folder.

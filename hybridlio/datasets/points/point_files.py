@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from hybridlio.core.arrays import Floats, Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import NS_PER_S, Scan
-from hybridlio.datasets.cloud_headers import read_header
-from hybridlio.datasets.kitti_files import read_bin
+from hybridlio.datasets.kitti.files import read_bin
+from hybridlio.datasets.points.cloud_headers import read_header
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
 

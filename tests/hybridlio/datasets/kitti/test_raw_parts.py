@@ -10,8 +10,8 @@ import pytest
 
 from hybridlio.core.errors import DataError
 from hybridlio.datasets import open_sequence
+from hybridlio.datasets.kitti.oxts import read_oxts
 from hybridlio.datasets.notes import Notes
-from hybridlio.datasets.oxts import read_oxts
 
 MS = 1_000_000
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from hybridlio.core.errors import DataError
-from hybridlio.datasets.point_files import read_scan
+from hybridlio.datasets.points.point_files import read_scan
 
 STAMP_NS = 1_600_000_000_000_000_000
 COUNT = 40

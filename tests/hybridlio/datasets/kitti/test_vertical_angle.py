@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from hybridlio.core.errors import ConfigError
 from hybridlio.datasets import open_sequence
-from hybridlio.datasets.vertical_angle import KITTI_VERTICAL_ANGLE_DEG, raise_points
+from hybridlio.datasets.kitti.vertical_angle import KITTI_VERTICAL_ANGLE_DEG, raise_points
 
 
 def cloud(rng: np.random.Generator, count: int = 5000) -> Any:

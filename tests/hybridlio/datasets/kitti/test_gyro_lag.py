@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hybridlio.core.arrays import Array
-from hybridlio.datasets.gyro_lag import gyro_lag_ns
+from hybridlio.datasets.kitti.gyro_lag import gyro_lag_ns
 from hybridlio.datasets.stamps import read_stamps
 
 MS = 1_000_000

@@ -1,0 +1,1 @@
+"""Readers of point files, and the meaning of their columns."""
