@@ -26,7 +26,8 @@ import numpy as np
 
 from hybridlio.cloud.preparation import prepare
 from hybridlio.core.arrays import Array
-from hybridlio.core.sensors import LIDAR_MODELS, LidarModel, Scan
+from hybridlio.core.lidar_models import LIDAR_MODELS, LidarModel
+from hybridlio.core.sensors import Scan
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.learned.data.preparing import KnownMotion, prepare_shard
 from hybridlio.learned.presets import preset

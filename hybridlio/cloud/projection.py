@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from hybridlio.core import se3
 from hybridlio.core.arrays import Floats
 from hybridlio.core.errors import ConfigError
-from hybridlio.core.sensors import LIDAR_MODELS, LidarModel
+from hybridlio.core.lidar_models import LIDAR_MODELS, LidarModel
 
 _EMPTY = np.iinfo(np.uint64).max
 _CHUNK = 16384  # points at a time, whose temporaries stay in the processor's cache: twice as fast as all at once

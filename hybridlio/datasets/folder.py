@@ -23,7 +23,8 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.files import read_yaml
-from hybridlio.core.sensors import LIDAR_MODELS, Calibration, ImuSamples, LidarModel, Scan
+from hybridlio.core.lidar_models import LIDAR_MODELS, LidarModel
+from hybridlio.core.sensors import Calibration, ImuSamples, Scan
 from hybridlio.core.trajectory_files import read_tum
 from hybridlio.datasets.gps_csv import note_fixes, read_gps_csv
 from hybridlio.datasets.imu_csv import read_imu_csv

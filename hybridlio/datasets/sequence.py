@@ -10,7 +10,8 @@ import numpy as np
 
 from hybridlio.core.arrays import Array, Stamps
 from hybridlio.core.errors import ConfigError, DataError
-from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, GpsFix, ImuNoise, ImuSamples, LidarModel, Scan
+from hybridlio.core.lidar_models import LidarModel
+from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, GpsFix, ImuNoise, ImuSamples, Scan
 from hybridlio.core.trajectory import Trajectory
 
 

@@ -8,7 +8,8 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from hybridlio.core.errors import ConfigError
-from hybridlio.core.sensors import LIDAR_MODELS, ImuNoise, LidarModel
+from hybridlio.core.lidar_models import LIDAR_MODELS, LidarModel
+from hybridlio.core.sensors import ImuNoise
 from hybridlio.simulation.choices import Driving, Scene
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from hybridlio.core.arrays import Array, Index, Stamps
-from hybridlio.core.sensors import NS_PER_S, ImuSamples, LidarModel, Scan
+from hybridlio.core.lidar_models import LidarModel
+from hybridlio.core.sensors import NS_PER_S, ImuSamples, Scan
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.kitti_writer import START_NS
 from hybridlio.simulation.plan import Drive

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from hybridlio.core.sensors import Calibration, LidarModel
+from hybridlio.core.lidar_models import LidarModel
+from hybridlio.core.sensors import Calibration
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.simulation.config import SimulationConfig

@@ -12,7 +12,8 @@ import numpy as np
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Floats, Index, Stamps
 from hybridlio.core.errors import DataError
-from hybridlio.core.sensors import LIDAR_MODELS, Calibration, ImuNoise, LidarModel, Scan
+from hybridlio.core.lidar_models import LIDAR_MODELS, LidarModel
+from hybridlio.core.sensors import Calibration, ImuNoise, Scan
 
 KITTI_LIDAR = LIDAR_MODELS["hdl-64e"]  # Geiger et al., "Vision meets Robotics: The KITTI Dataset", IJRR 2013
 _BYTES_PER_POINT = 16  # x y z reflectance, float32

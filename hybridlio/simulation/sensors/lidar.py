@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Index, Stamps
-from hybridlio.core.sensors import NS_PER_S, LidarModel, Scan
+from hybridlio.core.lidar_models import LidarModel
+from hybridlio.core.sensors import NS_PER_S, Scan
 from hybridlio.simulation.drive.traffic import CAR_RADIUS_M, MovingCar, in_reach
 from hybridlio.simulation.world.rays import Hits, RayScene
 

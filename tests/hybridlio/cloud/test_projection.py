@@ -16,7 +16,7 @@ from hybridlio.cloud.projection import (
 )
 from hybridlio.core import se3
 from hybridlio.core.errors import ConfigError
-from hybridlio.core.sensors import LIDAR_MODELS
+from hybridlio.core.lidar_models import LIDAR_MODELS
 
 PAPER = MAP_GEOMETRIES["hdl-64e"]
 

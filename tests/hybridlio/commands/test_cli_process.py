@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hybridlio.commands.app import app
-from hybridlio.core.sensors import LIDAR_MODELS
+from hybridlio.core.lidar_models import LIDAR_MODELS
 from hybridlio.datasets.registry import READERS
 from hybridlio.odometry.registry import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
 

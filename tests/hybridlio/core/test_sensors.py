@@ -10,7 +10,8 @@ from scipy.integrate import trapezoid
 
 from hybridlio.core import se3
 from hybridlio.core.errors import DataError
-from hybridlio.core.sensors import LIDAR_MODELS, Calibration, GpsFix, ImuSamples, Scan
+from hybridlio.core.lidar_models import LIDAR_MODELS
+from hybridlio.core.sensors import Calibration, GpsFix, ImuSamples, Scan
 
 START_NS = 1_317_042_272_335_337_762  # nanoseconds since 1970 exceed the precision of a float64
 MS = 1_000_000

@@ -10,7 +10,7 @@ import pytest
 
 from hybridlio.core import se3
 from hybridlio.core.errors import DataError
-from hybridlio.core.sensors import LIDAR_MODELS
+from hybridlio.core.lidar_models import LIDAR_MODELS
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.core.trajectory_files import write_tum
 from hybridlio.datasets import open_sequence

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from hybridlio.core.errors import DataError
-from hybridlio.core.sensors import LIDAR_MODELS, ImuNoise
+from hybridlio.core.lidar_models import LIDAR_MODELS
+from hybridlio.core.sensors import ImuNoise
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.core.trajectory_files import write_kitti
 from hybridlio.datasets import open_sequence

@@ -7,7 +7,8 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from hybridlio.core import se3
-from hybridlio.core.sensors import LIDAR_MODELS, NS_PER_S
+from hybridlio.core.lidar_models import LIDAR_MODELS
+from hybridlio.core.sensors import NS_PER_S
 from hybridlio.simulation.drive.traffic import MovingCar
 from hybridlio.simulation.sensors.lidar import first_hits, measure, ray_pattern
 from hybridlio.simulation.world.rays import Hits, RayScene
