@@ -160,12 +160,14 @@ def frame_range(frames: str) -> tuple[int | None, int | None]:
     """Parse a range ``A:B``, ``A:`` or ``:B``; an omitted end is None.
 
     Raises:
-        ConfigError: ``frames`` is not such a range.
+        ConfigError: ``frames`` is not such a range, or is empty for every recording.
     """
     try:
         start, stop = (int(end) if end.strip() else None for end in frames.split(":"))
     except ValueError:
         raise ConfigError(f"frames {frames!r}: give a range such as 100:200, 100: or :200") from None
+    if start is not None and stop is not None and (start < 0) == (stop < 0) and stop <= start:
+        raise ConfigError(f"frames {frames!r}: the range is empty; its end must be after its start")
     return start, stop
 
 

@@ -177,6 +177,7 @@ def test_the_exit_code_shows_whether_any_recording_failed(tiny_drive, tmp_path):
     ("options", "words"),
     [
         (("--frames", "x"), "frames 'x': give a range"),
+        (("--frames", "9:5"), "frames '9:5': the range is empty"),
         (("--reader", "x"), "unknown reader 'x'"),
         (("--raw-root", "/gone"), "raw root /gone: no such folder"),
         (("--initial-pose", "x"), "unknown initial pose 'x'"),

@@ -194,10 +194,18 @@ def test_without_a_range_the_whole_recording_is_used(sequence):
 
 
 @pytest.mark.parametrize(
-    ("text", "error"), [("5", ConfigError), ("1:2:3", ConfigError), ("a:b", ConfigError), ("9:9", DataError)]
+    ("text", "error"),
+    [
+        ("5", ConfigError),
+        ("1:2:3", ConfigError),
+        ("a:b", ConfigError),
+        ("9:9", ConfigError),
+        ("-2:-5", ConfigError),
+        ("900:", DataError),
+    ],
 )
 def test_a_malformed_or_empty_range_is_an_error(text, error, sequence):
-    with pytest.raises(error, match=r"range such as|no scans in"):
+    with pytest.raises(error, match=r"range such as|the range is empty|no scans in"):
         part_of(sequence, text)
 
 
