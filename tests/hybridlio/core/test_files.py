@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from hybridlio.core.errors import ConfigError, DataError
-from hybridlio.core.files import atomic_path, read_yaml, write_atomically
+from hybridlio.core.files import atomic_path, locked, read_yaml, write_atomically
 
 
 def test_text_and_bytes_are_written_unchanged_and_folders_made(tmp_path: Path) -> None:
@@ -83,3 +83,19 @@ def test_invalid_yaml_is_named_in_one_line(tmp_path: Path, content: bytes | None
         with pytest.raises(error, match=words) as raised:
             read_yaml(tmp_path / "my.yaml", error)
         assert "\n" not in str(raised.value)
+
+
+def test_a_lock_is_held_by_one_at_a_time(tmp_path: Path) -> None:
+    lock_file = tmp_path / "new" / "lock"
+    with locked(lock_file) as is_held:
+        assert is_held
+        with locked(lock_file, wait=False) as is_held_twice:
+            assert not is_held_twice
+    with locked(lock_file, wait=False) as is_held_again:
+        assert is_held_again
+
+
+def test_a_lock_that_cannot_be_created_names_its_place(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="file"), locked(tmp_path / "file" / "lock"):
+        pass
