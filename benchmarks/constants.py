@@ -7,7 +7,8 @@ tests listed for it, and prints which test caught each change. Exits with 1 if a
 tests fail without any change. A constant that no test holds either needs one or has no effect and can go.
 
 Only constants whose value is a choice are listed: of registration, degeneracy, covariance, map, gate and scan matching.
-Those that merely save time without changing results, such as the work per thread, are not.
+Those that merely save time without changing results, such as the work per thread, are not; nor is the number of
+iterations after a displacement in degeneracy.py, of which 1 and 30 give nearly the same costs.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ SOURCES = "tests/hybridlio/sources/test_"
 ICP = tuple(f"{REGISTRATION}{name}.py" for name in ("icp_limits", "icp", "icp_covariance"))
 INFORMATION = tuple(f"{REGISTRATION}{name}.py" for name in ("information", "icp_covariance", "degeneracy"))
 DEGENERACY = tuple(f"{REGISTRATION}{name}.py" for name in ("cost_profile", "degeneracy_limits", "degeneracy"))
-MAP = tuple(f"{REGISTRATION}{name}.py" for name in ("local_map", "ring_planes", "voxel_map"))
+MAP = tuple(f"{REGISTRATION}{name}.py" for name in ("local_map_limits", "local_map", "ring_planes", "voxel_map"))
 PLANES = ("tests/hybridlio/cloud/test_plane_fitting.py", *MAP)
 POINTS = tuple(f"{REGISTRATION}{name}.py" for name in ("point_to_point", "degeneracy"))
 SEARCH = (f"{REGISTRATION}motion_search.py",)
@@ -119,7 +120,6 @@ TABLE = [
     *_in(
         "hybridlio/registration/degeneracy.py",
         DEGENERACY,
-        _PROBE_ITERATIONS=("1",),
         _MAX_ROUNDS=("1",),
         _SETTLED_M=("5.0",),
         _OBSERVED_VARIANCE_SCALE=("1.0", "60.0"),

@@ -66,6 +66,14 @@ def test_errors_between_trunks_match_their_covariance():
     assert 0.05 < np.mean(normalised) < 3.0
 
 
+def test_objects_beside_trunks_do_not_displace_them(rng: np.random.Generator):
+    """Each trunk has a few points of something else 25 cm ahead, beyond the narrow kernel of point matches."""
+    surface, source, points = between_trunks(rng)
+    beside = points[7000:][::2] + np.array([0.25, 0.0, 0.0])
+    observed = observe(surface, source, off_by(0.1, -0.1), 0.1, dense=np.concatenate([points, beside]))
+    assert np.abs(error(observed)[3:5]).max() < 0.02
+
+
 def test_a_right_start_between_trunks_is_kept(rng: np.random.Generator):
     """Point matches from 10 cm to either side agree on it."""
     surface, source, points = between_trunks(rng)

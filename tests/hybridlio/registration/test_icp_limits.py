@@ -45,20 +45,35 @@ def test_a_registration_that_has_converged_stays_where_it_is(seed: int):
     surface, source = noisy_room(seed)
     found = register(surface, source, np.eye(4), DEFAULTS, kernel_start_m=1.0)
     assert found.converged
-    assert found.iterations <= 20
+    assert found.iterations <= 12
     moved = change(found, register(surface, source, found.pose, DEFAULTS))
-    assert moved[:3].max() < 5e-5
+    assert moved[:3].max() < 1.5e-5
     assert moved[3:].max() < 5e-4
 
 
-@pytest.mark.parametrize("xi", [(0, 0, 0.1, 0, 0, 0), (0, 0, 0, 0.4, 0.3, 0)], ids=["rotation", "translation"])
-def test_a_pose_that_has_moved_is_matched_again(xi: tuple[float, ...]):
-    """Also if it has only rotated, or only been translated."""
-    surface, source = noisy_room(0)
-    found = register(surface, source, MOTION @ se3.exp(np.array(xi)), DEFAULTS, kernel_start_m=0.3)
-    error = np.abs(se3.log(se3.between(MOTION, found.pose)))
-    assert error[:3].max() < 1e-3
-    assert error[3:].max() < 8e-3
+def test_a_slow_convergence_is_followed_to_the_end(rng: np.random.Generator):
+    """With noise as large as the kernel, steps shrink slowly; one of centimetres is not the last."""
+    points, normals = scene(rng, ROOM, 4000)
+    surface, source = Surface(10 * points, normals, 1), 10 * points[::5] + 0.1 * rng.standard_normal((4000, 3))
+    found = register(surface, source, se3.exp(np.array([0, 0, 0, 0.3, 0.2, 0.1])), DEFAULTS)
+    assert change(found, register(surface, source, found.pose, DEFAULTS))[3:].max() < 1e-3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_pose_that_has_rotated_is_matched_again(seed: int):
+    surface, source = noisy_room(seed)
+    start = MOTION @ se3.exp(np.array([0, 0, 0.1, 0, 0, 0]))
+    found = register(surface, source, start, DEFAULTS, kernel_start_m=0.3)
+    assert change(found, register(surface, source, found.pose, DEFAULTS))[:3].max() < 1e-4
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_pose_that_has_been_translated_is_matched_again(seed: int):
+    """The points are the surface's own, so that after the last matching nothing is left."""
+    points, normals = scene(np.random.default_rng(seed), ROOM, 4000)
+    start = se3.exp(np.array([0, 0, 0, 0.08, 0.06, -0.08]))
+    found = register(Surface(points, normals, 1), points[::5], start, DEFAULTS)
+    assert np.abs(se3.log(found.pose)[3:]).max() < 1e-5
 
 
 def test_matches_serve_several_steps(matched_at: list[np.ndarray]):

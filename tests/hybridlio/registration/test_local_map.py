@@ -5,7 +5,6 @@ import small_gicp
 from hybridlio.core import se3
 from hybridlio.registration.local_map import LocalMap
 from hybridlio.registration.settings import LocalMapSettings
-from hybridlio.registration.voxel_map import MAX_POINTS_PER_CELL
 
 SETTINGS = LocalMapSettings(threads=1)
 
@@ -104,7 +103,7 @@ def test_a_cell_holds_ten_points_with_a_minimum_spacing(rng: np.random.Generator
     local_map.insert(again, at(0.0))
     after = local_map.surface.points
     _, counts = np.unique(np.floor(after / SETTINGS.voxel_m), axis=0, return_counts=True)
-    assert counts.max() == MAX_POINTS_PER_CELL
+    assert counts.max() == 10
     assert len(after) > len(before)  # there was room
     np.testing.assert_array_equal(after[: len(before)], before)
     apart = np.linalg.norm(after[len(before) :, None] - before, axis=2)
