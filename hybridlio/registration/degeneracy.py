@@ -32,8 +32,8 @@ from hybridlio.registration.information import UNKNOWN_SIGMA_M, covariance_of, w
 from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Surface
 
-# In the strong directions after a displacement, in which they move by centimetres. Costs after 1 and 30 steps are nearly
-# the same, also on hills and between curved walls, so this only has to be small.
+# In the strong directions after a displacement, in which they move by centimetres. Costs after 1 and 30 steps are
+# nearly the same, also on hills and between curved walls, so this only has to be small.
 _PROBE_ITERATIONS = 6
 _MAX_ROUNDS = (
     4  # of moving to the parabola's minimum: from 0.6 m away in a field, one leaves up to 0.2 m, three millimetres

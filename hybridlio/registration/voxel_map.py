@@ -23,9 +23,8 @@ _KEY_BITS = 21  # per axis, so that three fit into 63 bits of an int64: ±2000 k
 _KEY_ORIGIN = 1 << (_KEY_BITS - 1)
 
 MAX_POINTS_PER_CELL = 10  # of a cell of 2 m: enough for a plane on each of two surfaces, few enough for quick searches
-_MIN_SPACING_M = (
-    0.1  # between points of different scans, about three times the noise of a range: nearer ones add nothing
-)
+# Between points of different scans, about three times the noise of a range: nearer ones add nothing.
+_MIN_SPACING_M = 0.1
 # A sensor is sparse if more than this share of its points within this range have neighbours of a single ring. Of 64
 # beams none has, of 16 beams one in six.
 _SPARSE_RANGE_M = 20.0
