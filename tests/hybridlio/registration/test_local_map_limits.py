@@ -86,7 +86,12 @@ def test_a_sensor_is_sparse_if_many_near_points_are_on_single_rings(
     assert voxel_map._is_sparse(np.concatenate([near, distant]), on_one_ring) == sparse
 
 
-def test_cells_a_thousand_kilometres_apart_have_different_keys(rng: np.random.Generator):
-    points = np.concatenate([rng.uniform(-1e6, 1e6, (300, 3)), rng.uniform(-500, 500, (300, 3))])
-    keys = np.concatenate([cells_of(point[None], 2.0)[1] for point in points])
-    assert len(np.unique(keys)) == len(np.unique(np.floor(points.astype(np.float32) / np.float32(2)), axis=0))
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_cells_within_a_thousand_kilometres_have_different_keys(axis: int):
+    """Along an axis, and in a slab two cells thick around it."""
+    along = np.r_[np.linspace(-1e6, 1e6, 1000), np.arange(-1000.0, 1000.0, 2.0)]
+    points = np.zeros((4000, 3))
+    points[:, axis] = np.tile(along, 2)
+    points[2000:, axis - 1] = 3.0
+    keys = [int(cells_of(point[None], 2.0)[1][0]) for point in points]
+    assert len(set(keys)) == len(np.unique(np.floor(points.astype(np.float32) / np.float32(2)), axis=0))
