@@ -56,7 +56,7 @@ ICP = tuple(f"{REGISTRATION}{name}.py" for name in ("icp_limits", "icp", "icp_co
 INFORMATION = tuple(f"{REGISTRATION}{name}.py" for name in ("information", "icp_covariance", "degeneracy"))
 DEGENERACY = tuple(f"{REGISTRATION}{name}.py" for name in ("cost_profile", "degeneracy_limits", "degeneracy"))
 MAP = tuple(f"{REGISTRATION}{name}.py" for name in ("local_map_limits", "local_map", "ring_planes", "voxel_map"))
-PLANES = ("tests/hybridlio/cloud/test_plane_fitting.py", *MAP)
+PLANES = ("tests/hybridlio/cloud/test_plane_fitting.py", "tests/hybridlio/cloud/test_normals.py", *MAP)
 POINTS = tuple(f"{REGISTRATION}{name}.py" for name in ("point_to_point", "degeneracy"))
 SEARCH = (f"{REGISTRATION}motion_search.py",)
 GATE = tuple(f"{SOURCES}{name}.py" for name in ("innovation_gate_constants", "innovation_gate"))
@@ -88,6 +88,14 @@ TABLE = [
         _LONG_STEP=("1e9",),
         _MATCH_KERNELS=("0.3", "30"),
         _MIN_MATCHES=("1", "1000"),
+    ),
+    *_in(
+        "hybridlio/registration/settings.py",
+        ICP,
+    ),
+    *_in(
+        "hybridlio/registration/settings.py",
+        MAP,
     ),
     *_in(
         "hybridlio/registration/settings.py",

@@ -31,9 +31,8 @@ PROBE_STEP_M = 0.5
 # Rise over scatter of an observed direction. On simulated drives smooth walls stayed at or below 3.5, and an open field
 # with bushes was at 6 or more.
 _OBSERVED_RATIO = 4.5
-OFFSETS_M = np.linspace(
-    -2.0, 2.0, 9
-)  # as far as a first step is unknown without any source of speed, PROBE_STEP_M apart
+# As far as a first step may be wrong without any source of speed (20 m/s at 10 Hz), PROBE_STEP_M apart.
+OFFSETS_M = np.linspace(-2.0, 2.0, 9)
 # Temperature of exp(−rise / (1.5·scatter)), chosen so that σ is consistent with the errors between smooth walls
 # (benchmarks/scenarios.py, corridor).
 _TEMPERATURE = 1.5

@@ -35,9 +35,8 @@ from hybridlio.registration.surface import Surface
 # In the strong directions after a displacement, in which they move by centimetres. Costs after 1 and 30 steps are
 # nearly the same, also on hills and between curved walls, so this only has to be small.
 _PROBE_ITERATIONS = 6
-_MAX_ROUNDS = (
-    4  # of moving to the parabola's minimum: from 0.6 m away in a field, one leaves up to 0.2 m, three millimetres
-)
+# Of moving to the parabola's minimum. From 0.6 m away in a field, one leaves up to 0.2 m, and three leave millimetres.
+_MAX_ROUNDS = 4
 _SETTLED_M = 0.1  # a fifth of the parabola's step: closer to the minimum, a new parabola gives the same one
 # On the variance of an observed direction. Only few points observe it, they stand on a few trunks and share their
 # errors, like points on one surface: twice the covariance scale of scan matching when it was chosen. Over simulated

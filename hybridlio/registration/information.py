@@ -52,9 +52,8 @@ NORMAL_NOISE = NormalNoise(2e-3, 8e-3)
 # Planes weighted by their thickness: 0.035 rad, as the worst normals belong to thick planes. The edges are no better.
 NORMAL_NOISE_WEIGHTED = NormalNoise(1.2e-3, 8e-3)
 _STRONG_RATIO = 3  # times the normal noise, so that the corrected information is at least two thirds of the measured
-UNKNOWN_SIGMA_M = (
-    10.0  # along unconstrained directions: far more than a step's error, yet well conditioned in the graph
-)
+# Along unconstrained directions: far more than a step's error, yet well conditioned in the graph.
+UNKNOWN_SIGMA_M = 10.0
 _HALF = 0.5  # after projection an eigenvector lies in the fixed subspace (1) or orthogonal to it (0)
 
 

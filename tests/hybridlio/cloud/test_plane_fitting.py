@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from hybridlio.cloud.normals import estimate_normals
 from hybridlio.cloud.plane_fitting import fit_planes, span_several_rings
 
 
@@ -31,6 +32,12 @@ def test_a_lidars_noise_keeps_the_weight_and_a_hedge_loses_it(
 ):
     weight = fit_planes(slab(rng, thickness_m)).weights[0]
     assert least <= weight <= most
+
+
+@pytest.mark.parametrize(("places", "has_normals"), [(4, False), (8, True)])
+def test_a_plane_needs_more_points_than_it_has_unknowns(rng: np.random.Generator, places: int, has_normals: bool):
+    points = np.column_stack([rng.uniform(4, 5, (places, 2)), np.ones(places)])
+    assert estimate_normals(points, neighbours=5, thin_m=0.0).any() == has_normals
 
 
 def ring(elevation_deg: float, jitter_deg: float = 0.0, count: int = 10) -> np.ndarray:

@@ -5,7 +5,8 @@ import pytest
 
 from hybridlio.core import se3
 from hybridlio.registration import voxel_map
-from hybridlio.registration.local_map import LocalMap, LocalMapSettings
+from hybridlio.registration.local_map import LocalMap
+from hybridlio.registration.settings import LocalMapSettings
 from hybridlio.registration.voxel_map import cells_of
 
 DEFAULTS = LocalMapSettings(threads=1)

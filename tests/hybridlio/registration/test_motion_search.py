@@ -50,12 +50,24 @@ def test_the_nearest_of_many_starts_is_found_and_refined(rng: np.random.Generato
 
 
 def test_a_small_overlap_does_not_win_by_its_low_cost(rng: np.random.Generator):
-    """Lifted out of the room, the few points of a ceiling's height lie exactly on a shelf's plane."""
-    surface, source = room(rng, 0.2)
-    shelf, normals = wall(rng, (-10, -8, 38.0), (20, 0, 0), (0, 16, 0))
+    """Forty metres up, only the scan's floor has a surface to lie on, and lies there perfectly."""
+    shelf, normals = wall(rng, (-12, -10, 38.0), (24, 0, 0), (0, 20, 0), 3000)
+    surface, source = room(rng)
     surface = surface.extended(shelf, normals, 1)
-    floor = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 40.0])  # the scan's floor on the shelf, with no walls around
-    starts = [TRUTH @ ahead(0.3), TRUTH @ se3.exp(floor)]
+    curtain = rng.uniform([9.3, -6, -0.5], [9.3, 6, 2.0], (1000, 3))  # that the map does not have, near a wall
+    source = np.concatenate([source, seen_from(TRUTH, curtain)])
+    starts = [TRUTH @ ahead(0.2), TRUTH @ se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 40.0]))]
+    assert error_m(best_start(surface, source, source, starts, SETTINGS)) < 0.05
+
+
+def test_the_most_matches_do_not_win_in_spite_of_a_high_cost(rng: np.random.Generator):
+    """Forty metres up there is a thicket, in which every point of the scan has some neighbour."""
+    thicket, normals = rng.uniform([-13, -11, 37], [13, 11, 44], (12_000, 3)), rng.standard_normal((12_000, 3))
+    surface, source = room(rng)
+    surface = surface.extended(thicket, normals / np.linalg.norm(normals, axis=1, keepdims=True), 1)
+    moved = rng.uniform([-5, -4, 0.0], [5, 4, 0.5], (400, 3))  # in the middle of the room, away from all walls
+    source = np.concatenate([source, seen_from(TRUTH, moved)])
+    starts = [TRUTH @ ahead(0.2), TRUTH @ se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 40.0]))]
     assert error_m(best_start(surface, source, source, starts, SETTINGS)) < 0.05
 
 
