@@ -63,3 +63,8 @@ class Trajectory:
     def from_first(self) -> Trajectory:
         """Return the same poses in the frame of the first one."""
         return Trajectory(self.stamps_ns, se3.between(self.poses[0], self.poses), self.covariances)
+
+
+def travelled_m(positions_m: Array) -> Array:
+    """Return the path length ``(N,)`` from the first position to each of ``(N, 3)`` positions."""
+    return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(positions_m, axis=0), axis=1)))

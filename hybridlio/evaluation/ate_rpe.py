@@ -17,7 +17,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError, DataError, EstimationError
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.tables import counted
-from hybridlio.core.trajectory import Trajectory
+from hybridlio.core.trajectory import Trajectory, travelled_m
 
 Alignment = Literal["se3", "sim3", "first", "none"]
 DeltaUnit = Literal["frames", "seconds", "metres"]
@@ -166,11 +166,10 @@ def _pairs(reference: Trajectory, delta: float, unit: DeltaUnit) -> tuple[NDArra
         raise ConfigError(
             f"RPE over {delta} {unit!r}: delta must be positive, in one of {', '.join(get_args(DeltaUnit))}"
         )
-    steps_m = np.linalg.norm(np.diff(reference.poses[:, :3, 3], axis=0), axis=1)
     at = {
         "frames": np.arange(len(reference), dtype=np.float64),
         "seconds": reference.times_s,
-        "metres": np.concatenate([[0.0], np.cumsum(steps_m)]),
+        "metres": travelled_m(reference.poses[:, :3, 3]),
     }[unit]
     last = np.searchsorted(at, at + delta * (1 - 1e-9))  # tolerates the rounding of a sum
     first = np.flatnonzero(last < len(reference))

@@ -16,6 +16,7 @@ from matplotlib.ticker import FuncFormatter, PercentFormatter
 from numpy.typing import NDArray
 
 from hybridlio.core.arrays import Array
+from hybridlio.core.trajectory import travelled_m
 from hybridlio.evaluation.consistency import Anees, PoseConsistency, bounds
 from hybridlio.evaluation.drift import Drift, DriftAverage
 from hybridlio.evaluation.report_data import DrawnPath
@@ -77,11 +78,11 @@ def trajectory_figure(
         axes = figure.subplot_mosaic([["above", right[0]], ["above", right[1]]], width_ratios=[1.2, 1])
         _above(axes["above"], paths, reference_m, bridged_m, loops_m)
         if reference_m is not None:
-            axes["height"].plot(_travelled(reference_m), reference_m[:, 2], color=REFERENCE, lw=4, alpha=0.45)
+            axes["height"].plot(travelled_m(reference_m), reference_m[:, 2], color=REFERENCE, lw=4, alpha=0.45)
             axes["error"].set(title="Distance from the reference", xlabel="distance travelled [m]", ylabel="[m]")
         for k, path in enumerate(paths.values()):
             style = _line(k)
-            axes["height"].plot(_travelled(path.positions_m), path.positions_m[:, 2], **style)
+            axes["height"].plot(travelled_m(path.positions_m), path.positions_m[:, 2], **style)
             if reference_m is not None:
                 axes["error"].plot(path.travelled_m, path.error_m, **style)
         if reference_m is not None:
@@ -275,10 +276,6 @@ def _nees(ax: Axes, times_s: Array, result: Anees) -> None:
     mean = np.convolve(result.nees, np.ones(window) / window, "valid")
     middle = times_s[window // 2 : window // 2 + len(mean)]
     ax.plot(middle, mean, color="black", lw=1.3, label=f"mean of {window}")
-
-
-def _travelled(positions_m: Array) -> Array:
-    return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(positions_m, axis=0), axis=1)))
 
 
 def _at_least(ax: Axes, span: float) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import NS_PER_S
-from hybridlio.core.trajectory import Trajectory
+from hybridlio.core.trajectory import Trajectory, travelled_m
 from hybridlio.evaluation.ate_rpe import Association, align, associate
 from hybridlio.evaluation.consistency import PoseConsistency
 from hybridlio.evaluation.evaluate import Evaluation, Steps, associated_step_errors, evaluate
@@ -167,8 +167,9 @@ def _path(trajectory: Trajectory, both: Association | None) -> DrawnPath:
         return DrawnPath(np.arange(len(trajectory)), trajectory.from_first().poses[:, :3, 3], np.empty(0), np.empty(0))
     aligned = align(both.reference, both.estimate, "first").poses
     true = both.reference.poses[:, :3, 3]
-    travelled = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(true, axis=0), axis=1)))
-    return DrawnPath(both.estimate_rows, aligned[:, :3, 3], travelled, np.linalg.norm(aligned[:, :3, 3] - true, axis=1))
+    return DrawnPath(
+        both.estimate_rows, aligned[:, :3, 3], travelled_m(true), np.linalg.norm(aligned[:, :3, 3] - true, axis=1)
+    )
 
 
 def _step_errors(data: ReportData, own: Association | None) -> dict[str, tuple[Array, Array]]:
