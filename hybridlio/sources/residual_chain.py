@@ -18,7 +18,7 @@ class Proposer(ResidualSource, Protocol):
         """Return a pose ``T_k_k1`` ``(4, 4)`` without checking its quality; None where there is none."""
         ...
 
-    def judge(self, frame: Frame, initial: RelativePose) -> RelativePose:
+    def assess(self, frame: Frame, initial: RelativePose) -> RelativePose:
         """Return what ``refine`` would for the frame of the last :meth:`propose`, with covariance and ``ok``."""
         ...
 
@@ -28,7 +28,7 @@ class ResidualChain:
 
     If the initial pose is certain to a decimetre, the first source only proposes a pose. The second starts there if
     its scan fits better, and otherwise answers as if there were no proposal. A wrong proposal does no harm, so the cost
-    of judging it is saved.
+    of assessing it is saved.
 
     If the initial pose is less certain, the first source's full answer is the second one's initial pose. Where the
     first fails or leaves a direction unconstrained, the second starts from the initial pose itself.
@@ -85,7 +85,7 @@ class ResidualChain:
     def _propose(self, frame: Frame, initial: RelativePose) -> tuple[RelativePose | None, RelativePose]:
         """Return the second one's answer with the first one's proposal, and the first one's if the second fails."""
         fine = self._second.refine(frame, replace(initial, proposed=self._first.propose(frame, initial)))
-        return None if fine.ok else self._first.judge(frame, initial), fine
+        return None if fine.ok else self._first.assess(frame, initial), fine
 
 
 def _is_vague(pose: RelativePose) -> bool:

@@ -1,4 +1,4 @@
-"""The residual network at run time: a source of residuals, judged by the loss that trained it."""
+"""The residual network at run time: a source of residuals whose answers the training loss evaluates."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hybridlio.core.estimates import RelativePose
 from hybridlio.core.motion_limits import UNKNOWN_TRANSLATION_SIGMA_M
 from hybridlio.core.sensors import NS_PER_S, Frame, Scan
 from hybridlio.learned.data.preparing import Mapped
-from hybridlio.learned.losses.loss_judge import CHI2_99, Judged, JudgedScan, LossJudge
+from hybridlio.learned.losses.loss_evaluator import CHI2_99, EvaluatedPose, LossEvaluator, LossScan
 from hybridlio.learned.networks.devices import at_run_time, on_device, pick_device
 from hybridlio.learned.networks.maps import valid_cells
 from hybridlio.learned.networks.odometry_network import SeenScan
@@ -34,13 +34,13 @@ _log = logging.getLogger(__name__)
 Rows = NDArray[np.float32] | NDArray[np.float64]
 Prepare = Callable[[Scan], Mapped]
 
-_LONG_WAY_M = 0.15  # longer than what the network was trained to go
-_RISE = 1.02  # the loss has changed by less when only which points match has
+_LONG_CORRECTION_M = 0.15  # the network is trained on initial poses 0.14 m off; longer corrections are less accurate
+_RISE = 1.02  # a smaller change of the loss may come from other points matching alone
 
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """A scan as the network takes it, and, once asked for, as the loss does."""
+    """A scan in the form that the network takes, and on demand in the form that the loss takes."""
 
     stamp_ns: int
     maps: SeenScan
@@ -49,14 +49,14 @@ class _Seen:
     threads: int
 
     @cached_property
-    def judged(self) -> JudgedScan:
+    def for_loss(self) -> LossScan:
         vertices, normals = (part[0].cpu().numpy() for part in (self.maps.vertices, self.maps.normals))
-        return JudgedScan.of_maps(vertices, normals, self.threads)
+        return LossScan.of_maps(vertices, normals, self.threads)
 
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """Two scans to be compared, ``dt_s`` apart, and what the network is told of the IMU between them."""
+    """Two scans ``dt_s`` apart, and the IMU features between them where the network uses them."""
 
     last: _Seen
     current: _Seen
@@ -69,20 +69,20 @@ class _Pair:
 
 
 class NetworkResidual:
-    """Refines each initial pose by the network, looking at the last scan and the current one.
+    """Refines each initial pose by the network, from the last scan and the current one.
 
-    The loss that trained the network judges its answer, in a robust form: its Hessian gives the covariance, and an
-    answer that it finds worse than the initial pose, by more than the covariance allows, is not taken. Then, or with
-    too little to see, the initial pose itself comes back, marked as not ok, and the log says why.
+    The training loss, with a robust kernel, evaluates the answer: its Hessian gives the covariance. An answer is
+    rejected where the loss rises from the initial pose to it by more than the covariance explains. Then, or with too
+    few cells or matches, the source returns the initial pose, marked as not ok, and logs the reason.
 
     Args:
-        prepare_for: gives, for the recipe that the weights were trained by, what makes a scan ready, such as
-            :func:`hybridlio.cloud.preparation.prepare` with the network's cells.
-        settings: weights, device, and how the answer is weighed.
+        prepare_for: returns a function that prepares a scan for the recipe of the weights, such as
+            :func:`hybridlio.cloud.preparation.prepare` with the network's map geometry.
+        settings: weights, device, and settings of the loss.
 
     Raises:
         DataError: the weights cannot be read.
-        ConfigError: there is no such device.
+        ConfigError: the device does not exist, or no weights of that name are shipped.
     """
 
     name = "network"
@@ -102,14 +102,14 @@ class NetworkResidual:
 
     @property
     def geometry(self) -> MapGeometry:
-        """The cells that the network takes."""
+        """Cells of the maps that the network takes."""
         return self._network.settings.geometry
 
     def start(self, frame: Frame) -> None:
-        """Take the first scan.
+        """Start at a first scan.
 
         Raises:
-            DataError: too few of its cells have a normal.
+            DataError: too few cells of its map have a normal.
         """
         self._step = self._pair = None
         self._last = self._look(frame.scan)
@@ -121,21 +121,21 @@ class NetworkResidual:
             )
 
     def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:
-        """The network's ``T = δT·T̂``; the initial pose, marked as not ok, where that fails."""
+        """Return the network's ``T = δT·T̂``, or the initial pose marked as not ok where that fails."""
         self._take(frame)
-        return self.judge(frame, initial)
+        return self.assess(frame, initial)
 
     def propose(self, frame: Frame, initial: RelativePose) -> Array | None:
-        """The network's ``T`` ``(4, 4)``, which nothing has judged yet; None with too little to see."""
+        """Return the network's ``T`` ``(4, 4)`` before the loss evaluates it; None with too few cells."""
         pair = self._take(frame)
         if not pair.enough:
             return None
-        pose = self._ask(pair, initial.pose)
+        pose = self._corrected(pair, initial.pose)
         self._step = (pose, pair.dt_s)
         return pose
 
-    def judge(self, frame: Frame, initial: RelativePose) -> RelativePose:
-        """What :meth:`refine` says of the frame that was last given to :meth:`propose`."""
+    def assess(self, frame: Frame, initial: RelativePose) -> RelativePose:
+        """Return the answer of :meth:`refine` for the frame of the last :meth:`propose`."""
         pair = self._pair
         assert pair is not None
         cells, dt_s = (pair.last.cells, pair.current.cells), pair.dt_s
@@ -146,20 +146,29 @@ class NetworkResidual:
         before, after = self._estimate(pair, initial)
         details |= {"cost": after.cost, "initial_cost": before.cost, "matched": after.matched}
         if after.matched < self._settings.min_matched:
-            return self._bridge(frame, initial, details, dt_s, f"only {after.matched:.0%} of the points have a match")
+            return self._bridge(
+                frame,
+                initial,
+                details,
+                dt_s,
+                f"only {after.matched:.0%} of the points have a match, {self._settings.min_matched:.0%} are needed",
+            )
         if self._is_worse(after, before):
-            why = f"the loss finds the answer worse ({after.cost:.4f} m, the initial pose {before.cost:.4f} m)"
+            why = f"the loss of the answer is higher ({after.cost:.4f} m, of the initial pose {before.cost:.4f} m)"
             return self._bridge(frame, initial, details, dt_s, why)
         self._step = (after.pose, dt_s)
         return self._answer(after, details)
 
     @property
     def current_scan(self) -> _Seen | None:
-        """The scan last looked at, for :meth:`pair`."""
+        """The last scan, as an argument for :meth:`pair`."""
         return self._last
 
     def pair(self, earlier: _Seen, current: _Seen, initial: RelativePose) -> RelativePose:
-        """A scan relative to any earlier one, ``T_j_k``, by the points alone; ``initial``, not ok, where that fails."""
+        """Return a scan's pose relative to any earlier one, ``T_j_k``, by the points alone.
+
+        Return ``initial``, marked as not ok, where that fails.
+        """
         if not (earlier.enough and current.enough):
             return replace(initial, ok=False)
         nothing, still = np.zeros((self._network.settings.imu_samples, 6)), np.zeros(3)
@@ -169,12 +178,12 @@ class NetworkResidual:
         return self._answer(after, {})
 
     def take_back(self, initial: RelativePose) -> None:
-        """Go on at the velocity of the initial pose: the last answer was not believed."""
+        """Take the velocity from the initial pose, because the last answer was rejected downstream."""
         if self._step is not None:
             self._step = (initial.pose, self._step[1])
 
     def _take(self, frame: Frame) -> _Pair:
-        """The last scan and the frame's, which is the last one from now on."""
+        """Return the pair of the last scan and the frame's, and make the latter the last scan."""
         last, current = self._last, self._look(frame.scan)
         if last is None:
             raise DataError(f"frame {frame.index}: no scan before it; call start with the first frame")
@@ -197,50 +206,50 @@ class NetworkResidual:
             there = int(valid_cells(seen.normals).sum()) if prepared.usable else 0
         return _Seen(scan.stamp_ns, seen, there, there >= self._settings.min_cells, self._threads)
 
-    def _estimate(self, pair: _Pair, initial: RelativePose) -> tuple[Judged, Judged]:
-        """The pose that the network starts from and its answer, both judged."""
-        judge = LossJudge(pair.last.judged, pair.current.judged, self._settings, self._threads)
-        before = min((judge.judge(T) for T in self._starts(initial, pair.dt_s)), key=lambda j: j.cost)
-        answer = judge.judge(self._ask(pair, before.pose))
-        if len(answer.degenerate):  # where the scans say nothing, the initial pose knows better than the network
-            way = answer.constrained(se3.log(se3.between(before.pose, answer.pose)))
-            answer = judge.judge(se3.orthonormalise(before.pose @ se3.exp(way)))
-        return before, judge.descend(answer)
+    def _estimate(self, pair: _Pair, initial: RelativePose) -> tuple[EvaluatedPose, EvaluatedPose]:
+        """Return the pose that the network starts from and its answer, both evaluated by the loss."""
+        evaluator = LossEvaluator(pair.last.for_loss, pair.current.for_loss, self._settings, self._threads)
+        before = min((evaluator.evaluate(T) for T in self._starts(initial, pair.dt_s)), key=lambda found: found.cost)
+        answer = evaluator.evaluate(self._corrected(pair, before.pose))
+        if len(answer.degenerate):  # along directions that the scans do not constrain, keep the initial pose
+            correction = answer.constrained(se3.log(se3.between(before.pose, answer.pose)))
+            answer = evaluator.evaluate(se3.orthonormalise(before.pose @ se3.exp(correction)))
+        return before, evaluator.refine(answer)
 
-    def _ask(self, pair: _Pair, start: Array) -> Array:
-        """Where the network gets to from a pose ``(4, 4)``, and once more from there after a long way."""
-        found = self._once(pair, start)
-        way_m = float(np.linalg.norm(se3.between(start, found)[:3, 3]))
-        return found if way_m < _LONG_WAY_M else self._once(pair, found)
+    def _corrected(self, pair: _Pair, start: Array) -> Array:
+        """Return the network's pose from a start ``(4, 4)``; after a long correction, run the network again."""
+        found = self._run(pair, start)
+        correction_m = float(np.linalg.norm(se3.between(start, found)[:3, 3]))
+        return found if correction_m < _LONG_CORRECTION_M else self._run(pair, found)
 
-    def _once(self, pair: _Pair, start: Array) -> Array:
+    def _run(self, pair: _Pair, start: Array) -> Array:
         with at_run_time():
             pose = on_device(start, self._device)
             found = self._network.refine_seen(pair.last.maps, pair.current.maps, pose, pair.features)
             return se3.orthonormalise(found.pose[0].double().cpu().numpy())
 
     def _starts(self, initial: RelativePose, dt_s: float) -> list[Array]:
-        """The initial pose, or that and others ahead of it where it is unsure of the translation."""
+        """Return the initial pose, and where its translation is uncertain, also poses behind and ahead of it."""
         sure = initial.translation_sigma_m <= UNKNOWN_TRANSLATION_SIGMA_M
         shifts = [0.0] if sure else [speed * dt_s for speed in self._settings.start_speeds_m_s]
         return [initial.pose @ se3.exp(np.array([0, 0, 0, shift, 0, 0])) for shift in shifts]
 
-    def _is_worse(self, after: Judged, before: Judged) -> bool:
-        """Whether the loss rises on the way from the initial pose, by a way longer than what it cannot tell apart."""
+    def _is_worse(self, after: EvaluatedPose, before: EvaluatedPose) -> bool:
+        """Return whether the loss rises to the answer, and the poses are too far apart (99 %) for that to be noise."""
         if after.cost < before.cost * _RISE:
             return False
-        way = se3.log(se3.between(before.pose, after.pose))
-        return bool(way @ np.linalg.solve(before.spread(self._settings.covariance_scale), way) > CHI2_99)
+        xi = se3.log(se3.between(before.pose, after.pose))
+        return bool(xi @ np.linalg.solve(before.spread(self._settings.covariance_scale), xi) > CHI2_99)
 
-    def _answer(self, judged: Judged, details: dict[str, float]) -> RelativePose:
-        # weighed by the points alone; what a network was told of the IMU, its noise over a step (0.02°, 0.2 mm), is
-        # nothing beside the answer's own, so that it may stand beside the samples
+    def _answer(self, found: EvaluatedPose, details: dict[str, float]) -> RelativePose:
+        # The covariance comes from the points alone. IMU features make the answer depend on the samples too, but their
+        # noise over a step (0.02°, 0.2 mm) is far below the answer's own, so the graph may use both as independent.
         return RelativePose(
-            judged.pose,
-            judged.covariance(self._settings.covariance_scale),
+            found.pose,
+            found.covariance(self._settings.covariance_scale),
             source=self.name,
-            degenerate=judged.degenerate,
-            details={**details, "sigma_m": judged.sigma_m, "refined": float(judged.refined)},
+            degenerate=found.degenerate,
+            details={**details, "sigma_m": found.sigma_m, "refined": float(found.refined)},
         )
 
     def _bridge(

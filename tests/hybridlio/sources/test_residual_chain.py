@@ -35,7 +35,7 @@ class Moved:
     def propose(self, _, initial):
         return self._moved(initial) if self._ok else None
 
-    def judge(self, frame, initial):
+    def assess(self, frame, initial):
         return self.refine(frame, initial)
 
     def _moved(self, initial):
@@ -105,7 +105,7 @@ def test_from_a_certain_pose_the_first_source_only_proposes():
     assert found.details == {"fine ok": 1, "fine cost": 0.03}
 
 
-def test_if_the_second_source_fails_from_a_certain_pose_the_proposal_is_judged_and_used():
+def test_if_the_second_source_fails_from_a_certain_pose_the_proposal_is_assessed_and_used():
     class Keeping(Moved):
         def take_back(self, initial):
             self.kept = initial

@@ -27,7 +27,7 @@ def initial(error: np.ndarray) -> RelativePose:
     return RelativePose(STEP @ se3.exp(error), WIDE, source="guess", from_imu=True)
 
 
-def test_steps_down_the_loss_find_the_pose_and_its_covariance_covers_what_is_left(weights, seen):
+def test_refinement_finds_the_pose_and_the_covariance_covers_its_error(weights, seen):
     path, normalised = weights(), []
     for seed in range(4):
         scans = [seen(np.eye(4), seed=2 * seed), seen(STEP, seed=2 * seed + 1)]
@@ -43,7 +43,7 @@ def test_steps_down_the_loss_find_the_pose_and_its_covariance_covers_what_is_lef
     assert np.mean(normalised) < 2.0
 
 
-def test_along_a_corridor_the_covariance_is_loose_and_the_direction_named(weights, seen):
+def test_along_a_corridor_the_covariance_is_large_and_the_direction_listed_as_degenerate(weights, seen):
     half = (500.0, 3.0, 2.0)
     scans = [seen(np.eye(4), half, seed=0), seen(STEP, half, seed=1)]
     found = source(weights(), scans, replace(FEW, refine_steps=8)).refine(frame(1), initial(OFF))
@@ -63,7 +63,7 @@ def answering(residual, pose, monkeypatch):
     monkeypatch.setattr(residual._network, "refine_seen", lambda *_: answer)
 
 
-def test_an_answer_that_the_loss_finds_worse_is_not_passed_on_and_the_log_says_why(weights, seen, monkeypatch, caplog):
+def test_an_answer_of_higher_loss_is_rejected_and_the_reason_logged(weights, seen, monkeypatch, caplog):
     residual = source(weights(), [seen(np.eye(4), seed=0), seen(STEP, seed=1)], replace(FEW, refine_steps=0))
     answering(residual, STEP @ se3.exp(3 * OFF), monkeypatch)
     found = residual.refine(frame(1), initial(OFF))
@@ -71,10 +71,10 @@ def test_an_answer_that_the_loss_finds_worse_is_not_passed_on_and_the_log_says_w
     assert np.allclose(found.pose, initial(OFF).pose)
     assert np.array_equal(found.covariance, WIDE)
     assert found.details["cost"] > found.details["initial_cost"]
-    assert "frame 1: bridged by the initial pose: network: the loss finds the answer worse" in caplog.text
+    assert "frame 1: bridged by the initial pose: network: the loss of the answer is higher" in caplog.text
 
 
-def test_a_bad_answer_is_mended_by_steps_down_the_loss_and_a_good_one_left_alone(weights, seen, monkeypatch):
+def test_refinement_corrects_a_bad_answer_and_keeps_a_good_one(weights, seen, monkeypatch):
     scans = [seen(np.eye(4), seed=0), seen(STEP, seed=1)]
     for error, mended in ((3 * OFF, True), (np.zeros(6), False)):
         residual = source(weights(), scans, replace(FEW, refine_steps=8))
@@ -86,7 +86,7 @@ def test_a_bad_answer_is_mended_by_steps_down_the_loss_and_a_good_one_left_alone
         assert np.abs(off[3:]).max() < (0.01 if mended else 1e-6)
 
 
-def test_how_far_off_the_losss_minimum_an_answer_is_counts_as_its_uncertainty(weights, seen, monkeypatch):
+def test_the_distance_to_the_minimum_of_the_loss_enters_the_covariance(weights, seen, monkeypatch):
     scans = [seen(np.eye(4), seed=0), seen(STEP, seed=1)]
     sigmas = []
     for error in (np.zeros(6), OFF):
@@ -99,7 +99,7 @@ def test_how_far_off_the_losss_minimum_an_answer_is_counts_as_its_uncertainty(we
     assert sigmas[1] > 3 * sigmas[0]
 
 
-def test_along_a_corridor_the_initial_pose_is_kept_whatever_the_network_says(weights, seen, monkeypatch):
+def test_along_a_corridor_the_initial_pose_is_kept_whatever_the_network_answers(weights, seen, monkeypatch):
     half = (500.0, 3.0, 2.0)
     residual = source(weights(), [seen(np.eye(4), half, seed=0), seen(STEP, half, seed=1)])
     answering(residual, se3.exp([0, 0, 0, 0.5, 0, 0]) @ STEP, monkeypatch)  # half a metre along it
@@ -110,22 +110,22 @@ def test_along_a_corridor_the_initial_pose_is_kept_whatever_the_network_says(wei
     assert abs(found.pose[1, 3] - STEP[1, 3]) < 0.02
 
 
-def test_a_proposal_is_the_networks_answer_as_it_is_and_can_be_judged_afterwards(weights, seen, monkeypatch):
+def test_a_proposal_is_the_networks_own_answer_and_can_be_assessed_afterwards(weights, seen, monkeypatch):
     scans, wrong = [seen(np.eye(4), seed=0), seen(STEP, seed=1)], STEP @ se3.exp(3 * OFF)
-    judged = []
+    answers = []
     for proposing in (True, False):
         residual = source(weights(), scans, replace(FEW, refine_steps=0))
         answering(residual, wrong, monkeypatch)
         if proposing:
             assert np.allclose(residual.propose(frame(1), initial(OFF)), wrong, atol=1e-6)
-        judged.append((residual.judge if proposing else residual.refine)(frame(1), initial(OFF)))
-    assert not judged[0].ok
-    assert np.array_equal(judged[0].covariance, judged[1].covariance)
-    assert judged[0].details == judged[1].details
+        answers.append((residual.assess if proposing else residual.refine)(frame(1), initial(OFF)))
+    assert not answers[0].ok
+    assert np.array_equal(answers[0].covariance, answers[1].covariance)
+    assert answers[0].details == answers[1].details
 
 
 @pytest.mark.parametrize(("ahead_m", "looks"), [(0.1, 1), (0.3, 2)])
-def test_after_a_long_way_the_network_looks_once_more(weights, seen, monkeypatch, ahead_m, looks):
+def test_after_a_long_correction_the_network_runs_again(weights, seen, monkeypatch, ahead_m, looks):
     residual, starts = source(weights(), [seen(np.eye(4), seed=0), seen(STEP, seed=1)]), []
     answer = type("Answer", (), {"pose": torch.tensor(STEP, dtype=torch.float32)[None]})
     monkeypatch.setattr(residual._network, "refine_seen", lambda *given: (starts.append(given[2]), answer)[1])
@@ -134,9 +134,7 @@ def test_after_a_long_way_the_network_looks_once_more(weights, seen, monkeypatch
     assert np.allclose(starts[-1][0], STEP, atol=1e-6) == (looks == 2)
 
 
-def test_however_often_the_network_looks_it_is_told_of_the_imu_once_a_scan_and_of_the_velocity_before_it(
-    weights, seen, monkeypatch
-):
+def test_imu_features_are_computed_once_a_scan_with_the_velocity_before_it(weights, seen, monkeypatch):
     scans = [seen(np.linalg.matrix_power(STEP, k), seed=k) for k in range(3)]
     residual = source(weights(imu="feature", velocity=True), scans, replace(FEW, refine_steps=0))
     told, velocities = [], []
@@ -151,18 +149,18 @@ def test_however_often_the_network_looks_it_is_told_of_the_imu_once_a_scan_and_o
     far = initial(np.array([0, 0, 0, 0.3, 0, 0]))
     for k in (1, 2):
         residual.propose(frame(k), far)
-        residual.judge(frame(k), far)
+        residual.assess(frame(k), far)
     assert len(told) == 8  # twice each time, for the way is long
     assert len({id(features) for features in told}) == len(velocities) == 2
     assert np.allclose(velocities, [np.zeros(3), STEP[:3, :3].T @ STEP[:3, 3] / 0.1], atol=1e-5)
 
 
-def test_of_a_scan_with_too_little_to_see_nothing_is_proposed(weights, seen):
+def test_a_scan_with_too_few_cells_gets_no_proposal(weights, seen):
     residual = source(weights(), [seen(np.eye(4)), replace_points(seen(STEP, seed=1), 50)])
     assert residual.propose(frame(1), initial(OFF)) is None
 
 
-def test_the_network_takes_one_thread_and_leaves_others_theirs(weights, seen, monkeypatch):
+def test_the_network_runs_on_one_thread_and_restores_the_number_of_threads(weights, seen, monkeypatch):
     torch.set_num_threads(2)
     residual, threads = source(weights(), [seen(np.eye(4), seed=0), seen(STEP, seed=1)]), []
     refine = residual._network.refine_seen
@@ -173,7 +171,7 @@ def test_the_network_takes_one_thread_and_leaves_others_theirs(weights, seen, mo
     assert (threads, torch.get_num_threads()) == ([1], 2)
 
 
-def test_too_little_to_see_is_bridged_and_the_scan_after_it_too(weights, seen):
+def test_a_scan_with_too_few_cells_is_bridged_and_so_is_the_next_one(weights, seen):
     good, poor = seen(np.eye(4)), replace_points(seen(STEP, seed=1), 50)
     residual = source(weights(), [good, poor, good, good], replace(FEW, refine_steps=3))
     at_rest = RelativePose(se3.exp(OFF), WIDE, source="guess")
@@ -185,7 +183,7 @@ def replace_points(scan, count):
     return type(scan)(scan.points[:count])
 
 
-def test_a_first_scan_without_much_in_it_is_an_error(weights, seen):
+def test_a_first_scan_with_too_few_cells_is_an_error(weights, seen):
     with pytest.raises(DataError, match="frame 0"):
         source(weights(), [replace_points(seen(np.eye(4)), 20)])
 
@@ -200,14 +198,14 @@ def test_scans_prepared_for_other_cells_are_refused(weights, seen):
 @pytest.mark.parametrize(
     "changes", [{"imu": "given"}, {"imu": "none"}, {"imu": "feature"}, {"normals": "none"}], ids=str
 )
-def test_any_networks_residual_serves_any_initial_pose(weights, seen, changes):
+def test_every_variant_of_the_network_refines_a_given_initial_pose(weights, seen, changes):
     scans = [seen(np.eye(4), seed=0), seen(STEP, seed=1)]
     found = source(weights(**changes), scans, replace(FEW, refine_steps=8)).refine(frame(1), initial(OFF))
     assert found.ok
     assert not found.from_imu  # weighed by the points, it may stand in a graph beside the samples
 
 
-def test_scans_several_steps_apart_are_compared_by_their_points_alone(weights, seen):
+def test_scans_several_steps_apart_are_registered_by_their_points_alone(weights, seen):
     scans = [seen(np.linalg.matrix_power(STEP, k), seed=k) for k in range(4)]
     residual = source(weights(imu="feature"), scans, replace(FEW, refine_steps=8))
     first = residual.current_scan
@@ -222,7 +220,7 @@ def test_scans_several_steps_apart_are_compared_by_their_points_alone(weights, s
     assert np.abs(error[3:]).max() < 0.02
 
 
-def test_a_pair_of_which_too_little_is_to_be_seen_gives_the_initial_pose_back(weights, seen):
+def test_a_pair_with_too_few_cells_returns_the_initial_pose(weights, seen):
     residual = source(weights(), [seen(np.eye(4)), replace_points(seen(STEP, seed=1), 50)])
     first = residual.current_scan
     residual.refine(frame(1), initial(OFF))

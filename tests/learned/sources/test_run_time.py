@@ -44,13 +44,13 @@ def test_a_pair_on_which_the_network_fails_is_listed_and_weighs_nothing(weights,
     path = str(weights(geometry=GEOMETRY, projective_steps=3))
     options = PreparationOptions(geometry=GEOMETRY, loss_points=2000, threads=1)
     residual = NetworkResidual(lambda _: partial(prepare, options=options), replace(FEW, weights=path, refine_steps=0))
-    ask, count = residual._ask, iter(range(99))
+    ask, count = residual._corrected, iter(range(99))
 
     def failing(*given):
         answer = ask(*given)
         return answer + (next(count) == 4) * np.eye(4)[:, [3, 0, 1, 2]].T
 
-    monkeypatch.setattr(residual, "_ask", failing)
+    monkeypatch.setattr(residual, "_corrected", failing)
     sequence = hl.open_sequence(tiny_drive).part(0, 12)
     run = run_odometry(sequence, hl.Odometry(residual=residual))
     assert run.stopped is None
