@@ -1,9 +1,9 @@
-"""What each departure of the default network from the paper's is worth, all rows trained for the same number of steps.
+"""Measure the effect of each departure of the default network from the paper's; all train for the same number of steps.
 
     python benchmarks/departures.py DRIVE… --test DRIVE… [--steps 100] [--rows A,B] [--cache DIR] [-o DIR]
 
-Drives are recordings with a reference, such as simulated ones, or their shards. Given again with the same -o, finished
-rows are not trained again. The first line is the untrained network.
+DRIVE is a recording with a reference, such as a simulated one, or its shard. A second call with the same -o does not
+train finished rows again. The first row is the untrained network.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import torch
-from front_end import SIZES, Row, shaken, steps_left
+from front_end import PERTURBATIONS, Row, errors_by_step, perturbed
 
 from hybridlio.core import tables
 from hybridlio.core.files import write_atomically
@@ -29,20 +29,20 @@ from hybridlio.runs.recipes import for_steps
 from hybridlio.runs.training_data import DataOptions, prepare_shards
 
 
-def measured(name: str, network: OdometryNetwork, tests: list[Shard]) -> Iterator[Row]:
-    """A line for each test recording: what is left of the larger error, and the chained steps."""
+def measure(name: str, network: OdometryNetwork, tests: list[Shard]) -> Iterator[Row]:
+    """Yield a row for each test recording: error left of the larger perturbation, drift of the chained steps."""
     for shard in tests:
         reference = shard.reference[1:]
-        degrees, metres = steps_left(network, shard, reference, shaken(reference, *SIZES[0]))[-1]
+        degrees, metres = errors_by_step(network, shard, reference, perturbed(reference, *PERTURBATIONS[0]))[-1]
         driven = drive(network, shard)
-        off_deg, off_m = step_errors(driven.initial, driven.reference)
+        initial_deg, initial_m = step_errors(driven.initial, driven.reference)
         t_rel, r_rel = driven.drift or (None, None)
         yield {
             "preset": name,
-            "numbers": str(parameter_count(network)),
+            "parameters": str(parameter_count(network)),
             "recording": shard.info.name,
-            "left of 14.5 cm / 0.41°": f"{100 * metres:.2f} cm / {degrees:.3f}°",
-            "initial pose off by": f"{100 * off_m:.1f} cm / {off_deg:.2f}°",
+            "error left of 14.5 cm / 0.41°": f"{100 * metres:.2f} cm / {degrees:.3f}°",
+            "error of the initial pose": f"{100 * initial_m:.1f} cm / {initial_deg:.2f}°",
             "t_rel [%]": tables.number(t_rel, 2),
             "r_rel [°/100 m]": tables.number(r_rel, 2),
         }
@@ -50,12 +50,14 @@ def measured(name: str, network: OdometryNetwork, tests: list[Shard]) -> Iterato
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("train", type=Path, nargs="+")
-    parser.add_argument("--test", type=Path, nargs="+", required=True)
-    parser.add_argument("--steps", type=int, default=100)
-    parser.add_argument("--rows", default="")
-    parser.add_argument("--cache", type=Path, default=Path("shards"))
-    parser.add_argument("-o", "--out", type=Path, default=Path("departures"))
+    parser.add_argument("train", type=Path, nargs="+", metavar="DRIVE", help="to train on")
+    parser.add_argument("--test", type=Path, nargs="+", required=True, metavar="DRIVE", help="to measure on")
+    parser.add_argument("--steps", type=int, default=100, help="of training (default: %(default)s)")
+    parser.add_argument("--rows", default="", metavar="A,B", help="presets (default: all departures)")
+    parser.add_argument("--cache", type=Path, default=Path("shards"), metavar="DIR", help="for shards")
+    parser.add_argument(
+        "-o", "--out", type=Path, default=Path("departures"), metavar="DIR", help="for weights and table"
+    )
     options = parser.parse_args()
     wanted = [name for name in options.rows.split(",") if name]
     prepared = DataOptions(options.cache)
@@ -64,7 +66,7 @@ def main() -> None:
         return prepare_shards(options.test, recipe, prepared)
 
     torch.manual_seed(0)
-    lines = list(measured("default, untrained", OdometryNetwork(DEFAULT.network).eval(), tests(DEFAULT)))
+    rows = list(measure("default, untrained", OdometryNetwork(DEFAULT.network).eval(), tests(DEFAULT)))
     for recipe in DEPARTURES:
         if wanted and recipe.name not in wanted:
             continue
@@ -73,9 +75,9 @@ def main() -> None:
         network = train(
             recipe, pairs, options.out / recipe.name, options=RunOptions(device="cpu", max_steps=options.steps)
         )
-        lines += measured(recipe.name, network.eval(), tests(recipe))
-        print(tables.to_markdown(lines[-len(options.test) :], ("preset", "recording")), flush=True)
-    text = tables.to_markdown(lines, ("preset", "recording"))
+        rows += measure(recipe.name, network.eval(), tests(recipe))
+        print(tables.to_markdown(rows[-len(options.test) :], ("preset", "recording")), flush=True)
+    text = tables.to_markdown(rows, ("preset", "recording"))
     write_atomically(options.out / "departures.md", text + "\n")
     print(text)
 

@@ -1,18 +1,18 @@
-"""Whether a change leaves every result as it was, to the last bit.
+"""Check that a change leaves every result the same to the last bit.
 
     python benchmarks/digests.py FOLDER [--data SHARED_DATA] [-o before.json]
     python benchmarks/digests.py FOLDER [--data SHARED_DATA] [-o after.json] --compare before.json
 
-Runs the commands `simulate`, `odometry` and `smooth` of the checkout that this file lies in, and keeps a SHA-256 digest
-of every result: the poses as text, each array in `covariances.npz`, the same of the smoothed run, and the recording.
-It uses only the command line, so that modules may move in between.
+Runs the commands `simulate`, `odometry` and `smooth` of the checkout that holds this file, and writes a SHA-256 digest
+of every result: the recording, the poses as text, each array of `covariances.npz`, and the same of the smoothed run. It
+uses the command line alone, so modules may move between two calls.
 
-Drives are simulated below FOLDER unless they are there; give an empty FOLDER to put the simulator to the test as well.
-SHARED_DATA holds `unpack.py` and KITTI's drives, whose cases are left out without it. Runs stay in FOLDER/runs, below
-the name of the file with the digests, for a look at what differs.
+Drives that FOLDER lacks are simulated; give an empty FOLDER to check the simulator as well. SHARED_DATA holds
+`unpack.py` and KITTI's drives; without it their cases are left out. Runs stay in FOLDER/runs/NAME, where NAME is that
+of the file of digests, so that differences can be inspected.
 
-Numerical libraries get one thread each, in every process alike (--threads). Other versions of them, or another
-processor, may change last bits by themselves; it says so where the earlier digests are of other circumstances.
+All numerical libraries use the same number of threads (--threads). Other versions of them, or another processor, can
+change the last bits too; the comparison lists such differences between the two calls.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ KITTI, WITHOUT_IMU = "kitti-", "without-imu"
 
 Digests = dict[str, str]
 
-DRIVES = {  # how each is simulated
+DRIVES = {  # options of `hybridlio simulate`
     "demo": "--seconds 60 --seed 1",
     "hdl-64e": "--seconds 20 --seed 2",
     "16-beam": "--seconds 20 --seed 3 --lidar 16-beam",
@@ -49,7 +49,7 @@ DRIVES = {  # how each is simulated
 
 
 class Case(NamedTuple):
-    """A recording, by its folder's name, and how odometry is run on it."""
+    """The name of a recording's folder, and options of `hybridlio odometry`."""
 
     recording: str
     options: str = ""
@@ -63,8 +63,8 @@ CASES = {
 }
 
 
-class Bench:
-    """Runs the checkout's commands.
+class Commands:
+    """Runs the commands of this checkout.
 
     Args:
         folder: for recordings and runs.
@@ -77,10 +77,10 @@ class Bench:
         self._env = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"} | dict.fromkeys(THREADS, str(threads))
         where = Path(self._python("-c", "import hybridlio; print(hybridlio.__file__)").strip())
         if not where.is_relative_to(ROOT):
-            sys.exit(f"the commands would be those of {where}, not of {ROOT}")
+            sys.exit(f"hybridlio would be imported from {where}, not from {ROOT}")
 
     def recording(self, name: str) -> Path | None:
-        """The recording's folder, made unless it is there; None if it is one of KITTI's that are not at hand."""
+        """Return the folder of a recording, made if necessary; None for one of KITTI's without its data."""
         if name.startswith(KITTI):
             return self._kitti(name.removeprefix(KITTI)) if self._unpack and self._unpack.is_file() else None
         folder = self._folder / name
@@ -95,7 +95,7 @@ class Bench:
         return folder
 
     def run(self, data: Path, options: str, out: Path) -> Path:
-        """The folder of an odometry run on a recording, smoothed too, in place of an earlier one."""
+        """Run odometry and smoothing on a recording and return the folder; replaces an earlier run."""
         run = self._folder / "runs" / out
         shutil.rmtree(run, ignore_errors=True)
         self._python("-m", "hybridlio", "odometry", data, *options.split(), "-o", run)
@@ -107,7 +107,7 @@ class Bench:
         return self._folder / "kitti/kitti_raw/2011_09_26" / f"2011_09_26_drive_{drive}_sync"
 
     def _python(self, *words: str | Path) -> str:
-        """What a Python process prints; this one ends if that fails."""
+        """Run Python and return its output; exit if it fails."""
         command = [sys.executable, *map(str, words)]
         done = subprocess.run(command, cwd=ROOT, env=self._env, capture_output=True, text=True, check=False)
         if done.returncode:
@@ -116,7 +116,7 @@ class Bench:
 
 
 def digests_of_run(run: Path) -> Digests:
-    """Digests of a run's results and of the smoothed ones, by file and array."""
+    """Return digests of a run's results and of the smoothed ones, by file and array."""
     found: Digests = {}
     for folder in (run, run / SMOOTHED):
         poses, covariances = folder / POSES, folder / COVARIANCES
@@ -125,22 +125,22 @@ def digests_of_run(run: Path) -> Digests:
             continue
         with np.load(covariances, allow_pickle=False) as arrays:
             for name, array in sorted(arrays.items()):
-                told = hashlib.sha256(f"{name} {array.dtype.str} {array.shape}\n".encode())
-                told.update(np.ascontiguousarray(array).tobytes())
-                found[f"{covariances.relative_to(run)}: {name}"] = told.hexdigest()
+                digest = hashlib.sha256(f"{name} {array.dtype.str} {array.shape}\n".encode())
+                digest.update(np.ascontiguousarray(array).tobytes())
+                found[f"{covariances.relative_to(run)}: {name}"] = digest.hexdigest()
     return found
 
 
 def digest_of_files(folder: Path) -> str:
-    """One digest of the names and contents of all files below a folder."""
-    told = hashlib.sha256()
+    """Return one digest of the names and contents of all files in a folder and its subfolders."""
+    digest = hashlib.sha256()
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
-        told.update(f"{path.relative_to(folder)} {hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())
-    return told.hexdigest()
+        digest.update(f"{path.relative_to(folder)} {hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())
+    return digest.hexdigest()
 
 
 def circumstances(threads: int) -> dict[str, str]:
-    """What may change last bits although no line of the library changed."""
+    """Return what can change the last bits besides the code: threads, Python, processor, libraries."""
     lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
     processor = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown")
     python = {"threads": str(threads), "python": platform.python_version(), "processor": processor}
@@ -148,14 +148,14 @@ def circumstances(threads: int) -> dict[str, str]:
 
 
 def compare(found: dict[str, Any], earlier: dict[str, Any], cases: list[str]) -> bool:
-    """Print what is the same and what is not; whether everything is."""
+    """Print which results are the same, and return whether all are."""
     for name in sorted(found["circumstances"].keys() | earlier["circumstances"].keys()):
-        now, then = (told["circumstances"].get(name) for told in (found, earlier))
+        now, then = (one["circumstances"].get(name) for one in (found, earlier))
         if now != then:
-            print(f"other circumstances: {name} was {then} and is {now}")
+            print(f"changed: {name} from {then} to {now}")
     verdicts = []
     for case in cases:
-        now, then = (told["cases"].get(case, {}).get("digests", {}) for told in (found, earlier))
+        now, then = (one["cases"].get(case, {}).get("digests", {}) for one in (found, earlier))
         for file in [*then, *(now.keys() - then.keys())]:
             both = now.get(file), then.get(file)
             verdicts.append("same" if both[0] == both[1] else "DIFFERENT" if all(both) else "ONLY IN ONE")
@@ -168,25 +168,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="for recordings and runs")
     parser.add_argument("--data", type=Path, metavar="SHARED_DATA", help="the folder that holds unpack.py")
-    parser.add_argument("--cases", default=",".join(CASES), metavar="A,B,…", help="by default all: %(default)s")
+    parser.add_argument("--cases", default=",".join(CASES), metavar="A,B,…", help="(default: all)")
     parser.add_argument("--threads", type=int, default=1, help="of each numerical library (default: %(default)s)")
-    parser.add_argument("--compare", type=Path, metavar="EARLIER", help="digests to hold these against")
+    parser.add_argument("--compare", type=Path, metavar="EARLIER", help="digests to compare with")
     parser.add_argument("-o", "--out", type=Path, default=Path("digests.json"), help="(default: %(default)s)")
     options = parser.parse_args()
     cases = options.cases.split(",")
     if unknown := set(cases) - CASES.keys():
         parser.error(f"unknown cases: {', '.join(sorted(unknown))}")
     earlier = json.loads(options.compare.read_text()) if options.compare else None
-    bench = Bench(options.folder, options.data, options.threads)
+    commands = Commands(options.folder, options.data, options.threads)
     found: dict[str, Any] = {"circumstances": circumstances(options.threads), "cases": {}}
     for name in cases:
         began = time.monotonic()
-        data = bench.recording(CASES[name].recording)
+        data = commands.recording(CASES[name].recording)
         if data is None:
-            print(f"{name}: left out, as --data does not give a folder that holds unpack.py", flush=True)
+            print(f"{name}: left out, as --data names no folder that holds unpack.py", flush=True)
             continue
         ready = time.monotonic()
-        run = bench.run(data, CASES[name].options, Path(options.out.stem) / name)
+        run = commands.run(data, CASES[name].options, Path(options.out.stem) / name)
         digests = {RECORDING: digest_of_files(data), **digests_of_run(run)}
         seconds = {"recording": round(ready - began, 1), "run": round(time.monotonic() - ready, 1)}
         found["cases"][name] = {"seconds": seconds, "digests": digests}

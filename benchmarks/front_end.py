@@ -1,12 +1,12 @@
-"""How good the learned front end is, and what it costs: accuracy of a step, drift without a graph, time by stage.
+"""Measure the learned front end: error left in a step, drift without a graph, adaptation, time by stage.
 
     python benchmarks/front_end.py --simulated DRIVE… --real DRIVE… --long DRIVE… --adapt --time [--cache DIR] [-o DIR]
 
-`--simulated` shakes true relative poses and measures what the network leaves of the error. `--real` does the same on
-recordings without an exact reference, around what small_gicp finds between full scans. `--adapt` trains the weights on
-each of two or more real recordings, without labels, and measures on the others. `--long` chains the steps of LSTMs and
-network, without a graph. `--time` takes the first two scans of the first recording given. Prints Markdown; -o keeps the
-figures.
+`--simulated` perturbs true relative poses and measures the error that the network leaves. `--real` does the same for
+recordings without an exact reference; small_gicp's registration of full scans takes its place. `--adapt` trains the
+weights on each of two or more real recordings, without labels, and measures on the others. `--long` chains the steps of
+LSTMs and network, without a graph. `--time` measures the first two scans of the first recording given. Prints Markdown;
+-o writes all figures to front_end.json.
 """
 
 from __future__ import annotations
@@ -41,23 +41,26 @@ from hybridlio.runs.recipes import adaptation_recipe
 from hybridlio.runs.training_data import DataOptions, prepare_shards
 
 Row = dict[str, str]
+Sizes = tuple[tuple[float, float], ...]  # degrees and metres
 
-SIZES = ((0.41, 0.145), (0.10, 0.054))  # degrees and metres, root mean square over pairs
-REAL_SIZES = ((0.41, 0.149),)
-THIN_M, REACH_M = 0.2, 1.0  # of small_gicp's registration
+PERTURBATIONS = ((0.41, 0.145), (0.10, 0.054))  # degrees and metres, RMS over pairs
+REAL_PERTURBATIONS = ((0.41, 0.149),)
+VOXEL_M, MAX_DISTANCE_M = 0.2, 1.0  # small_gicp's thinning and largest distance of a match
 
 
-def shaken(reference: Array, rotation_deg: float, translation_m: float) -> Array:
-    """Poses ``(N, 4, 4)`` whose errors are of these sizes, root mean square, the same draws every time."""
+def perturbed(reference: Array, rotation_deg: float, translation_m: float) -> Array:
+    """Return poses ``(N, 4, 4)`` with random errors of these RMS sizes, always the same draws."""
     sigmas = np.r_[np.full(3, np.radians(rotation_deg)), np.full(3, translation_m)] / np.sqrt(3)
     draws = np.random.default_rng(0).normal(size=(len(reference), 6)) * sigmas
     return reference @ se3.exp(draws)
 
 
 @torch.no_grad()
-def steps_left(network: OdometryNetwork, shard: Shard, reference: Array, initial: Array) -> list[tuple[float, float]]:
-    """Degrees and metres left before, and after each of the network's steps, over all pairs of a shard."""
-    # of every pair, also those whose last velocity nobody knows: it does not matter here
+def errors_by_step(
+    network: OdometryNetwork, shard: Shard, reference: Array, initial: Array
+) -> list[tuple[float, float]]:
+    """Return the RMS error in degrees and metres before, and after each of the network's steps, over all pairs."""
+    # the last velocity is not used here, so pairs without one count too
     pairs, poses = Pairs([shard], replace(network.settings, velocity=False)), []
     rows = [pairs.where(i)[1] - 1 for i in range(len(pairs))]
     for i, row in enumerate(rows):
@@ -69,16 +72,16 @@ def steps_left(network: OdometryNetwork, shard: Shard, reference: Array, initial
 
 
 def gicp_steps(sequence: Sequence) -> Array:
-    """``T_k_k1`` ``(N, 4, 4)`` by generalised ICP between full scans, from the recording's own reference."""
+    """Return ``T_k_k1`` ``(N, 4, 4)`` by GICP between full scans, started from the recording's own reference."""
     assert sequence.reference is not None
     steps, last = [], None
     for k in range(len(sequence)):
         points = prepare(sequence[k].scan).points.astype(np.float64)
-        cloud, tree = small_gicp.preprocess_points(points, downsampling_resolution=THIN_M, num_threads=2)
+        cloud, tree = small_gicp.preprocess_points(points, downsampling_resolution=VOXEL_M, num_threads=2)
         if last is not None:
             start = se3.between(sequence.reference.poses[k - 1], sequence.reference.poses[k])
             found = small_gicp.align(
-                last[0], cloud, last[1], start, registration_type="GICP", max_correspondence_distance=REACH_M,
+                last[0], cloud, last[1], start, registration_type="GICP", max_correspondence_distance=MAX_DISTANCE_M,
                 num_threads=2,
             )  # fmt: skip
             steps.append(np.asarray(found.T_target_source))
@@ -86,15 +89,20 @@ def gicp_steps(sequence: Sequence) -> Array:
     return np.array(steps)
 
 
-def accuracy_rows(network: OdometryNetwork, name: str, shard: Shard, reference: Array, sizes: object) -> Iterator[Row]:
-    for rotation_deg, translation_m in sizes:  # type: ignore[attr-defined]
-        figures = steps_left(network, shard, reference, shaken(reference, rotation_deg, translation_m))
+def accuracy_rows(network: OdometryNetwork, shard: Shard, reference: Array, perturbations: Sizes) -> Iterator[Row]:
+    for rotation_deg, translation_m in perturbations:
+        figures = errors_by_step(network, shard, reference, perturbed(reference, rotation_deg, translation_m))
         cells = [f"{100 * metres:.2f} cm / {degrees:.3f}°" for degrees, metres in figures]
-        yield {"recording": name, "initial error": cells[0], "after one step": cells[1], "left": cells[-1]}
+        yield {
+            "recording": shard.info.name,
+            "initial error": cells[0],
+            "after one step": cells[1],
+            "after all steps": cells[-1],
+        }
 
 
 def adapted(weights: Weights, shard: Shard) -> OdometryNetwork:
-    """The network after going on with its training on a recording, without labels."""
+    """Return the network trained further on a recording, without labels."""
     recipe = adaptation_recipe(weights.recipe)
     with tempfile.TemporaryDirectory() as folder:
         start = weights.fitting(recipe.network)
@@ -102,40 +110,41 @@ def adapted(weights: Weights, shard: Shard) -> OdometryNetwork:
 
 
 def stages(network: OdometryNetwork, sequence: Sequence) -> dict[str, Callable[[], object]]:
-    """What is done for each scan, one stage at a time, and registration by small_gicp to compare with."""
+    """Return the stages of a scan as functions, and registration by small_gicp for comparison."""
     last, current = (prepare(sequence[k].scan).points for k in (0, 1))
-    geometry, thinned = network.settings.geometry, THIN_M
+    geometry, threads = network.settings.geometry, torch.get_num_threads()
     maps = [torch.from_numpy(vertex_map(points, geometry))[None] for points in (last, current)]
     seen = [network.look(one) for one in maps]
     start = torch.eye(4)[None]
     imu, velocity, dt = torch.zeros(1, network.settings.imu_samples, 6), torch.zeros(1, 3), torch.full((1,), 0.1)
 
-    def all_of_it() -> None:
+    def maps_and_network() -> None:
         vertices = torch.from_numpy(vertex_map(current, geometry))[None]
         assert network.imu_network is not None
         pose = network.imu_network(imu, velocity, dt)
         network.refine_seen(seen[0], network.look(vertices), pose)
 
     def registration() -> None:
-        target = small_gicp.preprocess_points(last.astype(np.float64), thinned, num_threads=torch.get_num_threads())
-        source = small_gicp.preprocess_points(current.astype(np.float64), thinned, num_threads=torch.get_num_threads())
-        small_gicp.align(target[0], source[0], target[1], num_threads=torch.get_num_threads())
+        target = small_gicp.preprocess_points(last.astype(np.float64), VOXEL_M, num_threads=threads)
+        source = small_gicp.preprocess_points(current.astype(np.float64), VOXEL_M, num_threads=threads)
+        small_gicp.align(target[0], source[0], target[1], num_threads=threads)
 
     return {
         "vertex map": lambda: vertex_map(current, geometry),
         "normal map, features": lambda: network.look(maps[1]),
         "LSTMs": lambda: network.imu_network(imu, velocity, dt),  # type: ignore[misc]
         "residual": lambda: network.refine_seen(seen[0], seen[1], start),
-        "both maps and network": all_of_it,
+        "both maps and network": maps_and_network,
         "small_gicp, both scans": registration,
     }
 
 
 @torch.no_grad()
 def time_rows(network: OdometryNetwork, sequence: Sequence, threads: int, runs: int = 30) -> list[Row]:
-    """Median milliseconds of each stage by the clock and of the processor, all in turn, and as a share of small_gicp's.
+    """Return median wall-clock and processor milliseconds of each stage, and the ratio to small_gicp's.
 
-    A busy machine lengthens the former; with several threads, waiting for each other counts as work in the latter.
+    The stages take turns. Other load on the machine lengthens wall-clock time; processor time includes the spinning of
+    threads that wait for each other.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
@@ -157,7 +166,7 @@ def time_rows(network: OdometryNetwork, sequence: Sequence, threads: int, runs: 
             "median [ms]": f"{median[0]:.1f}",
             "processor, median [ms]": f"{median[1]:.1f}",
             "processor, least [ms]": f"{min(times[1] for times in took[name]):.1f}",
-            "processor, of small_gicp": f"{median[1] / peer[1]:.2f}",
+            "processor, relative to small_gicp": f"{median[1] / peer[1]:.2f}",
         }
         for name, median in medians.items()
     ]
@@ -173,50 +182,49 @@ def drift_rows(network: OdometryNetwork, shards: list[Shard]) -> Iterator[Row]:
             "length [m]": f"{length:.0f}",
             "t_rel [%]": tables.number(t_rel, 2),
             "r_rel [°/100 m]": tables.number(r_rel, 2),
-            "initial pose off by": f"{100 * lstm[1]:.1f} cm / {lstm[0]:.3f}°",
+            "error of the initial pose": f"{100 * lstm[1]:.1f} cm / {lstm[0]:.3f}°",
         }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--weights", default="shipped")
+    parser.add_argument("--weights", default="shipped", help="a file or the name of shipped weights")
     for name in ("--simulated", "--real", "--long"):
-        parser.add_argument(name, type=Path, nargs="*", default=[])
-    parser.add_argument("--adapt", action="store_true")
-    parser.add_argument("--time", action="store_true")
-    parser.add_argument("--cache", type=Path, default=Path("shards"))
-    parser.add_argument("-o", "--out", type=Path)
+        parser.add_argument(name, type=Path, nargs="*", default=[], metavar="DRIVE")
+    parser.add_argument("--adapt", action="store_true", help="train on each real recording, test on the others")
+    parser.add_argument("--time", action="store_true", help="measure the time of each stage")
+    parser.add_argument("--cache", type=Path, default=Path("shards"), metavar="DIR", help="for shards")
+    parser.add_argument("-o", "--out", type=Path, metavar="DIR", help="for front_end.json")
     options = parser.parse_args()
     weights = load_weights(weights_path(options.weights))
-    network, told = weights.network(), {}
+    network, found = weights.network(), {}
 
     def shards(paths: list[Path]) -> list[Shard]:
         return prepare_shards(paths, weights.recipe, DataOptions(options.cache)) if paths else []
 
     def show(title: str, rows: list[Row]) -> None:
         if rows:
-            told[title] = rows
+            found[title] = rows
             print(f"\n{title}\n\n{tables.to_markdown(rows, ('recording', 'stage', 'weights'))}", flush=True)
 
-    rows = [
-        row for s in shards(options.simulated) for row in accuracy_rows(network, s.info.name, s, s.reference[1:], SIZES)
-    ]
-    show("Simulated drives", rows)
+    simulated = shards(options.simulated)
+    show("Simulated drives", [r for s in simulated for r in accuracy_rows(network, s, s.reference[1:], PERTURBATIONS)])
     real = [(open_sequence(path), s) for path, s in zip(options.real, shards(options.real), strict=True)]
     steps = {s.info.name: gicp_steps(sequence) for sequence, s in real}
-    rows = [row for _, s in real for row in accuracy_rows(network, s.info.name, s, steps[s.info.name], REAL_SIZES)]
-    show("Real recordings", rows)
-    for _, one in real if options.adapt and len(real) > 1 else []:
-        after = adapted(weights, one)
-        others = [s for _, s in real if s is not one]
-        rows = [r for s in others for r in accuracy_rows(after, s.info.name, s, steps[s.info.name], REAL_SIZES)]
-        show(f"Adapted to {one.info.name}", rows)
+
+    def real_rows(network: OdometryNetwork, tested: list[Shard]) -> list[Row]:
+        return [r for s in tested for r in accuracy_rows(network, s, steps[s.info.name], REAL_PERTURBATIONS)]
+
+    show("Real recordings", real_rows(network, [s for _, s in real]))
+    for _, trained_on in real if options.adapt and len(real) > 1 else []:
+        others = [s for _, s in real if s is not trained_on]
+        show(f"Adapted to {trained_on.info.name}", real_rows(adapted(weights, trained_on), others))
     show("Without a graph", list(drift_rows(network, shards(options.long))))
     if options.time:
         first = (options.simulated + options.real + options.long)[0]
         show("Time for each scan", [row for n in (1, 2) for row in time_rows(network, open_sequence(first), n)])
     if options.out:
-        write_atomically(options.out / "front_end.json", json.dumps(told, indent=2) + "\n")
+        write_atomically(options.out / "front_end.json", json.dumps(found, indent=2) + "\n")
 
 
 if __name__ == "__main__":

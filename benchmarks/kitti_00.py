@@ -1,12 +1,12 @@
-"""KITTI 00 in full: a peer's odometry smoothed with the recording's own IMU and GPS.
+"""Smooth KISS-ICP's odometry of KITTI 00, all 4,541 poses, with the recording's own IMU and GPS.
 
 python benchmarks/kitti_00.py DATA [odometry imu gps outage …] [--outage-s 60]
 
-DATA holds `results/kiss_icp_00/00_poses_kitti.txt` (KISS-ICP's odometry, 4,541 poses), `kitti_imu_100hz`
-(accelerometer, gyroscope and GPS fixes of the same drive), and `kitti_odometry` with calibration, times and truth.
-The truth is only compared with: the noise of the odometry comes from how it agrees with the IMU, that of the IMU is the
-library's default, and where the clocks stand is found. `imu` smooths odometry and IMU alone, `gps` with all fixes,
-`outage` with those of 60 s left out at each of `--places` places along the drive.
+DATA holds `results/kiss_icp_00/00_poses_kitti.txt` (KISS-ICP's odometry), `kitti_imu_100hz` (accelerometer, gyroscope
+and GPS fixes of the same drive), and `kitti_odometry` with calibration, times and ground truth. The ground truth serves
+evaluation alone: the noise of the odometry is estimated from its agreement with the IMU, that of the IMU is the
+library's default, and the offset of the clocks is estimated. `imu` smooths odometry and IMU, `gps` adds all fixes, and
+`outage` leaves out 60 s of fixes, at `--places` places along the drive in turn.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from common import nanoseconds
 
 import hybridlio as hl
 from hybridlio.core import se3
@@ -37,17 +38,17 @@ T_LIDAR_IMU = se3.make(
     ],
     [-0.8086759, 0.3195559, -0.7997231],
 )
-FIX_SIGMA_M = 0.07  # the recording says nothing; smoothing raises it to what the fixes scatter
-SEARCHED_S = np.arange(-3.0, 3.0, 0.02)
+FIX_SIGMA_M = 0.07  # the recording states no accuracy; smoothing raises this to the scatter of the fixes
+CLOCK_OFFSETS_S = np.arange(-3.0, 3.0, 0.02)  # steps of 2 IMU samples; a parabola refines the best
 
 
 def read(data: Path) -> tuple[hl.Trajectory, hl.Trajectory, hl.ImuSamples, tuple[hl.GpsFix, ...]]:
-    """Truth, odometry, IMU and fixes; the last two count from the first row of the inertial file."""
+    """Return truth, odometry, IMU samples and GPS fixes; times of the last two start at the first inertial row."""
     folder = data / "kitti_odometry"
     seconds = np.loadtxt(folder / "00/times.txt")
     rows = dict(line.split(":") for line in (folder / "00/calib.txt").read_text().splitlines() if ":" in line)
     T_camera_lidar = np.vstack([np.array(rows["Tr"].split(), float).reshape(3, 4), [0, 0, 0, 1]])
-    stamps = np.round(seconds * NS_PER_S).astype(np.int64)
+    stamps = nanoseconds(seconds)
     truth = read_kitti(folder / "poses/00.txt", stamps, T_camera_lidar)
     odometry = read_kitti(data / "results/kiss_icp_00/00_poses_kitti.txt", stamps, T_camera_lidar)
     raw = np.loadtxt(data / "kitti_imu_100hz/imu_100hz.txt")
@@ -58,52 +59,52 @@ def read(data: Path) -> tuple[hl.Trajectory, hl.Trajectory, hl.ImuSamples, tuple
     return truth, odometry, imu, tuple(hl.GpsFix(t, p, covariance) for t, p in zip(times, fixes[:, 1:], strict=True))
 
 
-def nanoseconds(seconds: np.ndarray) -> np.ndarray:
-    return np.round(seconds * NS_PER_S).astype(np.int64)
+def imu_clock_offset_s(odometry: hl.Trajectory, imu: hl.ImuSamples) -> float:
+    """Return by how many seconds the IMU's clock is ahead of the scans' clock.
 
-
-def imu_clock(odometry: hl.Trajectory, imu: hl.ImuSamples) -> float:
-    """How many seconds the IMU's clock is ahead of the scans', by the speeds at which both say the vehicle turns."""
+    Minimises the median difference between the turn rates of odometry and gyroscope.
+    """
     turned = np.linalg.norm(se3.so3_log(se3.between(odometry.poses[:-1], odometry.poses[1:])[:, :3, :3]), axis=1)
     times, spans = odometry.times_s, np.diff(odometry.times_s)
     speeds = np.linalg.norm(imu.gyro_rad_s, axis=1)
     at = imu.stamps_ns / NS_PER_S
-    turned_by_then = np.concatenate([[0.0], np.cumsum((speeds[1:] + speeds[:-1]) / 2 * np.diff(at))])
+    turned_so_far = np.concatenate([[0.0], np.cumsum((speeds[1:] + speeds[:-1]) / 2 * np.diff(at))])
 
     def misfit(shift: float) -> float:
         inside = (times[:-1] + shift > at[1]) & (times[1:] + shift < at[-1])
-        integral = np.diff(np.interp(times + shift, at, turned_by_then))
+        integral = np.diff(np.interp(times + shift, at, turned_so_far))
         return float(np.median(np.abs(integral - turned)[inside] / spans[inside]))
 
-    costs = [misfit(shift) for shift in SEARCHED_S]
+    costs = [misfit(shift) for shift in CLOCK_OFFSETS_S]
     k = int(np.argmin(costs))
     before, here, after = costs[k - 1 : k + 2]
-    return float(SEARCHED_S[k] + (SEARCHED_S[1] - SEARCHED_S[0]) * (before - after) / (2 * (before - 2 * here + after)))
+    spacing = CLOCK_OFFSETS_S[1] - CLOCK_OFFSETS_S[0]
+    return float(CLOCK_OFFSETS_S[k] + spacing * (before - after) / (2 * (before - 2 * here + after)))
 
 
 def make_record(odometry: hl.Trajectory, imu: hl.ImuSamples, gps: tuple[hl.GpsFix, ...]) -> Record:
     measured, gaps = without_filled_gaps(imu)
-    shift = imu_clock(odometry, measured)
-    print(f"IMU: clock {1e3 * shift:.0f} ms ahead of the scans'; {len(gaps)} gaps filled with straight lines taken out")
+    shift = imu_clock_offset_s(odometry, measured)
+    print(f"IMU: clock {1e3 * shift:.0f} ms ahead of the scans'; {len(gaps)} interpolated gaps removed")
     on_scans = hl.ImuSamples(measured.stamps_ns - round(shift * NS_PER_S), measured.gyro_rad_s, measured.accel_m_s2)
     calibration = hl.Calibration(se3.inverse(T_LIDAR_IMU))
     noise = odometry_noise(odometry, on_scans, calibration)
-    for what, covariances in (("odometry's noise a step", noise.covariances), ("of which drift", noise.drifts)):
+    for part, covariances in (("odometry noise per step", noise.covariances), ("of which drift", noise.drifts)):
         sigmas = np.sqrt(np.median(np.diagonal(covariances, axis1=1, axis2=2), axis=0))
-        print(f"{what:>24s} {np.round(1e3 * sigmas[:3], 2)} mrad, {np.round(1e2 * sigmas[3:], 2)} cm")
+        print(f"{part:>24s} {np.round(1e3 * sigmas[:3], 2)} mrad, {np.round(1e2 * sigmas[3:], 2)} cm")
     return Record.from_odometry(odometry, on_scans, gps, calibration)
 
 
-def report(name: str, truth: hl.Trajectory, estimate: hl.Trajectory, spent: str = "") -> None:
+def report(name: str, truth: hl.Trajectory, estimate: hl.Trajectory, time_spent: str = "") -> None:
     e = hl.evaluate(truth, estimate)
     figures = f"ATE {e.ate_m:6.3f} m  t_rel {e.t_rel_percent:.3f} %  r_rel {e.r_rel_deg_per_100m:.3f} °/100 m"
-    print(f"{name:24s} {figures}  RPE {e.rpe_m:.4f} m {e.rpe_deg:.4f}°  {spent}", flush=True)
+    print(f"{name:24s} {figures}  RPE {e.rpe_m:.4f} m {e.rpe_deg:.4f}°  {time_spent}", flush=True)
 
 
 def smooth(name: str, truth: hl.Trajectory, record: Record, gps: GpsOptions | None) -> None:
     begin = time.process_time()
     smoothed = hl.smooth(record, gps=gps or False)
-    report(name, truth, smoothed.trajectory, f"{time.process_time() - begin:.0f} s of one core")
+    report(name, truth, smoothed.trajectory, f"{time.process_time() - begin:.0f} s processor time")
     if gps is not None:
         print(f"{'':24s} {smoothed.found['gps'].summary()}")
     for start, end in gps.outages if gps is not None else ():
@@ -111,15 +112,17 @@ def smooth(name: str, truth: hl.Trajectory, record: Record, gps: GpsOptions | No
         inside = (both.reference.stamps_ns >= start) & (both.reference.stamps_ns <= end)
         aligned = align(both.reference, both.estimate, lever_m=0.0).poses[inside, :3, 3]
         off = np.linalg.norm(aligned - both.reference.poses[inside, :3, 3], axis=1)
-        print(f"{'':24s} in the outage: RMSE {np.sqrt((off**2).mean()):.2f} m, at most {off.max():.2f} m", flush=True)
+        print(
+            f"{'':24s} during the outage: RMSE {np.sqrt((off**2).mean()):.2f} m, at most {off.max():.2f} m", flush=True
+        )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("parts", nargs="*", default=["odometry", "imu", "gps", "outage"])
-    parser.add_argument("--outage-s", type=float, default=60.0)
-    parser.add_argument("--places", type=int, default=8)
+    parser.add_argument("--outage-s", type=float, default=60.0, help="length of an outage (default: %(default)s)")
+    parser.add_argument("--places", type=int, default=8, help="number of outages, one a run (default: %(default)s)")
     options = parser.parse_args()
     truth, odometry, imu, gps = read(options.data)
     record = make_record(odometry, imu, gps)

@@ -1,18 +1,18 @@
-"""Whether the cost of a scan, and memory, grow with the run: one lap over and over, as one long recording.
+"""Measure how the time of a scan and memory grow over a long run: one lap, repeated, as a single recording.
 
     python benchmarks/long_run.py FOLDER [--scans 4500] [--backend fixed-lag,incremental] [-o FILE]
     python benchmarks/long_run.py --light
 
-The lap is 314 m around in a simulated town, of HDL-64E scans with a 100 Hz IMU; it is simulated below FOLDER unless it
-is there. Its end fits its beginning, so that laps follow each other as one drive. The local map forgets what is
-out of sight long before it comes again; what is seen across the circle fills up for ten laps. --light leaves the scans
-out: noisy steps and the samples of a drive straight on go through the graph alone.
+The lap is a circle of 314 m in a simulated town, with HDL-64E scans and a 100 Hz IMU. It is simulated in FOLDER unless
+FOLDER holds it, and ends where it starts, so that laps join without a gap. The local map drops what is out of sight
+long before the next lap, but what is visible across the circle accumulates for ten laps. --light leaves the scans out:
+noisy steps and the IMU samples of a straight drive go through the graph alone.
 
-Printed: how much processor time the last 500 scans take beside the first 500 of a run that has just begun, in a process
-of its own, at the same place of the lap. The two take turns scan by scan, so that what else the machine does, or how
-fast it is by then, changes both. The start's twenty scans do not count; means, as half of the scans bring a keyframe
-and a median lies between two kinds. Then median milliseconds of the first and the last 500 by stage, and resident
-memory, with the estimates kept as `hybridlio odometry` keeps them.
+Prints the ratio of two mean processor times: of the last 500 scans, and of the first 500 scans of a fresh run at the
+same places of the lap, in another process. Both take turns scan by scan, so other load and the clock rate of the
+machine affect them alike. The first 20 scans of the fresh run do not count. Means, because every other scan brings a
+keyframe, and a median would fall between the two kinds. Then come medians of the first and last 500 scans by stage, and
+resident memory; estimates are kept as `hybridlio odometry` keeps them.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import resident_mib
 
 from hybridlio.commands.terminal import progress
 from hybridlio.core import se3
@@ -44,27 +45,27 @@ from hybridlio.odometry.odometry import Odometry
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.simulate import simulate
 
-PART = 500
-WARM_UP = 20
+PART = 500  # scans that are averaged
+WARM_UP = 20  # scans of the fresh run that do not count
 LAP = 300  # scans
-RADIUS_M = 50.0  # 10.5 m/s
+RADIUS_M = 50.0  # gives 10.5 m/s
 CPU = "whole step, processor time"
 _STEP_NS = 100_000_000
 
 
-class StraightOn:
-    """A residual source that looks at nothing: 1 m a scan, give or take 2 cm."""
+class StraightDrive:
+    """A residual source that ignores the scans: 1 m forward a scan, with noise of 2 cm."""
 
-    name = "straight-on"
+    name = "straight-drive"
 
     def __init__(self) -> None:
         self._rng = np.random.default_rng(0)
 
     def start(self, frame: Frame) -> None:
-        """Nothing to keep."""
+        """Do nothing."""
 
     def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:  # noqa: ARG002
-        """The step with its noise; as of a map, so that the path has poses of its own."""
+        """Return a noisy step. It has a drift, as registration to a map has, so that the graph adds path poses."""
         sigmas = np.r_[np.full(3, 1e-3), np.full(3, 0.02)]
         step = se3.exp(np.array([0, 0, 0, 1.0, 0, 0]) + sigmas * self._rng.standard_normal(6))
         covariance = np.diag(sigmas**2)
@@ -72,7 +73,7 @@ class StraightOn:
 
 
 def light_frames(first: int, scans: int) -> Iterator[Frame]:
-    """Frames from ``first`` on without points, each with the samples of a drive straight on at one speed."""
+    """Yield frames from ``first`` on without points, with the IMU samples of a straight drive at constant speed."""
     rng, nothing = np.random.default_rng(1), np.empty((0, 3), np.float32)
     for k in range(first, scans):
         stamps = np.arange(k * _STEP_NS, (k + 1) * _STEP_NS + 1, _STEP_NS // 10)
@@ -81,86 +82,79 @@ def light_frames(first: int, scans: int) -> Iterator[Frame]:
         yield Frame(k, Scan((k + 1) * _STEP_NS, nothing), ImuSamples(stamps, gyro, accel), calibration=Calibration())
 
 
-def the_lap(folder: Path) -> Sequence:
-    """A lap whose last scan is where its first is, simulated unless it is there."""
+def simulated_lap(folder: Path) -> Sequence:
+    """Open the lap in a folder; simulate it first unless the folder holds it. It ends at its first pose."""
     turn = np.linspace(0, 2 * np.pi, LAP + 1)
     yaw = np.column_stack([np.zeros((LAP + 1, 2)), turn])
     place = RADIUS_M * np.column_stack([np.sin(turn), 1 - np.cos(turn), np.zeros(LAP + 1)])
     folder.mkdir(parents=True, exist_ok=True)
     np.savetxt(folder / "lap.txt", se3.make(se3.so3_exp(yaw), place)[:, :3].reshape(-1, 12))
     config = SimulationConfig(seed=8101, poses=folder / "lap.txt", poses_frame="lidar")
-    with progress("the lap") as tick:
+    with progress("simulating the lap") as tick:
         simulate(folder, config, tick)
     return open_sequence(folder)
 
 
 def laps(sequence: Sequence, first: int, scans: int) -> Iterator[Frame]:
-    """The lap's frames from ``first`` on again and again: after its last, which is where the first is, the second."""
+    """Yield the frames ``first`` to ``scans`` of repeated laps. The second frame of a lap follows the last one."""
     first_ns = int(sequence.stamps_ns[0])
     for k in range(first, scans):
         frame = sequence[(k - 1) % LAP + 1 if k else 0]
-        late_ns = first_ns + k * _STEP_NS - frame.scan.stamp_ns
-        imu = replace(frame.imu, stamps_ns=frame.imu.stamps_ns + late_ns)
-        yield replace(frame, index=k, scan=replace(frame.scan, stamp_ns=frame.scan.stamp_ns + late_ns), imu=imu)
+        shift_ns = first_ns + k * _STEP_NS - frame.scan.stamp_ns
+        imu = replace(frame.imu, stamps_ns=frame.imu.stamps_ns + shift_ns)
+        yield replace(frame, index=k, scan=replace(frame.scan, stamp_ns=frame.scan.stamp_ns + shift_ns), imu=imu)
 
 
-def laps_below(folder: Path, first: int, scans: int) -> Iterator[Frame]:
-    """The same of the lap below a folder, which another process can open too."""
-    return laps(the_lap(folder), first, scans)
+def laps_in(folder: Path, first: int, scans: int) -> Iterator[Frame]:
+    """Yield the frames of repeated laps in a folder. A partial of this function can be sent to another process."""
+    return laps(simulated_lap(folder), first, scans)
 
 
-def resident_mib() -> float:
-    """Memory that the process holds now."""
-    gc.collect()
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(float(line.split()[1]) for line in lines if line.startswith("VmRSS")) / 1024
+def make_odometry(backend: str, light: bool) -> Odometry:
+    """Make the odometry of a run."""
+    return Odometry(residual=StraightDrive(), backend=backend) if light else Odometry(backend=backend)
 
 
-def made(backend: str, light: bool) -> Odometry:
-    """A fresh one."""
-    return Odometry(residual=StraightOn(), backend=backend) if light else Odometry(backend=backend)
-
-
-class Fresh:
-    """A run in a process of its own that goes on by one scan when it is told to.
+class FreshRun:
+    """A run in another process that advances by one scan at each call.
 
     Args:
-        frames: from where it begins.
-        make: its odometry.
+        frames: yields its frames.
+        make: makes its odometry.
     """
 
     def __init__(self, frames: Callable[[], Iterator[Frame]], make: Callable[[], Odometry]) -> None:
         context = multiprocessing.get_context("spawn")
-        self._talk, theirs = context.Pipe()
+        self._connection, theirs = context.Pipe()
         context.Process(target=_serve, args=(theirs, frames, make), daemon=True).start()
 
     def step_cpu_ms(self) -> float:
-        """Processor time of its next scan."""
-        self._talk.send(None)
-        return float(self._talk.recv())
+        """Process the next scan and return its processor time in milliseconds."""
+        self._connection.send(None)
+        return float(self._connection.recv())
 
 
-def _serve(talk: Connection, frames: Callable[[], Iterator[Frame]], make: Callable[[], Odometry]) -> None:
+def _serve(connection: Connection, frames: Callable[[], Iterator[Frame]], make: Callable[[], Odometry]) -> None:
     odometry = make()
     for frame in frames():
-        talk.recv()
-        talk.send(_step(odometry, frame)[1])
+        connection.recv()
+        connection.send(_step(odometry, frame)[1])
 
 
 def _step(odometry: Odometry, frame: Frame) -> tuple[Estimate, float]:
-    """With its processor time in milliseconds."""
+    """Return the estimate and its processor time in milliseconds."""
     start = time.process_time()
     estimate = odometry.step(frame)
     return estimate, 1e3 * (time.process_time() - start)
 
 
 def run(frames: Callable[[int, int], Iterator[Frame]], make: Callable[[], Odometry], scans: int) -> dict[str, Any]:
-    """Milliseconds of the first and last ``PART`` scans by stage, and memory every ``PART`` scans."""
+    """Return milliseconds of the first and last ``PART`` scans by stage, and memory every ``PART`` scans."""
     stages: dict[str, list[float]] = {}
     memory: dict[int, float] = {}
     kept: PackedList[Estimate] = PackedList()
     odometry, begin = make(), max(scans - PART - WARM_UP, 0)
-    fresh, fresh_ms = Fresh(partial(frames, begin, scans), make), []
+    fresh, fresh_ms = FreshRun(partial(frames, begin, scans), make), []
     for k, frame in enumerate(frames(0, scans)):
         estimate, cpu_ms = _step(odometry, frame)
         stages.setdefault(CPU, []).append(cpu_ms)
@@ -170,6 +164,7 @@ def run(frames: Callable[[int, int], Iterator[Frame]], make: Callable[[], Odomet
         if k >= begin:
             fresh_ms.append(fresh.step_cpu_ms())
         if (k + 1) % PART == 0:
+            gc.collect()
             memory[k + 1] = resident_mib()
     spent = {stage: np.array([0.0] * (scans - len(ms)) + ms) for stage, ms in stages.items()}
     return {
@@ -183,25 +178,25 @@ def run(frames: Callable[[int, int], Iterator[Frame]], make: Callable[[], Odomet
 
 
 def main() -> None:
-    """Run and print."""
+    """Run the benchmark for each backend and print its figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, nargs="?", help="for the lap; not needed with --light")
-    parser.add_argument("--scans", type=int, default=4500)
-    parser.add_argument("--backend", default="fixed-lag", metavar="A,B,…")
-    parser.add_argument("--light", action="store_true")
-    parser.add_argument("-o", "--out", type=Path)
+    parser.add_argument("--scans", type=int, default=4500, help="length of the run (default: %(default)s)")
+    parser.add_argument("--backend", default="fixed-lag", metavar="A,B,…", help="(default: %(default)s)")
+    parser.add_argument("--light", action="store_true", help="IMU and graph alone, without scans")
+    parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="for all figures as JSON")
     options = parser.parse_args()
     if options.folder is None and not options.light:
-        parser.error("give a folder for the lap, or --light")
+        parser.error("a folder for the lap is missing; give one, or --light")
     results = {}
     for backend in options.backend.split(","):
-        frames = light_frames if options.light else partial(laps_below, options.folder)
-        results[backend] = found = run(frames, partial(made, backend, options.light), options.scans)
+        frames = light_frames if options.light else partial(laps_in, options.folder)
+        results[backend] = found = run(frames, partial(make_odometry, backend, options.light), options.scans)
         ratio = found["last_mean_cpu_ms"] / found["fresh_mean_cpu_ms"]
         memory = list(found["resident_mib"].values())
-        grown = memory[-1] - memory[0] if memory else float("nan")
-        grew = f"memory grew by {grown:.0f} MiB"
-        print(f"{backend}: the last {PART} scans take {ratio:.2f} times the processor time of a run's first, {grew}")
+        growth = memory[-1] - memory[0] if memory else float("nan")
+        print(f"{backend}: processor time of the last {PART} scans / first {PART} of a fresh run: {ratio:.2f}")
+        print(f"{backend}: growth of memory: {growth:.0f} MiB")
         print(json.dumps(found, indent=2))
     if options.out is not None:
         write_atomically(options.out, json.dumps(results, indent=2) + "\n")

@@ -1,10 +1,10 @@
-"""Pose graphs against bare GTSAM calls, in one process: ``python benchmarks/pose_graphs.py FOLDER [NAME …]``.
+"""Compare `PoseGraph` with bare GTSAM calls in one process: ``python benchmarks/pose_graphs.py FOLDER [NAME …]``.
 
-FOLDER holds g2o files. For each one GTSAM solves from the file's initial values and from its own best initialisation
-(chordal in space; LAGO in the plane, which takes diagonal noise only). Its best result is the one of smallest error, or
-the quicker of equal ones; ours is timed from the file as well: reading, initial values, solving. ``--outliers`` adds a
-tenth of wrong loop closures by seed and lets ``gnc`` find them. ``--bad-starts`` replaces the file's initial values by
-bad ones, of sphere2500 and torus3D by default, and prints the error reached all the same, as a multiple of the best.
+FOLDER holds g2o files. GTSAM solves each from the file's initial values and from its own best initialisation (3-D:
+chordal; 2-D: LAGO, which accepts diagonal noise only). GTSAM's best result is the one with the smallest error, or the
+faster of equal ones. Both times include reading, initial values and solving. ``--outliers`` adds 10 % wrong loop
+closures by seed and lets ``gnc`` find them. ``--bad-starts`` replaces the initial values of sphere2500 and torus3D (or
+of the files named) by bad ones, and prints the error reached relative to the best.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from hybridlio.core import se3
 from hybridlio.graph import PoseGraph
 from hybridlio.graph.model.coordinates import to_matrices
 
-_EQUAL = 1e-5  # relative; errors closer than this are the same answer
+_EQUAL = 1e-5  # relative difference of equal errors, GTSAM's own tolerance for convergence
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One way to solve a file: its error, and seconds for reading, initial values and solving together and alone."""
+    """The result of one method: final error, seconds in all, and seconds without reading."""
 
     name: str
     error: float
@@ -35,23 +35,25 @@ class Outcome:
     solve_s: float
 
 
-def bare(path: Path, space: bool, start: str) -> Outcome:
+def gtsam_alone(path: Path, is_3d: bool, start: str) -> Outcome:
+    """Solve a file with GTSAM, from the initial values ``given`` or from GTSAM's ``own`` initialisation."""
     begin = time.perf_counter()
-    graph, values = gtsam.readG2o(str(path), space)
+    graph, values = gtsam.readG2o(str(path), is_3d)
     read_s = time.perf_counter() - begin
     first = min(values.keys())
-    prior = gtsam.PriorFactorPose3 if space else gtsam.PriorFactorPose2
-    pose = values.atPose3(first) if space else values.atPose2(first)
-    graph.add(prior(first, pose, gtsam.noiseModel.Isotropic.Sigma(6 if space else 3, 1e-6)))
+    prior = gtsam.PriorFactorPose3 if is_3d else gtsam.PriorFactorPose2
+    pose = values.atPose3(first) if is_3d else values.atPose2(first)
+    graph.add(prior(first, pose, gtsam.noiseModel.Isotropic.Sigma(6 if is_3d else 3, 1e-6)))
     begin = time.perf_counter()
     if start == "own":
-        values = gtsam.InitializePose3.initialize(graph) if space else lago(graph)
+        values = gtsam.InitializePose3.initialize(graph) if is_3d else lago(graph)
     values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     solve_s = time.perf_counter() - begin
     return Outcome(f"gtsam, {start} start", graph.error(values), read_s + solve_s, solve_s)
 
 
 def lago(graph: gtsam.NonlinearFactorGraph) -> gtsam.Values:
+    """Initialise a 2-D graph by LAGO, with the diagonals of its information matrices."""
     diagonal = gtsam.NonlinearFactorGraph()
     for k in range(graph.size()):
         factor = graph.at(k)
@@ -74,17 +76,17 @@ def ours(path: Path) -> Outcome:
     return Outcome("ours", solution.error, end - begin, end - loaded)
 
 
-def quickest(outcomes: list[Outcome]) -> Outcome:
+def fastest(outcomes: list[Outcome]) -> Outcome:
     return min(outcomes, key=lambda outcome: outcome.total_s)
 
 
 def compare(path: Path, runs: int) -> None:
-    space = PoseGraph.load(path).dimension == 3
-    # in turn, so that what else the machine does meets all alike
-    rounds = [(bare(path, space, "given"), bare(path, space, "own"), ours(path)) for _ in range(runs)]
-    given, own, mine = (quickest(list(column)) for column in zip(*rounds, strict=True))
-    least = min(given.error, own.error)
-    best = quickest([outcome for outcome in (given, own) if outcome.error <= least * (1 + _EQUAL)])
+    is_3d = PoseGraph.load(path).dimension == 3
+    # the methods take turns, so that other load on the machine affects all alike
+    rounds = [(gtsam_alone(path, is_3d, "given"), gtsam_alone(path, is_3d, "own"), ours(path)) for _ in range(runs)]
+    given, own, mine = (fastest(list(column)) for column in zip(*rounds, strict=True))
+    least_error = min(given.error, own.error)
+    best = fastest([outcome for outcome in (given, own) if outcome.error <= least_error * (1 + _EQUAL)])
     ratio, ratio_solve = mine.total_s / best.total_s, mine.solve_s / best.solve_s
     print(
         f"{path.stem:16s} {given.error:12.6g} {own.error:12.6g} {mine.error:12.6g} "
@@ -94,20 +96,21 @@ def compare(path: Path, runs: int) -> None:
 
 
 def with_wrong_loops(path: Path, seed: int) -> tuple[PoseGraph, set[int]]:
+    """Return a graph with 10 % wrong loops between random poses, copies of its right ones, and their ids."""
     graph, rng = PoseGraph.load(path), np.random.default_rng(seed)
     edges = [factor for factor in graph.factors.values() if factor.kind == "between"]
     loops = [edge for edge in edges if abs(edge.keys[0] - edge.keys[1]) != 1]
     wrong: set[int] = set()
     while len(wrong) < round(0.1 * len(loops)):
         i, j = (int(k) for k in rng.choice(len(graph), 2, replace=False))
-        claim = loops[rng.integers(len(loops))]
+        copied = loops[rng.integers(len(loops))]
         if abs(i - j) > 1:
-            pose = to_matrices(claim.measured[None])[0]
-            wrong.add(graph.add_between(i, j, pose, information=claim.noise.information))
+            pose = to_matrices(copied.measured[None])[0]
+            wrong.add(graph.add_between(i, j, pose, information=copied.noise.information))
     return graph, wrong
 
 
-def outliers(path: Path, seed: int) -> None:
+def compare_with_outliers(path: Path, seed: int) -> None:
     clean = PoseGraph.load(path).optimize().poses[:, :3, 3]
     graph, wrong = with_wrong_loops(path, seed)
     begin = time.perf_counter()
@@ -123,17 +126,17 @@ def outliers(path: Path, seed: int) -> None:
 
 
 def bad_starts(count: int, extent_m: float, seeds: int) -> dict[str, np.ndarray]:
-    """All poses at the identity, and poses anywhere and anyhow by seed."""
+    """Return initial poses by name: all at the identity, and random positions and attitudes by seed."""
     starts = {"identity": np.tile(np.eye(4), (count, 1, 1))}
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
-        places = extent_m * rng.uniform(-0.5, 0.5, (count, 3))
-        starts[f"random {seed}"] = se3.make(Rotation.random(count, rng).as_matrix(), places)
+        positions = extent_m * rng.uniform(-0.5, 0.5, (count, 3))
+        starts[f"random {seed}"] = se3.make(Rotation.random(count, rng).as_matrix(), positions)
     return starts
 
 
-def start_badly(path: Path, seeds: int) -> None:
-    best = min(bare(path, True, "given").error, bare(path, True, "own").error, ours(path).error)
+def compare_bad_starts(path: Path, seeds: int) -> None:
+    best = min(gtsam_alone(path, True, "given").error, gtsam_alone(path, True, "own").error, ours(path).error)
     graph = PoseGraph.load(path)
     extent_m = float(np.ptp([graph.initial(key)[:3, 3] for key in graph.keys], axis=0).max())
     for name, poses in bad_starts(len(graph), extent_m, seeds).items():
@@ -147,26 +150,29 @@ def start_badly(path: Path, seeds: int) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("names", nargs="*")
-    parser.add_argument("--runs", type=int, default=3)
-    parser.add_argument("--outliers", action="store_true")
-    parser.add_argument("--bad-starts", action="store_true")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="of g2o files")
+    parser.add_argument("names", nargs="*", metavar="NAME", help="files without .g2o (default: all)")
+    parser.add_argument("--runs", type=int, default=3, help="repeats, or seeds (default: %(default)s)")
+    parser.add_argument("--outliers", action="store_true", help="add wrong loops for gnc to find")
+    parser.add_argument("--bad-starts", action="store_true", help="start from bad initial values")
     options = parser.parse_args()
     if options.bad_starts:
         print(f"{'':16s} {'start':10s} {'initial':8s} {'best error':>12s} {'reached/best':>12s} {'s':>8s}")
         for name in options.names or ("sphere2500", "torus3D"):
-            start_badly(options.folder / f"{name}.g2o", options.runs)
+            compare_bad_starts(options.folder / f"{name}.g2o", options.runs)
         return
     paths = [options.folder / f"{name}.g2o" for name in options.names] or sorted(options.folder.glob("*.g2o"))
     if options.outliers:
-        print(f"{'':16s} {'seed':>5s} {'wrong':>6s} {'missed':>7s} {'lost':>6s} {'RMSE, % of spread':>12s} {'s':>3s}")
+        print(f"{'':16s} {'seed':>5s} {'wrong':>6s} {'missed':>7s} {'lost':>6s} {'RMSE [%]':>12s} {'s':>8s}")
         for path in paths:
             for seed in range(options.runs):
-                outliers(path, seed)
+                compare_with_outliers(path, seed)
         return
-    print(f"{'':16s} {'gtsam given':>12s} {'gtsam own':>12s} {'ours':>12s} {'gtsam s':>8s} {'ours s':>8s} ratio  solve")
+    print(
+        f"{'errors and times':16s} {'gtsam given':>12s} {'gtsam own':>12s} {'ours':>12s} "
+        f"{'gtsam s':>8s} {'ours s':>8s} {'ratio':>6s} {'solve':>6s}"
+    )
     for path in paths:
         compare(path, options.runs)
 

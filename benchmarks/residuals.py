@@ -1,12 +1,12 @@
-"""How good and how honest residual sources are, step by step: error left, consistency of covariances, failures, time.
+"""Compare residual sources step by step: error left, consistency of covariances, failures, time.
 
     python benchmarks/residuals.py DATA… [--residual network,scan-matching] [--refine-steps 0,2] [--noise-m 0.083]
         [--noise-deg 0.24] [--reference small_gicp] [--weights FILE] [--scale S] [--frames 0:100] [-o FILE.json]
 
-Every source refines the same initial poses: the reference's steps, each shaken by a draw of its own, of the given
-standard deviation by axis. ANEES is the mean of eᵀΣ⁻¹e / n over the steps that did not fail: 1 is honest, more is too
-sure. `--reference small_gicp` registers consecutive scans by that library, for recordings whose own reference is too
-coarse for single steps. Times are medians; sources are interleaved scan by scan.
+Every source refines the same initial poses: the reference's steps, with independent noise of the given standard
+deviation on each axis. ANEES is the mean of eᵀΣ⁻¹e / n over the steps that did not fail: 1 is consistent, more is
+overconfident. `--reference small_gicp` takes that library's registration of consecutive scans as the truth, for
+recordings whose own reference is too coarse for single steps. Times are medians; sources take turns scan by scan.
 """
 
 from __future__ import annotations
@@ -32,25 +32,36 @@ from hybridlio.odometry.config import Config
 from hybridlio.odometry.registry import RESIDUAL_SOURCES
 from hybridlio.odometry.setup import Setup
 
+_INITIAL = "(initial poses)"
+
 
 @dataclass
-class Found:
-    """A source's answers over some recordings."""
+class Answers:
+    """A source's answers on all recordings.
+
+    Attributes:
+        name: of the source.
+        errors: ``(6,)`` of each step.
+        normalised: normalised errors squared of each step that did not fail: pose, rotation, translation.
+        degenerate: number of steps with a degenerate direction.
+        failed: number of steps that failed.
+        seconds: of each step.
+    """
 
     name: str
     errors: list[Array] = field(default_factory=list)
     normalised: list[Array] = field(default_factory=list)
-    loose: int = 0
+    degenerate: int = 0
     failed: int = 0
     seconds: list[float] = field(default_factory=list)
 
-    def take(self, answer: RelativePose, truth: Array, seconds: float) -> None:
-        """Add an answer to the step whose truth is given."""
+    def add(self, answer: RelativePose, truth: Array, seconds: float) -> None:
+        """Add the answer for a step whose true relative pose is given."""
         error = se3.log(se3.between(answer.pose, truth))
         self.errors.append(error)
         self.seconds.append(seconds)
         self.failed += not answer.ok
-        self.loose += len(answer.degenerate) > 0
+        self.degenerate += len(answer.degenerate) > 0
         if answer.ok:
             C = answer.covariance
             parts = (slice(None), slice(0, 3), slice(3, 6))
@@ -59,7 +70,7 @@ class Found:
             )
 
     def row(self) -> dict[str, float | str]:
-        """The figures."""
+        """Return the source's row of the table."""
         errors = np.array(self.errors)
         size_m, size_deg = np.linalg.norm(errors[:, 3:], axis=1), np.rad2deg(np.linalg.norm(errors[:, :3], axis=1))
         anees = np.mean(self.normalised, axis=0) if self.normalised else np.full(3, np.nan)
@@ -73,7 +84,7 @@ class Found:
             "ANEES rot.": float(anees[1]),
             "ANEES trans.": float(anees[2]),
             "failed": self.failed,
-            "loose": self.loose,
+            "degenerate": self.degenerate,
             "ms": 1e3 * float(np.median(self.seconds)),
         }
 
@@ -92,8 +103,8 @@ def sources(options: argparse.Namespace, sequence: Sequence) -> dict[str, Residu
     return made
 
 
-def true_steps(sequence: Sequence, how: str | None) -> Array:
-    if how is None and sequence.reference is not None:
+def true_steps(sequence: Sequence, reference: str | None) -> Array:
+    if reference is None and sequence.reference is not None:
         return se3.between(sequence.reference.poses[:-1], sequence.reference.poses[1:])
     steps, guess = [], np.eye(4)
     for k in range(1, len(sequence)):
@@ -114,19 +125,19 @@ def recordings(options: argparse.Namespace) -> Iterator[Sequence]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", nargs="+", type=Path)
-    parser.add_argument("--residual", default="network,network+scan-matching,scan-matching")
-    parser.add_argument("--refine-steps", default="0,2")
-    parser.add_argument("--noise-m", type=float, default=0.083)
-    parser.add_argument("--noise-deg", type=float, default=0.24)
-    parser.add_argument("--reference", choices=["small_gicp"])
-    parser.add_argument("--weights")
-    parser.add_argument("--scale", type=float)
-    parser.add_argument("--frames")
-    parser.add_argument("-o", "--out", type=Path)
+    parser.add_argument("data", nargs="+", type=Path, help="recordings")
+    parser.add_argument("--residual", default="network,network+scan-matching,scan-matching", metavar="A,B,…")
+    parser.add_argument("--refine-steps", default="0,2", metavar="A,B,…", help="of the network (default: %(default)s)")
+    parser.add_argument("--noise-m", type=float, default=0.083, help="by axis (default: %(default)s)")
+    parser.add_argument("--noise-deg", type=float, default=0.24, help="by axis (default: %(default)s)")
+    parser.add_argument("--reference", choices=["small_gicp"], help="in place of the recording's own")
+    parser.add_argument("--weights", help="of the network")
+    parser.add_argument("--scale", type=float, help="of the network's covariance")
+    parser.add_argument("--frames", metavar="A:B", help="a part of each recording")
+    parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="for the table as JSON")
     options = parser.parse_args()
     sigmas = np.r_[np.full(3, np.deg2rad(options.noise_deg)), np.full(3, options.noise_m)]
-    rng, found = np.random.default_rng(0), {"(initial poses)": Found("(initial poses)")}
+    rng, found = np.random.default_rng(0), {_INITIAL: Answers(_INITIAL)}
     for sequence in recordings(options):
         steps, made = true_steps(sequence, options.reference), sources(options, sequence)
         for source in made.values():
@@ -134,13 +145,13 @@ def main() -> None:
         for k in range(1, len(sequence)):
             frame, truth = sequence[k], steps[k - 1]
             pose = truth @ se3.exp(rng.normal(size=6) * sigmas)
-            initial = RelativePose(pose, np.diag(sigmas**2 + 1e-10), "shaken")
-            found["(initial poses)"].take(initial, truth, 0.0)
+            initial = RelativePose(pose, np.diag(sigmas**2 + 1e-10), _INITIAL)
+            found[_INITIAL].add(initial, truth, 0.0)
             for name, source in made.items():
                 start = time.perf_counter()
                 answer = source.refine(frame, initial)
-                found.setdefault(name, Found(name)).take(answer, truth, time.perf_counter() - start)
-    rows = [result.row() for result in found.values()]
+                found.setdefault(name, Answers(name)).add(answer, truth, time.perf_counter() - start)
+    rows = [answers.row() for answers in found.values()]
     print(" | ".join(rows[0]))
     for row in rows:
         print(" | ".join(f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()))

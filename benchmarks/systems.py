@@ -1,7 +1,8 @@
-"""The systems that are compared, each as a function that takes a frame and gives what it makes of it."""
+"""The systems that benchmarks compare. Each is a function that takes a frame and returns an `Answer`."""
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -22,11 +23,12 @@ class Answer:
     """A system's answer to one scan.
 
     Attributes:
-        pose: ``(4, 4)`` lidar pose in a world of the system's own.
-        stamp_ns: when it holds.
-        covariance: ``(6, 6)`` relative to the first pose, rotation first; None of a system that gives none.
-        bridged, degenerate: whether the system says that the scan was of no use, or left a direction open.
-        disagreed: whether it says that scan and IMU contradict each other.
+        pose: ``(4, 4)`` lidar pose in the system's own world frame.
+        stamp_ns: the time of the pose.
+        covariance: ``(6, 6)`` relative to the first pose, rotation first; None from a system that has none.
+        bridged: the system reports that it could not use the scan.
+        degenerate: the system reports that the scan leaves a direction unconstrained.
+        disagreed: the system reports that scan and IMU contradict each other.
     """
 
     pose: Array
@@ -38,10 +40,11 @@ class Answer:
 
 
 Step = Callable[[Frame], Answer]
-Make = Callable[[Sequence, int], Step]  # with the number of threads
+Make = Callable[[Sequence, int], Step]  # makes a system for a recording, with a number of threads
 
 
 def ours(config: Config, _: Sequence, threads: int) -> Step:
+    """Make hybridlio's odometry of a configuration."""
     from hybridlio.odometry.odometry import Odometry
 
     odometry = Odometry(config=Config.model_validate(_with_threads(config.model_dump(), threads)))
@@ -50,8 +53,8 @@ def ours(config: Config, _: Sequence, threads: int) -> Step:
         estimate = odometry.step(frame)
         relative = estimate.relative
         disagreed = estimate.gate.verdict not in ("untested", "accepted")
-        marks = (False, False) if relative is None else (not relative.ok, len(relative.degenerate) > 0)
-        return Answer(estimate.pose, estimate.stamp_ns, estimate.covariance, *marks, disagreed)
+        flags = (False, False) if relative is None else (not relative.ok, len(relative.degenerate) > 0)
+        return Answer(estimate.pose, estimate.stamp_ns, estimate.covariance, *flags, disagreed)
 
     return step
 
@@ -64,7 +67,10 @@ def _with_threads(tree: dict[str, object], threads: int) -> dict[str, object]:
 
 
 def kiss_icp(sequence: Sequence, threads: int) -> Step:
-    """Its defaults for a range of 100 m; it compensates motion only where points carry times, to the sweep's end."""
+    """Make KISS-ICP with its defaults for a range of 100 m.
+
+    It compensates motion, to the end of the sweep, only where points carry times.
+    """
     from kiss_icp.config import KISSConfig
     from kiss_icp.kiss_icp import KissICP
 
@@ -84,21 +90,24 @@ def kiss_icp(sequence: Sequence, threads: int) -> Step:
 
 
 def rko_lio(sequence: Sequence, threads: int) -> Step:
-    """Its defaults; its poses are the IMU's. It wants times that are not all equal, and extrinsics without rounding."""
+    """Make RKO-LIO with its defaults. Its poses are the IMU's.
+
+    It rejects scans whose times are all equal, and extrinsics whose rotation has rounding errors.
+    """
     from rko_lio.config import LIOConfig
     from rko_lio.lio import LIO
 
     system = LIO(LIOConfig(deskew=sequence[0].scan.time_offsets_ns is not None, max_num_threads=threads))
     T_imu_lidar = se3.orthonormalise(sequence.calibration.T_imu_lidar)
-    fed_ns = -(2**62)
+    last_imu_ns = -(2**62)
 
     def step(frame: Frame) -> Answer:
-        nonlocal fed_ns
+        nonlocal last_imu_ns
         imu, scan = frame.imu, frame.scan
         for stamp, accel, gyro in zip(imu.stamps_ns.tolist(), imu.accel_m_s2, imu.gyro_rad_s, strict=True):
-            if stamp > fed_ns:  # frames share the sample on their border
+            if stamp > last_imu_ns:  # consecutive frames share the sample on their border
                 system.add_imu_measurement(accel, gyro, stamp)
-                fed_ns = stamp
+                last_imu_ns = stamp
         offsets = np.zeros(len(scan), np.int64) if scan.time_offsets_ns is None else scan.time_offsets_ns
         times = scan.stamp_ns + offsets
         if scan.time_offsets_ns is None:
@@ -110,7 +119,7 @@ def rko_lio(sequence: Sequence, threads: int) -> Step:
 
 
 def small_gicp_odometry(_: Sequence, threads: int) -> Step:
-    """GICP of each scan, thinned to 0.25 m, to a growing map of Gaussian voxels of 1 m, from the last step again."""
+    """Make scan-to-map GICP: scans thinned to 0.25 m, a map of 1 m Gaussian voxels, started by constant velocity."""
     import small_gicp
 
     voxels: small_gicp.GaussianVoxelMap | None = None
@@ -123,7 +132,8 @@ def small_gicp_odometry(_: Sequence, threads: int) -> Step:
         if voxels is None:
             voxels = small_gicp.GaussianVoxelMap(1.0)
         else:
-            # its answer is as little a rotation as its start is, and from step to step that more than doubles
+            # small_gicp's result is no closer to a rotation than its start, and the deviation more than doubles with
+            # every step
             start = se3.orthonormalise(pose @ last_step)
             found = se3.orthonormalise(small_gicp.align(voxels, cloud, start, num_threads=threads).T_target_source)
             last_step, pose = se3.between(pose, found), found
@@ -134,9 +144,9 @@ def small_gicp_odometry(_: Sequence, threads: int) -> Step:
 
 
 def open3d_icp(_: Sequence, __: int) -> Step:
-    """Point-to-plane ICP of each scan, thinned to 0.5 m, to the last one, from the last step again.
+    """Make scan-to-scan point-to-plane ICP: scans thinned to 0.5 m, started by constant velocity.
 
-    Its threads are OpenMP's, which the process is started with.
+    Open3D takes its number of threads from OpenMP's environment variable, which the process is started with.
     """
     import open3d as o3d
 
@@ -164,7 +174,7 @@ def _end_of_sweep_ns(frame: Frame) -> int:
     return frame.scan.stamp_ns + (int(offsets.max()) if offsets is not None and len(offsets) else 0)
 
 
-PEERS: dict[str, tuple[str, Make]] = {  # with the package that each needs
+PEERS: dict[str, tuple[str, Make]] = {  # name: (the package that it needs, how it is made)
     "kiss-icp": ("kiss_icp", kiss_icp),
     "rko_lio": ("rko_lio", rko_lio),
     "small_gicp": ("small_gicp", small_gicp_odometry),
@@ -174,9 +184,9 @@ _NEED_IMU = ("rko_lio",)
 
 
 def our_systems(initial_poses: str, residuals: str, backends: str) -> dict[str, Make]:
-    """Every combination of the names, which have commas between; ``each`` of one of the three changes it alone.
+    """Make every combination of the comma-separated names.
 
-    With ``each``, every implementation of that seam is tried with the default of the other two.
+    ``each`` in place of names tries all implementations of that seam with the default of the other two.
     """
     default = Config()
     asked = {"initial_pose": initial_poses, "residual": residuals, "backend": backends}
@@ -190,7 +200,7 @@ def our_systems(initial_poses: str, residuals: str, backends: str) -> dict[str, 
 
 
 def peer_systems(names: str, sequence: Sequence) -> dict[str, Make]:
-    """The peers of these names that can run on the recording; says which are not installed."""
+    """Return the named peers that can run on the recording. Print which of them are not installed."""
     from importlib.util import find_spec
 
     out = {}
@@ -201,3 +211,18 @@ def peer_systems(names: str, sequence: Sequence) -> dict[str, Make]:
         elif len(sequence.imu) or name not in _NEED_IMU:
             out[name] = make
     return out
+
+
+def add_system_options(parser: ArgumentParser) -> None:
+    """Add the options that select systems and their number of threads."""
+    default = {"--initial-pose": "preintegration", "--residual": "scan-matching", "--backend": "fixed-lag"}
+    for option, names in default.items():
+        parser.add_argument(option, default=names, metavar="A,B,…", help="names, or 'each' (default: %(default)s)")
+    parser.add_argument("--peers", default=",".join(PEERS), metavar="A,B,…", help="'' for none (default: all)")
+    parser.add_argument("--threads", type=int, default=2, help="of each system (default: %(default)s)")
+
+
+def chosen_systems(options: Namespace, sequence: Sequence) -> dict[str, Make]:
+    """Return the systems that the options select, ours first."""
+    found = our_systems(options.initial_pose, options.residual, options.backend)
+    return found | peer_systems(options.peers, sequence)

@@ -9,7 +9,7 @@ from typing import Any
 from hybridlio.simulation import SimulationConfig, simulate
 
 SECONDS = 20.0
-DRIVES: dict[int, dict[str, Any]] = {
+DRIVES: dict[int, dict[str, Any]] = {  # settings by seed
     1001: {"speed_m_s": 10},
     1002: {"speed_m_s": 14, "traffic_per_km": 30},
     1003: {"speed_m_s": 7, "parked": 0.9},
@@ -28,7 +28,7 @@ DRIVES: dict[int, dict[str, Any]] = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path, metavar="DIR", help="where to")
+    parser.add_argument("folder", type=Path, metavar="DIR", help="for the drives")
     folder = parser.parse_args().folder
     for seed, settings in DRIVES.items():
         print(simulate(folder, SimulationConfig(seed=seed, seconds=SECONDS, **settings)), flush=True)

@@ -1,11 +1,11 @@
-"""Make the README's picture: a simulated drive, the map that the odometry draws of it, and one scan.
+"""Make the picture of the README: the map and path of a simulated drive, and one scan.
 
 python docs/make_pictures.py [FOLDER]
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
 import tempfile
 from pathlib import Path
 
@@ -25,12 +25,13 @@ from hybridlio.core import se3
 
 IMAGES = Path(__file__).resolve().parent / "images"
 CONFIG = hl.SimulationConfig(seconds=60, seed=5, speed_m_s=9.0)
+LIDAR_HEIGHT_M = 1.73  # above the road, as on KITTI's car, which the simulator models
 BACKGROUND = "#0d1117"
 HEIGHTS = LinearSegmentedColormap.from_list("heights", ["#222b3a", "#2f6f9f", "#5fd0c0", "#ffe08a"])
 
 
 def run(sequence: hl.Sequence) -> tuple[np.ndarray, np.ndarray]:
-    """Estimated poses, and the map they make of the scans, thinned."""
+    """Return the estimated poses ``(N, 4, 4)`` and the thinned map of every fifth scan, ``(M, 3)``."""
     odometry = hl.Odometry()
     poses, clouds = [], []
     for frame in sequence:
@@ -44,8 +45,9 @@ def run(sequence: hl.Sequence) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_map(ax: Axes, cloud: np.ndarray, poses: np.ndarray, reference: np.ndarray) -> None:
+    """Draw the map from above, coloured by height over the road, with the true and the estimated path."""
     _, nearest = cKDTree(poses[:, :2, 3]).query(cloud[:, :2])
-    above_road_m = cloud[:, 2] - poses[nearest, 2, 3] + 1.73
+    above_road_m = cloud[:, 2] - poses[nearest, 2, 3] + LIDAR_HEIGHT_M
     order = np.argsort(above_road_m)
     height = np.clip(above_road_m[order], 0.0, 5.0)
     ax.scatter(*cloud[order, :2].T, c=height, s=0.35, lw=0, cmap=HEIGHTS, vmin=0, vmax=5, rasterized=True)
@@ -61,14 +63,18 @@ def draw_map(ax: Axes, cloud: np.ndarray, poses: np.ndarray, reference: np.ndarr
 
 
 def draw_scan(ax: Axes, scan: hl.Scan) -> None:
+    """Draw a scan as a range image."""
     ranges = np.linalg.norm(vertex_map(scan.points, map_geometry("hdl-64e")), axis=0)
     ax.imshow(np.where(ranges > 0, ranges, np.nan), aspect="auto", cmap="magma_r", vmin=2, vmax=50)
     ax.set_title("one scan as a range image: distance by elevation and azimuth", color="white", fontsize=10)
     ax.axis("off")
 
 
-def main(folder: str | None = None) -> None:
-    root = Path(folder or tempfile.mkdtemp(prefix="hybridlio-"))
+def main() -> None:
+    """Simulate the drive, run odometry and save the picture."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, nargs="?", help="for the simulated drive (default: a temporary folder)")
+    root = parser.parse_args().folder or Path(tempfile.mkdtemp(prefix="hybridlio-"))
     sequence = hl.open_sequence(hl.simulate(root, CONFIG))
     poses, cloud = run(sequence)
     figure, (above, below) = plt.subplots(
@@ -79,8 +85,8 @@ def main(folder: str | None = None) -> None:
     IMAGES.mkdir(exist_ok=True)
     figure.savefig(IMAGES / "drive.png", dpi=110, facecolor=BACKGROUND)
     evaluation = hl.evaluate(sequence.reference, hl.Trajectory(sequence.stamps_ns, poses))
-    print(f"{IMAGES / 'drive.png'}: {evaluation.length_m:.0f} m, off at the end by {evaluation.end_error_m:.2f} m")
+    print(f"{IMAGES / 'drive.png'}: {evaluation.length_m:.0f} m, error at the end {evaluation.end_error_m:.2f} m")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

@@ -1,10 +1,10 @@
-"""What all tests share: where the real recordings are, one seed, and threads that do not fight each other."""
+"""Fixtures for all tests: real recordings, random numbers, a small drive, untrained weights. Limits threads."""
 
 from __future__ import annotations
 
 import os
 
-if os.environ.get("PYTEST_XDIST_WORKER"):  # before NumPy and PyTorch load: each worker is a core's worth of work
+if os.environ.get("PYTEST_XDIST_WORKER"):  # before NumPy and PyTorch load: one thread for each worker
     for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(_name, "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -31,13 +31,13 @@ def project_root() -> Path:
 
 @pytest.fixture
 def rng() -> np.random.Generator:
-    """A generator with the same seed in every test."""
+    """A random generator with the same seed in every test."""
     return np.random.default_rng(20240229)
 
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of packed real recordings; the test is skipped where there is none."""
+    """The folder of packed real recordings; without it the test is skipped."""
     folder = Path(os.environ.get("HYBRIDLIO_SHARED_DATA", ROOT.parent / "shared" / "data"))
     if not (folder / "unpack.py").is_file():
         pytest.skip(f"no real recordings at {folder} (set HYBRIDLIO_SHARED_DATA to the folder that holds unpack.py)")
@@ -46,7 +46,7 @@ def shared_data() -> Path:
 
 @pytest.fixture(scope="session")
 def unpacked_recordings(shared_data: Path) -> Path:
-    """The real recordings laid out as KITTI ships them, unpacked once for all workers and later runs."""
+    """The real recordings in KITTI's layout, unpacked once for all workers and later runs."""
     default = Path(tempfile.gettempdir()) / f"hybridlio-recordings-{os.getuid()}"
     cache = Path(os.environ.get("HYBRIDLIO_CACHE", default))
     cache.mkdir(parents=True, exist_ok=True)
@@ -54,7 +54,7 @@ def unpacked_recordings(shared_data: Path) -> Path:
     version = hashlib.sha256(script.read_bytes()).hexdigest()
     done = cache / "unpacked.sha256"
     with (cache / "lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # released when the file closes, also by a worker that dies
+        fcntl.flock(lock, fcntl.LOCK_EX)  # released when the file closes, even if the worker dies
         if not (done.is_file() and done.read_text() == version):
             subprocess.run([sys.executable, str(script), str(cache)], check=True, stdout=subprocess.DEVNULL)
             done.write_text(version)
@@ -75,7 +75,7 @@ def kitti_odometry_root(unpacked_recordings: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def tiny_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A simulated drive of 25 scans with a 16-beam sensor, started at 10 m/s; read it, do not change it."""
+    """A simulated drive of 25 scans with a 16-beam sensor, started at 10 m/s. Tests must not change it."""
     from hybridlio.simulation import SimulationConfig, simulate
 
     return simulate(tmp_path_factory.mktemp("drive"), SimulationConfig(seconds=2.5, seed=3, lidar="16-beam"))
@@ -83,10 +83,10 @@ def tiny_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def untrained_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Weights for the 16-beam lidar that know nothing yet.
+    """Untrained weights for the 16-beam lidar.
 
-    Their LSTMs go on at the last velocity without turning, and their residual is that of the untrained projective steps
-    alone, which suffices for a decimetre.
+    Their LSTMs keep the last velocity without rotation. Their residual is that of the projective steps alone, which
+    corrects errors of about 0.1 m.
     """
     import torch
 

@@ -1,4 +1,4 @@
-"""The benchmarks run; what they measure is not tested."""
+"""Tests that benchmarks run; the figures that they print are not tested."""
 
 from __future__ import annotations
 
@@ -14,40 +14,44 @@ ROOT = Path(__file__).resolve().parents[1]
 OURS = f"{Config().initial_pose} + none + {Config().backend}"
 
 
+def python(*words: object) -> subprocess.CompletedProcess[str]:
+    """Run Python with this checkout's package and benchmarks."""
+    path = os.pathsep.join([str(ROOT), str(ROOT / "benchmarks")])
+    command = [sys.executable, *map(str, words)]
+    return subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=False)
+
+
 def run(script: str, *words: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(ROOT / "benchmarks" / script), *map(str, words)]
-    return subprocess.run(
-        command, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False
-    )
+    return python(ROOT / "benchmarks" / script, *words)
 
 
-def test_peers_are_compared_with_ours_as_far_as_they_are_installed(tiny_drive, tmp_path):
+def test_ours_is_compared_with_the_installed_peers(tiny_drive, tmp_path):
     options = ("--frames", ":6", "--residual", "none", "--peers", "kiss-icp,rko_lio,small_gicp", "--repeats", "2")
     done = run("peers.py", tiny_drive, *options, "-o", tmp_path)
     assert done.returncode == 0, done.stderr
-    ((told,),) = [json.loads((tmp_path / "peers.json").read_text())["recordings"].values()]
-    assert told["scans"] == 6
-    (first, ours), *peers = told["systems"].items()
+    ((found,),) = [json.loads((tmp_path / "peers.json").read_text())["recordings"].values()]
+    assert found["scans"] == 6
+    (first, ours), *peers = found["systems"].items()
     assert first == OURS
     assert ours["times ours"] == 1
-    for name, row in told["systems"].items():
+    for name, row in found["systems"].items():
         assert row["median [ms]"] > 0
         assert row["least"] <= row["times ours"] <= row["most"]
         assert row["start to first pose [s]"] > 0
-        assert row["peak memory [MB]"] > 10
+        assert row["peak memory [MiB]"] > 10
         assert name in (tmp_path / "peers.md").read_text()
     for peer in ("kiss-icp", "rko_lio"):
         assert peer in dict(peers) or f"{peer} is not installed" in done.stdout
     assert "small_gicp" in dict(peers)
 
 
-def test_hard_cases_are_held_against_the_normal_one(tmp_path):
+def test_scenarios_include_the_normal_drive_and_report_uncertainty(tmp_path):
     options = ("--scenarios", "imu-gap", "--seeds", "3", "--length-m", "12", "--peers", "small_gicp")
     done = run("scenarios.py", tmp_path / "drives", *options, "--residual", "none", "-o", tmp_path)
     assert done.returncode == 0, done.stderr
-    told = json.loads((tmp_path / "scenarios.json").read_text())["scenarios"]
-    assert set(told) == {"normal", "imu-gap"}
-    for systems in told.values():
+    found = json.loads((tmp_path / "scenarios.json").read_text())["scenarios"]
+    assert set(found) == {"normal", "imu-gap"}
+    for systems in found.values():
         ours = systems[OURS][0]
         assert ours["completed"]
         assert ours["end_sigma_m"] > 0
@@ -55,44 +59,38 @@ def test_hard_cases_are_held_against_the_normal_one(tmp_path):
     assert "small_gicp" in (tmp_path / "imu-gap.md").read_text()
 
 
-def test_small_gicps_odometry_still_stands_after_sixty_times_the_same_scan(tiny_drive):
+def test_small_gicp_odometry_does_not_move_on_sixty_copies_of_one_scan(tiny_drive):
     program = (
-        "import sys; sys.path.insert(0, sys.argv[1]); import numpy as np; from pathlib import Path;"
+        "import sys; import numpy as np; from pathlib import Path;"
         "from systems import small_gicp_odometry; from hybridlio.datasets.registry import open_sequence;"
-        "sequence = open_sequence(Path(sys.argv[2])); step = small_gicp_odometry(sequence, 1);"
+        "sequence = open_sequence(Path(sys.argv[1])); step = small_gicp_odometry(sequence, 1);"
         "poses = [step(sequence[0]).pose for _ in range(60)]; print(np.abs(poses[-1] - np.eye(4)).max())"
     )
-    command = [sys.executable, "-c", program, str(ROOT / "benchmarks"), str(tiny_drive)]
-    done = subprocess.run(
-        command, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False
-    )
+    done = python("-c", program, tiny_drive)
     assert done.returncode == 0, done.stderr
     assert float(done.stdout) < 0.01
 
 
-def test_a_system_that_diverges_is_named_and_not_judged(tiny_drive, tmp_path):
+def test_a_diverging_system_is_stopped_and_not_evaluated(tiny_drive, tmp_path):
     program = (
-        "import sys; sys.path.insert(0, sys.argv[1]); import peers, systems, lockstep; from functools import partial;"
+        "import sys, common, peers, systems, lockstep; from functools import partial;"
         "from pathlib import Path; import numpy as np\n"
         "def make(sequence, threads):\n"
         "    return lambda frame: systems.Answer(np.eye(4) * 50.0**frame.index, frame.scan.stamp_ns)\n"
         "if __name__ == '__main__':\n"
-        "    again = partial(peers.opened, Path(sys.argv[2]), None, None)\n"
-        "    found = lockstep.run_in_lockstep({'wild': make}, again, 10, 1)['wild']\n"
-        "    print(found.error, peers.accuracy(found, again()))\n"
+        "    opened = partial(common.open_part, Path(sys.argv[1]), None, None)\n"
+        "    found = lockstep.run_in_lockstep({'diverging': make}, opened, 10, 1)['diverging']\n"
+        "    print(found.error, peers.accuracy(found, opened()))\n"
     )
-    (tmp_path / "wild.py").write_text(program)
-    command = [sys.executable, str(tmp_path / "wild.py"), str(ROOT / "benchmarks"), str(tiny_drive)]
-    done = subprocess.run(
-        command, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False
-    )
+    (tmp_path / "diverging.py").write_text(program)
+    done = python(tmp_path / "diverging.py", tiny_drive)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "scan 4: OverflowError: diverged {}"
 
 
-def test_laps_follow_each_other_without_a_gap():
+def test_repeated_laps_have_no_gap():
     program = (
-        "import sys; sys.path.insert(0, sys.argv[1]); import numpy as np; "
+        "import numpy as np; "
         "from hybridlio.core.sensors import Frame, ImuSamples, Scan; import long_run;"
         "stamps = 10**12 + np.arange(long_run.LAP + 1) * 10**8;"
         "samples = lambda k: ImuSamples(np.arange(stamps[k] - 10**8, stamps[k] + 1, 10**7), *np.zeros((2, 11, 3)));"
@@ -108,14 +106,11 @@ def test_laps_follow_each_other_without_a_gap():
         "later = list(long_run.laps(lap, 5, 8));"
         "assert [f.scan.stamp_ns for f in later] == [f.scan.stamp_ns for f in found[5:8]]"
     )
-    command = [sys.executable, "-c", program, str(ROOT / "benchmarks")]
-    done = subprocess.run(
-        command, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False
-    )
+    done = python("-c", program)
     assert done.returncode == 0, done.stderr
 
 
-def test_asking_for_help_simulates_nothing(tmp_path, monkeypatch):
+def test_the_help_of_training_drives_simulates_nothing(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     done = run("training_drives.py", "--help")
     assert (done.returncode, list(tmp_path.iterdir())) == (0, [])
