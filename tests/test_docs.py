@@ -120,9 +120,16 @@ def test_every_command_and_option_shown_exists():
 def test_every_script_and_option_of_it_that_a_page_shows_exists(page: Path):
     text = page.read_text().replace("\\\n", " ")
     for script, options in re.findall(r"python ((?:benchmarks|examples|docs)/\w+\.py)([^`\n]*)", text):
-        source = (ROOT / script).read_text()
+        source = with_siblings(ROOT / script)
         words = set(re.findall(r"--[a-z][\w-]*", options.partition("#")[0]))
         assert {option for option in words if f'"{option}"' not in source} == set(), script
+
+
+def with_siblings(script: Path) -> str:
+    """Return the text of a script and of the modules beside it that it imports, which may add its options."""
+    text = script.read_text()
+    siblings = [script.with_name(f"{name}.py") for name in re.findall(r"^from (\w+) import", text, flags=re.MULTILINE)]
+    return text + "".join(path.read_text() for path in siblings if path.is_file())
 
 
 def test_every_command_is_shown_in_the_readme():
