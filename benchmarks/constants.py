@@ -198,12 +198,7 @@ TABLE = [
         _YOUNG_MAP_DRIFT_SHARE=("0.0", "50.0"),
         _UNCHANGED_MAP_DRIFT_SHARE=("0.5", "0.0"),
     ),
-    *_in(
-        "hybridlio/sources/thinned_scan.py",
-        MATCHING,
-        _VOXEL_SHRINKAGE=("0.1",),
-        _AMPLE=("0.1",),
-    ),
+    *_in("hybridlio/sources/thinned_scan.py", MATCHING, _VOXEL_SHRINKAGE=("0.1",), _AMPLE=("0.1",)),
 ]
 
 
