@@ -54,8 +54,9 @@ def test_a_small_overlap_does_not_win_by_its_low_cost(rng: np.random.Generator):
     shelf, normals = wall(rng, (-12, -10, 38.0), (24, 0, 0), (0, 20, 0), 3000)
     surface, source = room(rng)
     surface = surface.extended(shelf, normals, 1)
-    curtain = rng.uniform([9.3, -6, -0.5], [9.3, 6, 2.0], (1000, 3))  # that the map does not have, near a wall
-    source = np.concatenate([source, seen_from(TRUTH, curtain)])
+    curtains = rng.uniform([9.3, -6, -0.5], [9.3, 6, 2.0], (8000, 3))  # that the map does not have, near two walls
+    curtains[::2, 0] *= -1
+    source = np.concatenate([source, seen_from(TRUTH, curtains)])
     starts = [TRUTH @ ahead(0.2), TRUTH @ se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 40.0]))]
     assert error_m(best_start(surface, source, source, starts, SETTINGS)) < 0.05
 
