@@ -50,7 +50,7 @@ def test_the_nearest_of_many_starts_is_found_and_refined(rng: np.random.Generato
 
 
 def test_a_small_overlap_does_not_win_by_its_low_cost(rng: np.random.Generator):
-    """Forty metres up, only the scan's floor has a surface to lie on, and lies there perfectly."""
+    """At a start 40 m too high only the floor of the scan overlaps the map, without any error."""
     shelf, normals = wall(rng, (-12, -10, 38.0), (24, 0, 0), (0, 20, 0), 3000)
     surface, source = room(rng)
     surface = surface.extended(shelf, normals, 1)
