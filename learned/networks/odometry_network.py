@@ -11,7 +11,7 @@ from hybridlio.core.errors import ConfigError
 from hybridlio.learned.networks import maps
 from hybridlio.learned.networks import torch_se3 as se3
 from hybridlio.learned.networks.imu_network import ImuNetwork
-from hybridlio.learned.networks.projective_steps import ProjectiveSteps, EncodedPoints
+from hybridlio.learned.networks.projective_steps import EncodedPoints, ProjectiveSteps
 from hybridlio.learned.networks.residual_network import ResidualNetwork
 from hybridlio.learned.settings import NetworkSettings
 
