@@ -90,7 +90,7 @@ def test_many_starts_are_compared_by_few_points_and_a_dozen_by_all(
     assert judged[40:] == [len(source)] * len(refined)
 
 
-def test_the_better_of_two_poses_is_told_by_a_few_points(rng: np.random.Generator):
+def test_a_few_points_decide_between_two_poses(rng: np.random.Generator):
     surface, source = room(rng)
     assert fits_better(surface, source, TRUTH, TRUTH @ ahead(0.3), 0.3, 1)
     assert not fits_better(surface, source, TRUTH @ ahead(0.3), TRUTH, 0.3, 1)
