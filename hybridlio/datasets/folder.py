@@ -1,7 +1,7 @@
 """Reader of plain folders: scans in natural order, a file of stamps, an IMU CSV and a calibration.
 
 recording/
-    scans/*.bin|.npy|.pcd|.ply   one kind per folder, see `point_files`; also in lidar/, points/, velodyne/, data/,
+    scans/*                      of one kind, see `points.point_files`; also in lidar/, points/, velodyne/, data/,
                                  or directly in recording/
     timestamps.txt or times.txt  one stamp per scan, see `stamps.read_stamps`
     imu.csv                      optional, see `imu_csv`
@@ -13,7 +13,6 @@ recording/
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +23,13 @@ from hybridlio.core.arrays import Array, Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.files import read_yaml
 from hybridlio.core.lidar_models import LIDAR_MODELS, LidarModel
-from hybridlio.core.sensors import Calibration, ImuSamples, Scan
+from hybridlio.core.sensors import Calibration, ImuSamples
 from hybridlio.core.trajectory_files import read_tum
 from hybridlio.datasets.gps_csv import note_fixes, read_gps_csv
 from hybridlio.datasets.imu_csv import read_imu_csv
 from hybridlio.datasets.kitti.vertical_angle import raised
 from hybridlio.datasets.notes import Notes
-from hybridlio.datasets.points.point_files import SUFFIXES, read_scan
+from hybridlio.datasets.points.point_files import SUFFIXES, open_point_files
 from hybridlio.datasets.reference import poses_at
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.datasets.stamps import (
@@ -52,21 +51,6 @@ _HOW_TO_CALIBRATE = (
     "write the transform T_imu_lidar, which maps lidar points into the IMU's frame, such as\n"
     "T_imu_lidar:\n  - [1, 0, 0, 0.1]\n  - [0, 1, 0, 0.0]\n  - [0, 0, 1, 0.3]\n  - [0, 0, 0, 1]"
 )
-
-
-@dataclass(frozen=True)
-class PointFiles:
-    """Loads scan ``k`` from ``paths[k]`` with stamp ``stamps_ns[k]``."""
-
-    paths: tuple[Path, ...]
-    stamps_ns: Stamps
-
-    def __call__(self, k: int) -> Scan:
-        """Load scan ``k``; a :class:`DataError` names frame and file."""
-        try:
-            return read_scan(self.paths[k], int(self.stamps_ns[k]))
-        except DataError as error:
-            raise DataError(f"frame {k}: {error}") from None
 
 
 def find(path: Path) -> dict[str, Path]:
@@ -105,7 +89,7 @@ def open_folder(folder: Path, raw_root: Path | None = None, vertical_angle_deg: 
     return Sequence(
         name=folder.name,
         stamps_ns=stamps,
-        load_scan=raised(PointFiles(paths, stamps), vertical_angle_deg),
+        load_scan=raised(open_point_files(paths, stamps, notes), vertical_angle_deg),
         imu=imu,
         calibration=calibration,
         reference=poses_at(stamps, poses.stamps_ns, poses.poses, "rows of poses_tum.txt", notes) if poses else None,

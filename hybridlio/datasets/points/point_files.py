@@ -1,123 +1,148 @@
-"""Scan files: ``.bin`` (KITTI's float32 x y z reflectance), ``.npy``, ``.pcd`` and ``.ply``.
+"""Scan files of every kind, and the loader of a recording's scans.
 
-Columns are found by name if the format has names:
-
-* ``x y z`` in metres, lidar frame (x forward, y left, z up);
-* ``intensity``, ``reflectivity`` or ``reflectance``: 0..1, or 0..255 if any value is above 1;
-* ``t``, ``time``, ``timestamp`` or ``time_offset``: integers are nanoseconds, floating-point numbers seconds; relative
-  to the scan's stamp or, if above 10⁶ s, absolute on the stamps' clock.
-
-A ``.npy`` file holds a structured array with these names, or rows of x y z or x y z intensity.
+Columns are found by name if the format has names: ``x y z`` in the lidar frame (x forward, y left, z up), an intensity,
+a time (:mod:`hybridlio.datasets.points.point_times`). Those of ``.bin`` files are found from their values
+(:mod:`hybridlio.datasets.points.bin_layout`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hybridlio.core.arrays import Floats, Stamps
+from hybridlio.core.arrays import Stamps
 from hybridlio.core.errors import DataError
-from hybridlio.core.sensors import NS_PER_S, Scan
-from hybridlio.datasets.kitti.files import read_bin
-from hybridlio.datasets.points.cloud_headers import read_header
+from hybridlio.core.sensors import Scan
+from hybridlio.datasets.notes import Notes
+from hybridlio.datasets.points import pcd, ply, tables
+from hybridlio.datasets.points.bin_layout import BinLayout, column_names, find_layout
+from hybridlio.datasets.points.fields import Columns
+from hybridlio.datasets.points.point_format import PointFormat, find_format, sampled
+from hybridlio.datasets.points.point_times import StatedTimes
 
-SUFFIXES = (".bin", ".npy", ".pcd", ".ply")
+SUFFIXES = (".bin", ".npy", ".pcd", ".ply", ".las", ".laz", ".feather", ".parquet")
 
-_INTENSITIES = ("intensity", "reflectivity", "reflectance")
-_TIMES = ("t", "time", "timestamp", "time_offset")
-_MIN_ABSOLUTE_NS = 10**15  # 12 days: far above any offset, far below seconds since 1970
-_MAX_OFFSET_NS = NS_PER_S  # no lidar turns slower than once a second
-_MIN_SWEEP_NS = 1_000_000  # no lidar sweeps within 1 ms: the unit is wrong
-Columns = dict[str, NDArray[Any]]
+_READERS: dict[str, Callable[[Path], Columns]] = {
+    ".pcd": pcd.read_pcd,
+    ".ply": ply.read_ply,
+    ".las": tables.read_las,
+    ".laz": tables.read_las,
+    ".feather": tables.read_arrow,
+    ".parquet": tables.read_arrow,
+}
+
+
+@dataclass(frozen=True)
+class PointFiles:
+    """Loads scan ``k`` from ``paths[k]`` with stamp ``stamps_ns[k]``. An object, so that it can be pickled.
+
+    Attributes:
+        paths: one file per scan.
+        stamps_ns: one stamp per scan.
+        layout: the columns of ``.bin`` files.
+        step_ns: median distance between the stamps; None if there is one scan.
+        format: how the columns are read.
+    """
+
+    paths: tuple[Path, ...]
+    stamps_ns: Stamps
+    layout: BinLayout
+    step_ns: int | None
+    format: PointFormat
+
+    def __call__(self, k: int) -> Scan:
+        """Load scan ``k``.
+
+        Raises:
+            DataError: the file is missing, truncated, or without a usable point; the message names frame and file.
+        """
+        path = self.paths[k]
+        try:
+            return self.format.scan(read_columns(path, self.layout, self.step_ns), int(self.stamps_ns[k]))
+        except DataError as error:
+            raise DataError(f"frame {k}: {_at(path, error)}") from None
+
+
+def open_point_files(
+    paths: tuple[Path, ...],
+    stamps_ns: Stamps,
+    notes: Notes,
+    layout: BinLayout | None = None,
+    times: StatedTimes | None = None,
+) -> PointFiles:
+    """Look at some scans of a recording, and return the loader of all.
+
+    Args:
+        paths: one file per scan, all of one kind.
+        stamps_ns: ``(N,)`` int64.
+        notes: receives what was found.
+        layout: the columns of ``.bin`` files; found by default.
+        times: what the user states about the points' times.
+
+    Raises:
+        DataError: the columns or their meaning cannot be found. A scan that cannot be read is passed over here; its
+            error comes when it is loaded.
+    """
+    step_ns = int(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else None
+    looked_at = sampled(len(paths))
+    if layout is None:
+        is_bin = paths[0].suffix == ".bin"
+        layout = find_layout([paths[k] for k in looked_at], step_ns, notes) if is_bin else BinLayout()
+    samples, errors = [], []
+    for k in looked_at:
+        try:
+            samples.append((int(stamps_ns[k]), read_columns(paths[k], layout, step_ns)))
+        except DataError as error:
+            errors.append(_at(paths[k], error))
+    if errors and not samples:
+        raise DataError(errors[0])
+    try:
+        found = find_format(samples, step_ns, notes, times)
+    except DataError as error:
+        raise DataError(_at(paths[0].parent if len(paths) > 1 else paths[0], error)) from None
+    return PointFiles(paths, stamps_ns, layout, step_ns, found)
+
+
+def read_columns(path: Path, layout: BinLayout | None = None, step_ns: int | None = None) -> Columns:
+    """Read the columns of a scan file, by lower-case name.
+
+    Args:
+        path: the file.
+        layout: the columns of a ``.bin`` file; KITTI's by default.
+        step_ns: median distance between the stamps, to recognise times in files without names.
+
+    Raises:
+        DataError: the file is missing, malformed or truncated; the message does not name it.
+    """
+    if not path.is_file():
+        raise DataError("no such file")
+    if path.suffix == ".bin":
+        return (layout or BinLayout()).read(path)
+    if path.suffix != ".npy":
+        return {name.lower(): values for name, values in _READERS[path.suffix](path).items()}
+    values = tables.read_npy(path)
+    if isinstance(values, dict):
+        return {name.lower(): column for name, column in values.items()}
+    names = ["x", "y", "z", *column_names(values[:, 3:], step_ns)]
+    return {name: values[:, k] for k, name in enumerate(names) if not name.startswith("_")}
 
 
 def read_scan(path: Path, stamp_ns: int) -> Scan:
-    """Read the scan in ``path``.
+    """Read one scan file by itself, finding its columns and times from its own values.
 
     Raises:
-        DataError: the file is missing or truncated, has no finite point, or has unusable columns; the message names the
-            file.
+        DataError: the file cannot be read or its columns have no clear meaning; the message names the file.
     """
-    points, columns = _read(path)
+    notes = Notes(path.name)
+    loader = open_point_files((path,), np.array([stamp_ns], np.int64), notes)
     try:
-        scan = Scan(stamp_ns, points, _intensity(columns), _offsets_ns(columns, stamp_ns))
+        return loader.format.scan(read_columns(path, loader.layout), stamp_ns)
     except DataError as error:
         raise DataError(f"{path}: {error}") from None
-    if not len(scan):
-        raise DataError(f"{path}: the scan has no finite points")
-    return scan
 
 
-def _read(path: Path) -> tuple[NDArray[Any], Columns]:
-    if not path.is_file():
-        raise DataError(f"{path}: no such file")
-    if path.suffix == ".bin":
-        points, intensity = read_bin(path)
-        return points, {"intensity": intensity}
-    return _read_npy(path) if path.suffix == ".npy" else _read_open3d(path)
-
-
-def _read_npy(path: Path) -> tuple[NDArray[Any], Columns]:
-    try:
-        values = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise DataError(f"{path}: cannot read the scan, perhaps truncated ({error})") from None
-    if values.dtype.names:
-        columns: Columns = {name: values[name].ravel() for name in values.dtype.names}
-        if not {"x", "y", "z"} <= columns.keys():
-            raise DataError(f"{path}: expected fields x y z, found {' '.join(columns)}")
-        return np.column_stack([columns["x"], columns["y"], columns["z"]]), columns
-    if values.ndim != 2 or values.shape[1] not in (3, 4):
-        raise DataError(f"{path}: expected (N, 3) x y z or (N, 4) x y z intensity, found shape {values.shape}")
-    return values[:, :3], {"intensity": values[:, 3]} if values.shape[1] == 4 else {}
-
-
-def _read_open3d(path: Path) -> tuple[NDArray[Any], Columns]:
-    import open3d as o3d
-
-    header = read_header(path)
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        cloud = o3d.t.io.read_point_cloud(path)
-    columns: Columns = {name: cloud.point[name].numpy() for name in cloud.point}
-    if "positions" not in columns or not len(columns["positions"]):
-        raise DataError(f"{path}: Open3D finds no points; the file is empty or malformed")
-    lost = [name for name in header.fields if name in _TIMES and name not in columns]
-    if lost:
-        raise DataError(
-            f"{path}: Open3D cannot read the type of the time column '{lost[0]}'; write it as int or double"
-        )
-    return columns.pop("positions"), {name: values.ravel() for name, values in columns.items()}
-
-
-def _intensity(columns: Columns) -> Floats | None:
-    values = next((columns[name] for name in _INTENSITIES if name in columns), None)
-    if values is None:
-        return None
-    full_scale = 255 if np.max(values, where=np.isfinite(values), initial=0) > 1 else 1
-    return np.asarray(values, dtype=np.float32) / np.float32(full_scale)
-
-
-def _offsets_ns(columns: Columns, stamp_ns: int) -> Stamps | None:
-    """Return the points' times relative to the scan's stamp; None without such a column.
-
-    Raises:
-        DataError: a time is not finite or over 1 s from the stamp, or all are within 1 ms but differ.
-    """
-    name = next((name for name in _TIMES if name in columns), None)
-    if name is None:
-        return None
-    values = columns[name]
-    if not np.isfinite(values).all():
-        raise DataError(f"column '{name}' has times that are not finite")
-    whole = np.issubdtype(values.dtype, np.integer)
-    ns = values.astype(np.int64) if whole else np.round(values.astype(np.float64) * NS_PER_S).astype(np.int64)
-    offsets = ns - stamp_ns if len(ns) and np.median(np.abs(ns)) > _MIN_ABSOLUTE_NS else ns
-    unit = "integers are nanoseconds" if whole else "floating-point numbers are seconds"
-    if len(offsets) and np.abs(offsets).max() > _MAX_OFFSET_NS:
-        raise DataError(f"column '{name}' is over 1 s from the scan's stamp; {unit}, on the stamps' clock")
-    if len(offsets) and 0 < np.ptp(offsets) < _MIN_SWEEP_NS:
-        raise DataError(f"column '{name}' spans under 1 ms, too short for a sweep; {unit}")
-    return offsets
+def _at(path: Path, error: DataError) -> str:
+    return f"{path}: {error}"

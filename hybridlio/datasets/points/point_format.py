@@ -1,0 +1,168 @@
+"""From the columns of a scan file to a scan: unit, points that are no returns, and times, found once a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridlio.core.arrays import Array, Floats, Mask
+from hybridlio.core.errors import DataError
+from hybridlio.core.sensors import MAX_RANGE_M, Scan
+from hybridlio.datasets.notes import Notes
+from hybridlio.datasets.points.point_times import PointTimes, StatedTimes, find_point_times
+
+Columns = Mapping[str, NDArray[Any]]
+
+SAMPLES = 5  # scans that are looked at to find the format: enough to see a pattern, 0.2 s to read
+
+_INTENSITIES = ("intensity", "reflectivity", "reflectance", "remission")
+_FULL_SCALES = (1.0, 255.0, 65535.0)  # of intensities: the smallest that holds them
+_MM = 1e-3
+_MIN_WHOLE_RANGE = 500.0  # median of whole numbers above which they are millimetres: no lidar's median range is 500 m
+_SAME_RANGE_M = 0.002  # of one no-return code, also where coordinates are rounded to millimetres
+_MIN_CODE_SHARE, _MIN_CODE_POINTS = 0.005, 20  # of a scan at its largest range; surfaces leave a few points there
+_MIN_CODE_ELEVATIONS_RAD = 0.03  # standard deviation: a code fills many beams, a real ring of equal ranges only one
+
+
+@dataclass(frozen=True)
+class PointFormat:
+    """How the columns of a recording's scans are read.
+
+    Attributes:
+        scale_m: metres in one unit of x, y and z.
+        no_return_m: range at which the sensor writes beams without a return, or None.
+        times: the convention of the points' times; None if there are none.
+    """
+
+    scale_m: float = 1.0
+    no_return_m: float | None = None
+    times: PointTimes | None = None
+
+    def scan(self, columns: Columns, stamp_ns: int) -> Scan:
+        """Return the scan of the columns, without points that are not finite, at the origin or no returns.
+
+        Raises:
+            DataError: x, y or z is missing, no point is left, or times are unusable.
+        """
+        points = self._points(columns)
+        keep = self._returns(points)
+        if not keep.all():
+            points, columns = points[keep], {name: values[keep] for name, values in columns.items()}
+        offsets = None if self.times is None else self.times.offsets_ns(columns, stamp_ns)
+        scan = Scan(stamp_ns, points, _intensity(columns), offsets)
+        if not len(scan):
+            far = "; all are over 10 km away, as in a map's frame, and must be in the lidar's" if len(points) else ""
+            raise DataError(f"the scan has no finite points{far}")
+        return scan
+
+    def _points(self, columns: Columns) -> Floats:
+        xyz = coordinates(columns)
+        if self.scale_m != 1.0:
+            xyz = xyz.astype(np.float64) * self.scale_m
+        return xyz.astype(np.float32, copy=False)
+
+    def _returns(self, points: Floats) -> Mask:
+        keep = np.asarray(np.isfinite(points).all(axis=1) & points.any(axis=1), dtype=bool)
+        if self.no_return_m is not None:
+            keep &= np.abs(_ranges(points) - self.no_return_m) > _SAME_RANGE_M
+        return keep
+
+
+def coordinates(columns: Columns) -> NDArray[Any]:
+    """Return x, y and z ``(N, 3)`` in the unit and type of the columns.
+
+    Raises:
+        DataError: one is missing.
+    """
+    if not {"x", "y", "z"} <= columns.keys():
+        raise DataError(f"expected fields x y z, found {' '.join(columns) or 'none'}")
+    return np.column_stack([columns["x"], columns["y"], columns["z"]])
+
+
+def sampled(count: int) -> list[int]:
+    """Return the indices of the scans to look at, spread over a recording of ``count`` scans."""
+    return sorted({round(k) for k in np.linspace(0, count - 1, SAMPLES)}) if count else []
+
+
+def find_format(
+    samples: Sequence[tuple[int, Columns]], step_ns: int | None, notes: Notes, stated: StatedTimes | None = None
+) -> PointFormat:
+    """Find the format of a recording from stamp and columns of some of its scans; note what is unusual.
+
+    Args:
+        samples: at the indices of :func:`sampled`, without scans that cannot be read.
+        step_ns: median distance between the stamps; None if there is one scan.
+        notes: receives the findings.
+        stated: what the user states about the points' times.
+
+    Raises:
+        DataError: x, y or z is missing, or the meaning of the points' times is not clear.
+    """
+    scale_m = _scale_m([coordinates(columns) for _, columns in samples], notes)
+    plain = PointFormat(scale_m)
+    clouds = [plain._points(columns) for _, columns in samples]
+    zeros = float(np.mean([(~cloud.any(axis=1)).mean() for cloud in clouds if len(cloud)] or [0.0]))
+    if zeros:
+        notes.found(f"points at the origin, {zeros:.1%} of a scan, are left out: beams without a return")
+    found = PointFormat(scale_m, _no_return_m(clouds, notes))
+    valid = []
+    for (stamp, columns), cloud in zip(samples, clouds, strict=True):
+        keep = found._returns(cloud)
+        valid.append((stamp, {name: values[keep] for name, values in columns.items()}))
+    return PointFormat(scale_m, found.no_return_m, find_point_times(valid, step_ns, notes, stated))
+
+
+def _scale_m(clouds: list[NDArray[Any]], notes: Notes) -> float:
+    """Return metres in one unit of the coordinates: 0.001 for whole numbers that are too large for metres."""
+    finite = [cloud[np.isfinite(cloud).all(axis=1)].astype(np.float64) for cloud in clouds]
+    finite = [cloud for cloud in finite if len(cloud)]
+    if not finite:
+        return 1.0
+    whole = all((cloud == np.round(cloud)).all() for cloud in finite)
+    medians = [float(np.median(_ranges(cloud[cloud.any(axis=1)]))) for cloud in finite if cloud.any()]
+    typical = float(np.median(medians or [0.0]))
+    if not whole or typical < _MIN_WHOLE_RANGE:
+        return 1.0
+    notes.found(f"coordinates are whole numbers with a median range of {typical:.0f}: read as millimetres")
+    return _MM
+
+
+def _no_return_m(clouds: list[Floats], notes: Notes) -> float | None:
+    """Return the exact range that a sensor writes for beams without a return; None if there is no such range.
+
+    It is the largest range of most scans, at many points in many directions.
+    """
+    codes, shares = [], []
+    for points in clouds:
+        cloud = points[np.isfinite(points).all(axis=1) & points.any(axis=1)]
+        ranges = _ranges(cloud)
+        at = ranges > ranges.max() - _SAME_RANGE_M if len(ranges) else np.zeros(0, dtype=bool)
+        if at.sum() < max(_MIN_CODE_POINTS, _MIN_CODE_SHARE * len(cloud)):
+            continue
+        if np.std(np.arcsin(cloud[at, 2] / ranges[at])) > _MIN_CODE_ELEVATIONS_RAD:
+            codes.append(float(np.median(ranges[at])))
+            shares.append(float(at.mean()))
+    if not codes or 2 * len(codes) <= len(clouds) or np.ptp(codes) > _SAME_RANGE_M or codes[0] >= MAX_RANGE_M:
+        return None
+    notes.add(
+        f"points at exactly {codes[0]:.3f} m, {np.mean(shares):.1%} of a scan, are left out: the code of beams without "
+        "a return"
+    )
+    return float(np.median(codes))
+
+
+def _ranges(points: NDArray[Any]) -> Array:
+    return np.asarray(np.linalg.norm(points.astype(np.float64), axis=1))
+
+
+def _intensity(columns: Columns) -> Floats | None:
+    values = next((columns[name] for name in _INTENSITIES if name in columns), None)
+    if values is None:
+        return None
+    largest = np.max(values, where=np.isfinite(values), initial=0)
+    full_scale = next((scale for scale in _FULL_SCALES if largest <= scale), _FULL_SCALES[-1])
+    return np.asarray(values, dtype=np.float32) / np.float32(full_scale)
