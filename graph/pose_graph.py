@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
-from hybridlio.core.geodesy import GeodeticPoint, check_geodetic, enu_from_geodetic
-from hybridlio.core.sensors import ImuNoise, ImuSamples
+from hybridlio.graph.body_measurements import BodyMeasurements
 from hybridlio.graph.formats.files import read_graph, write_graph
+from hybridlio.graph.formats.load_report import LoadOptions, LoadReport
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.connectivity import components
-from hybridlio.graph.model.graph_data import GraphData, PosesByKey
+from hybridlio.graph.model.graph_data import PosesByKey
 from hybridlio.graph.model.keys import Key, check_key
-from hybridlio.graph.model.measurements import Factor, Kind, factor_label
-from hybridlio.graph.model.new_factors import between_factor, check_direction, imu_factor, prior_factor, vector_factor
+from hybridlio.graph.model.measurements import Factor
+from hybridlio.graph.model.new_factors import between_factor, prior_factor
 from hybridlio.graph.model.noise import NoiseInput, RobustLike
 from hybridlio.graph.solve.batch import solve_batch
 from hybridlio.graph.solve.initial_values import find_initial_values
@@ -28,11 +28,8 @@ from hybridlio.graph.solve.replay import solve_online
 from hybridlio.graph.solve.settings import ONLINE_SOLVERS, InitialMethod, InitialName, OnlineName, Settings, SolverName
 from hybridlio.graph.solve.solution import Solution
 
-_UP = np.array([0.0, 0.0, 1.0])
-_STANDING_SIGMA_M_S = 0.01  # of a standing vehicle: it sways on its springs by millimetres in a second
 
-
-class PoseGraph:
+class PoseGraph(BodyMeasurements):
     """Poses and measurements; :meth:`optimize` finds the poses that fit the measurements best.
 
     Keys are integers or ``(robot, index)``. Poses are ``(4, 4)``; covariances are ``(6, 6)`` in rad² and m², rotation
@@ -45,7 +42,8 @@ class PoseGraph:
     """
 
     def __init__(self, dimension: co.Dimension = 3) -> None:
-        self._data = GraphData(dimension)
+        super().__init__(dimension)
+        self._load_report = LoadReport()
 
     def __repr__(self) -> str:
         edges, others = len(self._data.edges), len(self._data.other_factors)
@@ -107,15 +105,6 @@ class PoseGraph:
         """Release a fixed pose."""
         self._data.unfix(*self._data.known_keys(key, what="unfix"))
 
-    @property
-    def origin(self) -> GeodeticPoint | None:
-        """Place on Earth of world's origin, whose axes then are east, north and up; None until it is set."""
-        return self._data.origin
-
-    def set_origin(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> None:
-        """Set world's origin on Earth (WGS 84; metres above the ellipsoid); it cannot change, as fixes depend on it."""
-        self._data.set_origin(check_geodetic(latitude_deg, longitude_deg, altitude_m, "origin"))
-
     # factors: each call returns the factor's id
 
     @property
@@ -157,66 +146,6 @@ class PoseGraph:
         if factor.keys[1] not in self._data:
             self._data.add_pose(factor.keys[1])
         return self._data.add_factor(factor)
-
-    def add_gps(
-        self, key: Key, position_m: ArrayLike, sigmas: ArrayLike | None = None, lever_arm_m: ArrayLike = (0, 0, 0), *,
-        covariance: ArrayLike | None = None, robust: RobustLike = None,
-    ) -> int:  # fmt: skip
-        """Add the antenna's position ``(3,)`` in world; ``lever_arm_m`` is the antenna's position in the body frame."""
-        vectors, noise = (position_m, lever_arm_m), NoiseInput(covariance, sigmas=sigmas)
-        return self._add_vectors("gps", key, vectors, noise, robust)
-
-    def add_gps_geodetic(
-        self, key: Key, latitude_deg: float, longitude_deg: float, altitude_m: float, sigmas: ArrayLike | None = None,
-        lever_arm_m: ArrayLike = (0, 0, 0), *, covariance: ArrayLike | None = None, robust: RobustLike = None,
-    ) -> int:  # fmt: skip
-        """Add the antenna's place on Earth; world is east, north, up at ``origin``, which is the first fix if not set.
-
-        Args:
-            key: of a pose that the graph has.
-            latitude_deg, longitude_deg, altitude_m: on WGS 84, metres above the ellipsoid (not above sea level).
-            sigmas, covariance: exactly one of them, of east, north, up in metres.
-            lever_arm_m, robust: as in :meth:`add_gps`.
-        """
-        point = check_geodetic(latitude_deg, longitude_deg, altitude_m, factor_label("gps", (key,)))
-        origin = self.origin or point
-        position = enu_from_geodetic([point], origin)[0]
-        number = self.add_gps(key, position, sigmas, lever_arm_m, covariance=covariance, robust=robust)
-        self._data.origin = origin
-        return number
-
-    def add_attitude(
-        self, key: Key, direction_world: ArrayLike, direction_body: ArrayLike, sigma_rad: float,
-        robust: RobustLike = None,
-    ) -> int:  # fmt: skip
-        """Add a direction known in world and measured in the body frame, ``(3,)`` each, of any length but zero."""
-        for direction in (direction_world, direction_body):
-            check_direction(direction, factor_label("attitude", (key,)))
-        vectors, noise = (direction_world, direction_body), NoiseInput(sigmas=sigma_rad)
-        return self._add_vectors("attitude", key, vectors, noise, robust)
-
-    def add_gravity(self, key: Key, accel_m_s2: ArrayLike, sigma_rad: float, robust: RobustLike = None) -> int:
-        """Add roll and pitch from an accelerometer at rest or in steady motion, whose specific force points up."""
-        return self.add_attitude(key, _UP, accel_m_s2, sigma_rad, robust)
-
-    def add_velocity(self, key: Key, velocity_m_s: ArrayLike, sigmas: ArrayLike, robust: RobustLike = None) -> int:
-        """Add the body's velocity ``(3,)`` in world."""
-        return self._add_vectors("velocity", key, (velocity_m_s,), NoiseInput(sigmas=sigmas), robust)
-
-    def add_zero_velocity(self, key: Key, sigma_m_s: float = _STANDING_SIGMA_M_S) -> int:
-        """Add that the body stands still."""
-        return self.add_velocity(key, np.zeros(3), sigma_m_s)
-
-    def add_bias(self, key: Key, accel_m_s2: ArrayLike, gyro_rad_s: ArrayLike, sigmas: ArrayLike) -> int:
-        """Add the IMU's biases, ``(3,)`` each; ``sigmas`` are six, accelerometer first.
-
-        A chain of inertial factors without one starts from biases of zero, with the sigmas of its :class:`ImuNoise`.
-        """
-        return self._add_vectors("bias", key, (accel_m_s2, gyro_rad_s), NoiseInput(sigmas=sigmas))
-
-    def add_imu(self, i: Key, j: Key, samples: ImuSamples, noise: ImuNoise | None = None) -> int:
-        """Add two or more raw samples, the first at pose i, the last at pose j; brings both velocities and biases."""
-        return self._data.add_factor(imu_factor(self._data, (i, j), samples, noise or ImuNoise()))
 
     # solving
 
@@ -273,15 +202,32 @@ class PoseGraph:
     # files
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> PoseGraph:
-        """Read ``.npz``, ``.g2o`` or TORO's ``.graph``; in text with neither FIX nor prior the lowest pose is fixed.
+    def load(
+        cls, path: str | os.PathLike[str], *, repair: bool = False, strict: bool = False, drop: Collection[str] = ()
+    ) -> PoseGraph:
+        """Read ``.npz``, ``.g2o`` or TORO's ``.graph``; in text that places no pose, the one of lowest id is fixed.
+
+        :attr:`load_report` and a warning tell what was left out, repaired or completed.
+
+        Args:
+            path: the file.
+            repair: whether to replace each information matrix that is not positive definite by the nearest one that
+                is, instead of refusing the file.
+            strict: whether to refuse rows that are left out by default (planes and directions, as hdl_graph_slam
+                writes them) and TORO's edges without information, which are given the identity by default.
+            drop: tags of rows to leave out, where a file has rows that cannot be read.
 
         Raises:
-            DataError: the file is missing, truncated or malformed; names the row.
+            DataError: the file is missing, truncated or malformed, or has rows that cannot be read; names the row.
         """
         graph = cls()
-        graph._data = read_graph(path)
+        graph._data, graph._load_report = read_graph(path, LoadOptions(repair, strict, drop))
         return graph
+
+    @property
+    def load_report(self) -> LoadReport:
+        """Counts of what :meth:`load` left out or changed; false where it read everything as it is."""
+        return self._load_report
 
     def save(self, path: str | os.PathLike[str], solution: Solution | None = None) -> None:
         """Write ``.npz`` (everything), ``.g2o`` or TORO's ``.graph``, with the initial values or a solution's poses.
@@ -291,8 +237,3 @@ class PoseGraph:
             DataError: unknown ending, or the file cannot be written.
         """
         write_graph(self._data, path, solution)
-
-    def _add_vectors(
-        self, kind: Kind, key: Key, vectors: tuple[ArrayLike, ...], noise: NoiseInput, robust: RobustLike = None
-    ) -> int:
-        return self._data.add_factor(vector_factor(self._data, kind, key, vectors, noise, robust))

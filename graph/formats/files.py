@@ -6,19 +6,20 @@ import os
 from pathlib import Path
 
 from hybridlio.core.errors import DataError
+from hybridlio.graph.formats.load_report import LoadOptions, LoadReport
 from hybridlio.graph.formats.npz import read_npz, write_npz
 from hybridlio.graph.formats.text_reader import read_text
 from hybridlio.graph.formats.text_writer import write_text
 from hybridlio.graph.model.graph_data import GraphData, PosesByKey
 
 
-def read_graph(path: str | os.PathLike[str]) -> GraphData:
-    """Read a pose graph: ``.npz``, or text (g2o's or TORO's) under any other ending.
+def read_graph(path: str | os.PathLike[str], options: LoadOptions) -> tuple[GraphData, LoadReport]:
+    """Read a pose graph: ``.npz``, or text (g2o's or TORO's) under any other ending; the options concern text.
 
     Raises:
         DataError: the file is missing, truncated or malformed; names the row of text.
     """
-    return read_npz(path) if Path(path).suffix == ".npz" else read_text(path)
+    return (read_npz(path), LoadReport()) if Path(path).suffix == ".npz" else read_text(path, options)
 
 
 def write_graph(data: GraphData, path: str | os.PathLike[str], solution: PosesByKey | None) -> None:

@@ -21,8 +21,9 @@ from hybridlio.core.estimates import RelativePose
 from hybridlio.core.files import write_atomically
 from hybridlio.graph.model import coordinates as co
 
-RowKind: TypeAlias = Literal["vertex", "edge", "prior"]
-Angles: TypeAlias = Literal["quaternion", "rpy", "heading"]
+RowKind: TypeAlias = Literal["vertex", "edge", "prior", "position"]
+Values: TypeAlias = Literal["quaternion", "rpy", "heading", "point"]
+_SIZES = {"quaternion": 7, "rpy": 6, "heading": 3}
 
 
 @dataclass(frozen=True)
@@ -30,28 +31,35 @@ class RowFormat:
     """What follows the tag in a row of text.
 
     Attributes:
-        kind: vertex, edge or prior.
+        kind: vertex, edge, prior of a pose, or prior of a position.
         dimension: 2 or 3.
-        angles: how the rotation is written.
+        values: what is written: a pose, by how its rotation is written, or a point.
         ids: number of integers at the start.
         triangle: ``(row, column)`` in the information matrix, translation first, of each number at the end.
+        optional_information: whether rows may end before the information matrix, which then is the identity.
     """
 
     kind: RowKind
     dimension: co.Dimension
-    angles: Angles
+    values: Values
     ids: int
     triangle: tuple[tuple[int, int], ...] = ()
+    optional_information: bool = False
 
     @property
-    def pose_size(self) -> int:
-        """Number of values of the pose."""
-        return {"quaternion": 7, "rpy": 6, "heading": 3}[self.angles]
+    def keys(self) -> int:
+        """Number of vertices that a row names; a further integer is the id of a sensor's offset."""
+        return 2 if self.kind == "edge" else 1
+
+    @property
+    def head(self) -> int:
+        """Number of words after the tag and before the information matrix."""
+        return self.ids + _SIZES.get(self.values, self.dimension)
 
     @property
     def length(self) -> int:
         """Number of words after the tag."""
-        return self.ids + self.pose_size + len(self.triangle)
+        return self.head + len(self.triangle)
 
 
 def _upper_triangle(size: int) -> tuple[tuple[int, int], ...]:
@@ -67,10 +75,11 @@ ROW_FORMATS = {
     "VERTEX_SE2": RowFormat("vertex", 2, "heading", 1),
     "EDGE_SE2": RowFormat("edge", 2, "heading", 2, _upper_triangle(3)),
     "EDGE_PRIOR_SE2": RowFormat("prior", 2, "heading", 1, _upper_triangle(3)),
+    "EDGE_SE3_PRIORXYZ": RowFormat("position", 3, "point", 1, _upper_triangle(3)),
     "VERTEX3": RowFormat("vertex", 3, "rpy", 1),
-    "EDGE3": RowFormat("edge", 3, "rpy", 2, _upper_triangle(6)),
+    "EDGE3": RowFormat("edge", 3, "rpy", 2, _upper_triangle(6), optional_information=True),
     "VERTEX2": RowFormat("vertex", 2, "heading", 1),
-    "EDGE2": RowFormat("edge", 2, "heading", 2, _TORO_PLANAR),
+    "EDGE2": RowFormat("edge", 2, "heading", 2, _TORO_PLANAR, optional_information=True),
     "VERTEX": RowFormat("vertex", 2, "heading", 1),
     "EDGE": RowFormat("edge", 2, "heading", 2, _TORO_PLANAR),
     "ODOMETRY": RowFormat("edge", 2, "heading", 2, _TORO_PLANAR),
@@ -78,9 +87,12 @@ ROW_FORMATS = {
 # The same tags in files whose writers order the triangle row by row instead of as TORO does.
 ROW_BY_ROW = {tag: RowFormat("edge", 2, "heading", 2, _upper_triangle(3)) for tag in ("EDGE2", "EDGE", "ODOMETRY")}
 
-# Tags that a reader skips: landmarks, cameras, and measurements and parameters of them.
-SKIPPED_TAGS = frozenset(
+# Rows that are left out and counted: planes, and priors of directions, as hdl_graph_slam and GLIM write them.
+LEFT_OUT_TAGS = frozenset(
     {
+        *("VERTEX_PLANE", "EDGE_SE3_PLANE", "EDGE_PLANE", "EDGE_PLANE_IDENTITY", "EDGE_PLANE_PARALLEL"),
+        *("EDGE_PLANE_PERPENDICULAR", "EDGE_PLANE_PRIOR_NORMAL", "EDGE_PLANE_PRIOR_DISTANCE"),
+        *("EDGE_SE3_PRIORVEC", "EDGE_SE3_PRIORQUAT"),
         *("VERTEX_XY", "VERTEX_TRACKXYZ", "VERTEX_POINTXYZ", "VERTEX_CAM", "LANDMARK", "BR", "EQUIV"),
         *("EDGE_SE2_XY", "EDGE_BEARING_SE2_XY", "EDGE_BEARING_RANGE_SE2_XY", "EDGE_PRIOR_SE2_XY", "EDGE_XY_PRIOR"),
         *("EDGE_SE3_TRACKXYZ", "EDGE_SE3_XYZ", "EDGE_SE3_XYZ_PRIOR", "EDGE_PROJECT_P2MC"),
@@ -89,9 +101,9 @@ SKIPPED_TAGS = frozenset(
 )
 
 
-def pose_numbers(coordinates: Array, angles: Angles) -> Array:
+def pose_numbers(coordinates: Array, values: Values) -> Array:
     """Return a row's numbers of a pose from its coordinates."""
-    if angles != "rpy":
+    if values != "rpy":
         return coordinates
     yaw_pitch_roll = Rotation.from_quat(coordinates[3:]).as_euler("ZYX")
     return np.concatenate([coordinates[:3], yaw_pitch_roll[::-1]])
@@ -99,8 +111,10 @@ def pose_numbers(coordinates: Array, angles: Angles) -> Array:
 
 def information_numbers(information: Array, row_format: RowFormat) -> Array:
     """Return a row's numbers of an information matrix ``(d, d)``, rotation first."""
-    order = co.TEXT_ORDER[row_format.dimension]
-    ordered = information[np.ix_(order, order)]
+    ordered = information
+    if row_format.values != "point":
+        order = co.TEXT_ORDER[row_format.dimension]
+        ordered = information[np.ix_(order, order)]
     return np.array([ordered[cell] for cell in row_format.triangle])
 
 

@@ -4,119 +4,56 @@ from __future__ import annotations
 
 import logging
 import os
-from collections import Counter
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
-from hybridlio.core.errors import DataError, GraphError, HybridLioError
-from hybridlio.graph.formats.g2o import ROW_FORMATS, SKIPPED_TAGS
-from hybridlio.graph.formats.text_rows import ParsedRows, TextTable, check_ids, parse_rows
+from hybridlio.core import se3
+from hybridlio.core.arrays import Array
+from hybridlio.core.errors import DataError, GraphError
+from hybridlio.graph.formats.g2o import ROW_FORMATS
+from hybridlio.graph.formats.load_report import LoadOptions, LoadReport
+from hybridlio.graph.formats.text_rows import ParsedRows, parse_rows
+from hybridlio.graph.formats.text_split import read_lines, split_by_tag
 from hybridlio.graph.model import coordinates as co
+from hybridlio.graph.model.checks import free_motions
+from hybridlio.graph.model.connectivity import components
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, from_integer, to_integer
-from hybridlio.graph.model.measurements import Factor
-from hybridlio.graph.model.noise import Noise, Robust, make_robust
+from hybridlio.graph.model.measurements import Factor, Kind
+from hybridlio.graph.model.noise import Noise
 
 _LOG = logging.getLogger(__name__)
-_OFFSET_TAG = "PARAMS_SE3OFFSET"
 
 
-@dataclass(frozen=True, eq=False)
-class _FileContent:
-    """A text file split by tag.
+def read_text(path: str | os.PathLike[str], options: LoadOptions) -> tuple[GraphData, LoadReport]:
+    """Read a pose graph from g2o's or TORO's text; a warning says what was left out or changed.
 
-    Attributes:
-        tables: rows of poses and factors by tag.
-        fixed: ids of fixed poses.
-    """
-
-    tables: dict[str, TextTable]
-    fixed: list[int]
-
-
-def read_text(path: str | os.PathLike[str]) -> GraphData:
-    """Read a pose graph from g2o's or TORO's text.
-
-    Rows of landmarks are skipped, with a warning. Where the file has neither FIX nor a prior, the pose of lowest id is
-    fixed, at the origin if the file has no vertices.
+    Where neither FIX nor priors place the graph, the pose of lowest id is fixed, at the origin if the file has no
+    vertices.
 
     Raises:
-        DataError: the file cannot be read, is truncated or malformed; names the row.
+        DataError: the file cannot be read, is truncated or malformed, or holds what the options refuse; names the row.
     """
     path = Path(path)
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"cannot read {path}: {error}") from error
-    content = _split(path, lines)
+    content = split_by_tag(path, read_lines(path), options)
     dimensions = {ROW_FORMATS[tag].dimension for tag in content.tables}
     if len(dimensions) != 1:
         found = "poses in the plane and in space" if dimensions else "no poses"
         raise DataError(f"{path}: found {found}; expected VERTEX_ and EDGE_ rows of one dimension")
     data = GraphData(dimensions.pop())
     try:
-        rows = [parse_rows(path, tag, table) for tag, table in content.tables.items()]
+        rows = [parse_rows(path, tag, table, options.repair) for tag, table in content.tables.items()]
         _add_vertices(data, path, [part for part in rows if ROW_FORMATS[part.tag].kind == "vertex"])
-        _add_factors(data, path, [part for part in rows if ROW_FORMATS[part.tag].kind != "vertex"])
+        _add_factors(data, path, [part for part in rows if ROW_FORMATS[part.tag].kind != "vertex"], content.offsets)
         _fix(data, content.fixed)
     except GraphError as error:
         raise DataError(f"{path}: {error}") from error
-    return data
-
-
-def _split(path: Path, lines: list[str]) -> _FileContent:
-    """Sort the rows by tag; a kernel in a comment belongs to the next factor."""
-    content, skipped = _FileContent({}, []), Counter[str]()
-    kernel: Robust | None = None
-    for number, line in enumerate(lines, 1):
-        tag, rest = (*line.split(None, 1), "", "")[:2]
-        if tag in ROW_FORMATS:
-            table = content.tables.setdefault(tag, TextTable())
-            if kernel is not None:
-                table.kernels[len(table.lines)], kernel = kernel, None
-            table.lines.append(number)
-            table.rests.append(rest)
-        elif tag and tag not in SKIPPED_TAGS:
-            kernel = _read_other_row(path, number, content, tag, rest.split()) or kernel
-        elif tag:
-            skipped[tag] += 1
-    if skipped:
-        _LOG.warning(
-            "%s: skipped %s; only poses are read", path, ", ".join(f"{n} × {tag}" for tag, n in skipped.items())
-        )
-    return content
-
-
-def _read_other_row(path: Path, line: int, content: _FileContent, tag: str, words: list[str]) -> Robust | None:
-    """Read a row that is neither pose nor factor; return the kernel that it gives the next factor, if any."""
-    if tag == "#" and words[:1] == ["robust"]:
-        return _read_kernel(path, line, words)
-    if tag == "FIX":
-        content.fixed.extend(int(word) for word in check_ids(path, line, words))
-    elif tag == _OFFSET_TAG:
-        _check_offset(path, line, words)
-    elif not tag.startswith("#"):
-        raise DataError(f"{path}, row {line}: unknown tag {tag!r}")
-    return None
-
-
-def _read_kernel(path: Path, line: int, words: list[str]) -> Robust | None:
-    try:
-        return make_robust((words[1], float(words[2])), 1, "kernel")
-    except (IndexError, ValueError, HybridLioError) as error:
-        raise DataError(f"{path}, row {line}: expected a kernel '# robust NAME WIDTH' ({error})") from error
-
-
-def _check_offset(path: Path, line: int, words: list[str]) -> None:
-    try:
-        offset = [float(word) for word in words[1:]]
-    except ValueError:
-        offset = []
-    if offset != co.IDENTITY[3].tolist():
-        raise DataError(f"{path}, row {line}: priors with an offset are not supported; apply the offset to the priors")
+    report = LoadReport(dict(content.left_out), sum(part.repaired for part in rows), content.without_information)
+    if report:
+        _LOG.warning("%s: %s", path, report)
+    return data, report
 
 
 def _add_vertices(data: GraphData, path: Path, parts: list[ParsedRows]) -> None:
@@ -131,7 +68,7 @@ def _add_vertices(data: GraphData, path: Path, parts: list[ParsedRows]) -> None:
         data.add_poses(keys, part.coordinates)
 
 
-def _add_factors(data: GraphData, path: Path, parts: list[ParsedRows]) -> None:
+def _add_factors(data: GraphData, path: Path, parts: list[ParsedRows], offsets: dict[int, Array]) -> None:
     """Add all edges and priors, with ids in the file's order."""
     rows = sorted((line, keys) for part in parts for line, keys in zip(part.lines, part.keys, strict=True))
     ids = {line: factor_id for factor_id, (line, _) in enumerate(rows)}
@@ -140,8 +77,8 @@ def _add_factors(data: GraphData, path: Path, parts: list[ParsedRows]) -> None:
     if edges:
         _add_edges(data, edges, ids)
     for part in parts:
-        if ROW_FORMATS[part.tag].kind == "prior":
-            _add_priors(data, part, ids)
+        if ROW_FORMATS[part.tag].kind in ("prior", "position"):
+            _add_priors(data, part, ids, offsets)
 
 
 def _add_edges(data: GraphData, parts: list[ParsedRows], ids: dict[int, int]) -> None:
@@ -155,11 +92,28 @@ def _add_edges(data: GraphData, parts: list[ParsedRows], ids: dict[int, int]) ->
     data.add_edges(numbers[order], ends[order], measured[order], information[order], kernels)
 
 
-def _add_priors(data: GraphData, part: ParsedRows, ids: dict[int, int]) -> None:
+def _add_priors(data: GraphData, part: ParsedRows, ids: dict[int, int], offsets: dict[int, Array]) -> None:
     columns = zip(part.lines, part.keys, part.coordinates, part.information, strict=True)
-    for k, (line, keys, pose, information) in enumerate(columns):
-        factor = Factor("prior", keys, pose, Noise("information", information), part.kernels.get(k))
+    for k, (line, keys, measured, information) in enumerate(columns):
+        offset = offsets.get(part.offsets[k]) if part.offsets else None
+        if offset is not None and not np.array_equal(offset, co.IDENTITY[3]):
+            measured, information = _prior_of_body(measured, information, offset)
+        kind: Kind = "prior"
+        if ROW_FORMATS[part.tag].kind == "position":  # of the body's origin: a fix with the antenna there
+            kind, measured = "gps", np.r_[measured, np.zeros(3)]
+        factor = Factor(kind, keys, measured, Noise("information", information), part.kernels.get(k))
         data.add_factor(factor, ids[line])
+
+
+def _prior_of_body(sensor: Array, information: Array, offset: Array) -> tuple[Array, Array]:
+    """Return a prior of the body's pose from one of a sensor's, given the sensor in the body frame.
+
+    A right perturbation ξ of the body's pose T is Ad(offset⁻¹) ξ of the sensor's pose T·offset.
+    """
+    T_world_sensor, T_body_sensor = co.to_matrices(np.array([sensor, offset]))
+    T_sensor_body = se3.inverse(T_body_sensor)
+    J = se3.adjoint(T_sensor_body)
+    return co.from_matrices((T_world_sensor @ T_sensor_body)[None], 3)[0], J.T @ information @ J
 
 
 def _check_keys(data: GraphData, path: Path, rows: list[tuple[int, tuple[Key, ...]]]) -> None:
@@ -178,10 +132,17 @@ def _check_keys(data: GraphData, path: Path, rows: list[tuple[int, tuple[Key, ..
 
 def _fix(data: GraphData, fixed: list[int]) -> None:
     """Fix the poses that the file names, or the one of lowest id where nothing else anchors the graph."""
-    anchored = any(factor.kind == "prior" for factor in data.other_factors.values())
+    anchored = any(factor.kind == "prior" for factor in data.other_factors.values()) or _placed_by_positions(data)
     lowest = [] if anchored else [min(map(to_integer, data.keys))]
     for number in fixed or lowest:
         (key,) = data.known_keys(from_integer(number), what="FIX")
         if data.initial_value(key) is None:
             data.set_initial(key, co.IDENTITY[data.dimension])
         data.fix(key)
+
+
+def _placed_by_positions(data: GraphData) -> bool:
+    """Return whether measured positions determine where the whole graph lies."""
+    if not any(factor.kind == "gps" for factor in data.other_factors.values()):
+        return False
+    return not any(free_motions(data, part) for part in components(data))

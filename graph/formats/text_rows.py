@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridlio.core.arrays import Array
+from hybridlio.core.arrays import Array, Mask
 from hybridlio.core.errors import DataError, GraphError
 from hybridlio.graph.formats.g2o import ROW_BY_ROW, ROW_FORMATS, RowFormat
 from hybridlio.graph.model import coordinates as co
@@ -17,6 +18,12 @@ from hybridlio.graph.model.noise import Robust
 
 _UNIT_TOLERANCE = 1e-3  # of a quaternion's norm: files with three digits pass, other numbers do not
 _EXACT_INTEGERS = 2**53  # a double holds all integers below it
+_LONGEST_ID = 19  # digits of the largest signed 64-bit integer
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_NOT_FINITE = re.compile(r"[+-]?(nan|inf|infinity)", re.ASCII | re.IGNORECASE)
+# Smallest eigenvalue of a repaired information matrix, relative to its largest: far above double rounding (1e-16), so
+# that Cholesky succeeds, and as good as no information beside that of other factors.
+_REPAIRED_EIGENVALUE = 1e-9
 
 
 @dataclass(eq=False)
@@ -42,20 +49,24 @@ class ParsedRows:
         tag: theirs.
         lines: line numbers in the file.
         keys: of the poses that each names.
+        offsets: id of the sensor's offset that each names; empty where the format has none.
         coordinates: ``(M, 7)`` or ``(M, 3)``.
         information: ``(M, d, d)``; empty for vertices.
         kernels: robust kernels by row.
+        repaired: number of rows whose information matrix was not positive definite.
     """
 
     tag: str
     lines: list[int]
     keys: list[tuple[Key, ...]]
+    offsets: list[int]
     coordinates: Array
     information: Array
     kernels: dict[int, Robust]
+    repaired: int = 0
 
 
-def parse_rows(path: Path, tag: str, table: TextTable) -> ParsedRows:
+def parse_rows(path: Path, tag: str, table: TextTable, repair: bool) -> ParsedRows:
     """Parse the rows of one tag.
 
     Raises:
@@ -63,39 +74,41 @@ def parse_rows(path: Path, tag: str, table: TextTable) -> ParsedRows:
     """
     row_format = ROW_FORMATS[tag]
     if not row_format.triangle:
-        numbers = _parse_numbers(path, tag, table, table.rests)
-        ids, values = _ids(path, tag, table, numbers), numbers[:, row_format.ids :]
-        coordinates = _coordinates(path, table.lines, row_format, values)
-        return ParsedRows(tag, table.lines, _keys(path, table.lines, ids), coordinates, np.empty(0), table.kernels)
-    # Poses differ from row to row, information matrices seldom do: each distinct matrix is parsed once.
-    head = row_format.ids + row_format.pose_size
-    split = [rest.split(None, head) for rest in table.rests]
-    if any(len(words) <= head for words in split):
-        _raise_for_first_bad_row(path, tag, table)
-    heads = _parse_numbers(path, tag, table, [" ".join(words[:-1]) for words in split])
-    last_row = {words[-1]: k for k, words in enumerate(split)}  # by the matrix's text
-    number = {text: k for k, text in enumerate(last_row)}
-    matrices = _parse_numbers(path, tag, table, list(last_row), skipped=head)
-    lines = [table.lines[k] for k in last_row.values()]
-    information = _check_information(path, tag, lines, matrices)[[number[words[-1]] for words in split]]
+        heads = _parse_numbers(path, tag, table, table.rests)
+        information, repaired = np.empty(0), 0
+    else:
+        # Poses differ from row to row, information matrices seldom do: each distinct matrix is parsed once.
+        split = [rest.split(None, row_format.head) for rest in table.rests]
+        if any(len(words) <= row_format.head for words in split):
+            _raise_for_first_bad_row(path, tag, table)
+        heads = _parse_numbers(path, tag, table, [" ".join(words[:-1]) for words in split])
+        last_row = {words[-1]: k for k, words in enumerate(split)}  # by the matrix's text
+        number = {text: k for k, text in enumerate(last_row)}
+        matrices = _parse_numbers(path, tag, table, list(last_row), skipped=row_format.head)
+        lines = [table.lines[k] for k in last_row.values()]
+        distinct, wrong = _check_information(path, tag, lines, matrices, repair)
+        rows = [number[words[-1]] for words in split]
+        information, repaired = distinct[rows], int(wrong[rows].sum())
+    ids = _ids(path, tag, table, heads)
+    keys = _keys(path, table.lines, [row[: row_format.keys] for row in ids])
+    offsets = [row[-1] for row in ids] if row_format.ids > row_format.keys else []
     coordinates = _coordinates(path, table.lines, row_format, heads[:, row_format.ids :])
-    keys = _keys(path, table.lines, _ids(path, tag, table, heads))
-    return ParsedRows(tag, table.lines, keys, coordinates, information, table.kernels)
+    return ParsedRows(tag, table.lines, keys, offsets, coordinates, information, table.kernels, repaired)
 
 
 def _parse_numbers(path: Path, tag: str, table: TextTable, rows: list[str], skipped: int = 0) -> Array:
     """Return the numbers ``(M, n)`` of rows of text, of which each lacks the first ``skipped``."""
     row_format = ROW_FORMATS[tag]
-    only_head = row_format.triangle and not skipped
-    length = row_format.ids + row_format.pose_size if only_head else row_format.length
+    length = row_format.length - skipped if skipped else row_format.head
+    if any(not row for row in rows):  # NumPy leaves empty rows out
+        _raise_for_first_bad_row(path, tag, table)
     try:
         values = np.loadtxt(rows, comments=None, ndmin=2)
     except ValueError:
+        values = np.empty((0, 0))
+    if values.shape != (len(rows), length) or not np.isfinite(values).all():
         _raise_for_first_bad_row(path, tag, table)
-        raise
-    if values.shape != (len(rows), length - skipped) or not np.isfinite(values).all():
-        _raise_for_first_bad_row(path, tag, table)
-        raise DataError(f"{path}: {tag} rows cannot be read")
+        raise DataError(f"{path}, row {table.lines[0]}: cannot read the {tag} rows from here on")
     return values
 
 
@@ -106,31 +119,38 @@ def _raise_for_first_bad_row(path: Path, tag: str, table: TextTable) -> None:
         if len(words) != row_format.length:
             raise DataError(f"{path}, row {line}: {tag} takes {row_format.length} values, got {len(words)}")
         check_ids(path, line, words[: row_format.ids])
-        for word in words[row_format.ids :]:
-            _check_number(path, line, word)
+        check_numbers(path, line, words[row_format.ids :])
 
 
-def _check_number(path: Path, line: int, word: str) -> None:
-    try:
-        value = float(word)
-    except ValueError:
-        raise DataError(f"{path}, row {line}: {word!r} is not a number") from None
-    if not np.isfinite(value):
-        raise DataError(f"{path}, row {line}: numbers must be finite, got {word}")
+def check_numbers(path: Path, line: int, words: list[str]) -> Array:
+    """Return the words as numbers.
+
+    Raises:
+        DataError: one is not a finite number in ASCII digits.
+    """
+    for word in words:
+        if _NOT_FINITE.fullmatch(word):
+            raise DataError(f"{path}, row {line}: numbers must be finite, got {word}")
+        if not _NUMBER.fullmatch(word):
+            raise DataError(f"{path}, row {line}: {word!r} is not a number")
+        if not np.isfinite(float(word)):
+            raise DataError(f"{path}, row {line}: numbers must be finite, got {word}")
+    return np.array([float(word) for word in words])
 
 
 def check_ids(path: Path, line: int, words: list[str]) -> list[str]:
     """Return the words; raise DataError where one is not the number of a pose."""
-    if not "".join(words).isdecimal() or "" in words:
+    if any(not (word.isascii() and word.isdecimal() and len(word) <= _LONGEST_ID) for word in words):
         raise DataError(f"{path}, row {line}: pose ids must be non-negative integers, got {' '.join(words)!r}")
     return words
 
 
 def _ids(path: Path, tag: str, table: TextTable, numbers: Array) -> list[list[int]]:
-    """Return the pose ids of each row; those too large for a double are parsed again, as integers."""
-    count, ids = 2 if ROW_FORMATS[tag].kind == "edge" else 1, numbers[:, : ROW_FORMATS[tag].ids]
+    """Return the integers of each row; those too large for a double are parsed again."""
+    count = ROW_FORMATS[tag].ids
+    ids = numbers[:, :count]
     if (ids == np.floor(ids)).all() and ids.min() >= 0 and ids.max() < _EXACT_INTEGERS:
-        exact: list[list[int]] = ids[:, :count].astype(np.int64).tolist()
+        exact: list[list[int]] = ids.astype(np.int64).tolist()
         return exact
     _raise_for_first_bad_row(path, tag, table)
     return [[int(word) for word in rest.split(None, count)[:count]] for rest in table.rests]
@@ -149,45 +169,72 @@ def _keys(path: Path, lines: list[int], ids: list[list[int]]) -> list[tuple[Key,
 
 
 def _coordinates(path: Path, lines: list[int], row_format: RowFormat, values: Array) -> Array:
-    """Return coordinates ``(M, 7)`` or ``(M, 3)`` from the numbers of poses."""
-    if row_format.angles == "heading":
-        return values
-    if row_format.angles == "rpy":
+    """Return the coordinates of poses, ``(M, 7)`` or ``(M, 3)``, or of points ``(M, d)``."""
+    if row_format.values == "rpy":
         quaternions = Rotation.from_euler("ZYX", values[:, [5, 4, 3]]).as_quat(canonical=True)
         return np.hstack([values[:, :3], quaternions])
-    bad = np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1) > _UNIT_TOLERANCE
-    if bad.any():
-        raise DataError(f"{path}, row {lines[int(np.argmax(bad))]}: the quaternion is not of unit length")
+    if row_format.values == "quaternion":
+        check_quaternions(path, lines, values)
     return values
 
 
-def _check_information(path: Path, tag: str, lines: list[int], values: Array) -> Array:
-    """Return information matrices ``(M, d, d)``; TORO's planar tags in the order that makes all positive definite."""
+def check_quaternions(path: Path, lines: list[int], values: Array) -> None:
+    """Raise DataError where the quaternion of one of the coordinates ``(M, 7)`` is not of unit length."""
+    bad = np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1) > _UNIT_TOLERANCE
+    if bad.any():
+        raise DataError(f"{path}, row {lines[int(np.argmax(bad))]}: the quaternion is not of unit length")
+
+
+def _check_information(path: Path, tag: str, lines: list[int], values: Array, repair: bool) -> tuple[Array, Mask]:
+    """Return information matrices ``(M, d, d)``, all positive definite, and which of them were not.
+
+    TORO's planar tags are read in the order that makes all of them positive definite.
+    """
     information = _information(values, ROW_FORMATS[tag])
-    bad = _first_indefinite(information)
-    if bad is not None and tag in ROW_BY_ROW:
+    wrong = _not_positive_definite(information)
+    if wrong.any() and tag in ROW_BY_ROW:
         row_by_row = _information(values, ROW_BY_ROW[tag])
-        if _first_indefinite(row_by_row) is None:
-            return row_by_row
-    if bad is not None:
-        raise DataError(f"{path}, row {lines[bad]}: the information matrix is not positive definite")
-    return information
+        if not _not_positive_definite(row_by_row).any():
+            return row_by_row, np.zeros_like(wrong)
+    if wrong.any() and not repair:
+        raise DataError(
+            f"{path}, row {lines[int(np.argmax(wrong))]}: the information matrix is not positive definite; "
+            "load with repair=True to take the nearest matrix that is"
+        )
+    for k in np.flatnonzero(wrong):
+        information[k] = _nearest_positive_definite(information[k])
+    return information, wrong
 
 
 def _information(values: Array, row_format: RowFormat) -> Array:
     """Return matrices ``(M, d, d)``, rotation first, from the numbers of their upper triangles."""
-    size = co.TANGENT_SIZE[row_format.dimension]
+    size = 1 + max(row for row, _ in row_format.triangle)
     matrix = np.empty((len(values), size, size))
     for column, (i, j) in enumerate(row_format.triangle):
         matrix[:, i, j] = matrix[:, j, i] = values[:, column]
+    if row_format.values == "point":
+        return matrix
     order = np.argsort(co.TEXT_ORDER[row_format.dimension])
     return matrix[:, order][:, :, order]
 
 
-def _first_indefinite(information: Array) -> int | None:
-    """Return the index of the first matrix that is not positive definite, or None."""
+def _not_positive_definite(information: Array) -> Mask:
+    """Return which matrices ``(M, d, d)`` are not positive definite, ``(M,)``."""
     try:
         np.linalg.cholesky(information)
     except np.linalg.LinAlgError:
-        return int(np.argmin(np.linalg.eigvalsh(information)[:, 0] > 0))
-    return None
+        return np.array([len(information) == 1 or _not_positive_definite(matrix[None])[0] for matrix in information])
+    return np.zeros(len(information), dtype=bool)
+
+
+def _nearest_positive_definite(matrix: Array) -> Array:
+    """Return the nearest matrix, in the Frobenius norm, whose eigenvalues are all positive.
+
+    Higham, "Computing a nearest symmetric positive semidefinite matrix" (1988): negative eigenvalues become zero, here
+    a small share of the largest. A matrix without any positive eigenvalue becomes that share of its largest entry.
+    """
+    values, vectors = np.linalg.eigh(matrix)
+    scale = values[-1] if values[-1] > 0 else max(float(np.abs(matrix).max()), 1.0)
+    values = np.maximum(values, _REPAIRED_EIGENVALUE * scale)
+    repaired = (vectors * values) @ vectors.T
+    return np.asarray((repaired + repaired.T) / 2)

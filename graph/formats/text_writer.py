@@ -21,7 +21,12 @@ from hybridlio.graph.model.measurements import Factor
 Dialect = Literal["g2o", "toro"]
 
 _TAGS: dict[tuple[str, int], dict[str, str]] = {
-    ("g2o", 3): {"vertex": "VERTEX_SE3:QUAT", "between": "EDGE_SE3:QUAT", "prior": "EDGE_SE3_PRIOR"},
+    ("g2o", 3): {
+        "vertex": "VERTEX_SE3:QUAT",
+        "between": "EDGE_SE3:QUAT",
+        "prior": "EDGE_SE3_PRIOR",
+        "position": "EDGE_SE3_PRIORXYZ",
+    },
     ("g2o", 2): {"vertex": "VERTEX_SE2", "between": "EDGE_SE2", "prior": "EDGE_PRIOR_SE2"},
     ("toro", 3): {"vertex": "VERTEX3", "between": "EDGE3"},
     ("toro", 2): {"vertex": "VERTEX2", "between": "EDGE2"},
@@ -39,16 +44,23 @@ def write_text(data: GraphData, path: str | os.PathLike[str], dialect: Dialect) 
         DataError: the file cannot be written.
     """
     tags = _TAGS[dialect, data.dimension]
-    unsupported = Counter(f.kind for f in data.other_factors.values() if f.kind not in tags)
-    if unsupported:
+    unsupported = Counter(f.kind for f in data.other_factors.values() if _row_kind(f) not in tags)
+    if data.origin is not None:  # text has no place on Earth to give to measured positions
+        unsupported["gps"] = sum(f.kind == "gps" for f in data.other_factors.values())
+    if unsupported.total():
         kinds = ", ".join(f"{count} × {kind}" for kind, count in unsupported.items())
         raise GraphError(f"{path}: {dialect}'s format cannot hold {kinds}; save as .npz, which holds everything")
     lines = [*_vertex_lines(data, tags["vertex"]), *_fix_lines(data)]
     if any(factor.kind == "prior" for factor in data.other_factors.values()) and data.dimension == 3:
         lines.append(f"PARAMS_SE3OFFSET 0 {format_numbers(co.IDENTITY[3])}")
     for factor in data.factors.values():
-        lines += _factor_lines(factor, tags[factor.kind])
+        lines += _factor_lines(factor, tags[_row_kind(factor)])
     write_atomically(path, "\n".join(lines) + "\n")
+
+
+def _row_kind(factor: Factor) -> str:
+    """Return the factor's kind, where a position in world is one that has no lever arm."""
+    return "position" if factor.kind == "gps" and not factor.measured[3:].any() else factor.kind
 
 
 def _vertex_lines(data: GraphData, tag: str) -> Iterator[str]:
@@ -62,7 +74,7 @@ def _vertex_lines(data: GraphData, tag: str) -> Iterator[str]:
     for key in data.keys:
         pose = data.initial_value(key)
         assert pose is not None
-        yield f"{tag} {to_integer(key)} {format_numbers(pose_numbers(pose, ROW_FORMATS[tag].angles))}"
+        yield f"{tag} {to_integer(key)} {format_numbers(pose_numbers(pose, ROW_FORMATS[tag].values))}"
 
 
 def _is_readers_origin(data: GraphData, given: list[Key]) -> bool:
@@ -77,8 +89,8 @@ def _is_readers_origin(data: GraphData, given: list[Key]) -> bool:
 def _fix_lines(data: GraphData) -> list[str]:
     fixed = sorted(to_integer(key) for key in data.fixed)
     lowest = min((to_integer(key) for key in data.keys), default=None)
-    has_prior = any(factor.kind == "prior" for factor in data.other_factors.values())
-    if not fixed or (fixed == [lowest] and not has_prior):
+    placed = any(factor.kind in ("prior", "gps") for factor in data.other_factors.values())
+    if not fixed or (fixed == [lowest] and not placed):
         return []
     return [f"FIX {' '.join(map(str, fixed))}"]
 
@@ -90,6 +102,7 @@ def _factor_lines(factor: Factor, tag: str) -> Iterator[str]:
     ids += [0] * (row_format.ids - len(ids))  # the id of a prior's offset in space
     if factor.robust is not None:
         yield f"# robust {factor.robust.kernel} {factor.robust.width!r}"
-    pose = pose_numbers(factor.measured, row_format.angles)
+    measured = factor.measured[:3] if row_format.kind == "position" else factor.measured
+    pose = pose_numbers(measured, row_format.values)
     numbers: Array = np.r_[pose, information_numbers(factor.noise.information, row_format)]
     yield f"{tag} {' '.join(map(str, ids))} {format_numbers(numbers)}"

@@ -32,7 +32,7 @@ def check_determined(data: GraphData) -> None:
     if not len(data):
         raise GraphError("the graph has no poses")
     _check_concerned(data)
-    free = [(part, motions) for part in components(data) if (motions := _free_motions(data, part))]
+    free = [(part, motions) for part in components(data) if (motions := free_motions(data, part))]
     if free:
         raise GraphError(_free_message(data, free))
     _check_velocities(data)
@@ -55,7 +55,7 @@ def _free_message(data: GraphData, free: list[tuple[list[Key], list[str]]]) -> s
     return f"{apart}{parts}. Add a prior, fix a pose, or measure these directions"
 
 
-def _free_motions(data: GraphData, part: list[Key]) -> list[str]:
+def free_motions(data: GraphData, part: list[Key]) -> list[str]:
     """Return the motions of the part as a whole that change none of its measurements."""
     inside = set(part)
     if inside & data.fixed:

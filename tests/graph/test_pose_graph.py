@@ -318,7 +318,7 @@ def test_the_public_names_are_exactly_these():
         *("add_pose", "initial", "set_initial", "start_from", "fix", "unfix", "set_origin", "remove"),
         *("add_prior", "add_between", "add_imu", "add_velocity", "add_zero_velocity", "add_bias"),
         *("add_gps", "add_gps_geodetic", "add_attitude", "add_gravity"),
-        *("initialise", "optimize", "online", "load", "save"),
+        *("initialise", "optimize", "online", "load", "load_report", "save"),
     }
 
 
