@@ -198,7 +198,12 @@ TABLE = [
         _YOUNG_MAP_DRIFT_SHARE=("0.0", "50.0"),
         _UNCHANGED_MAP_DRIFT_SHARE=("0.5", "0.0"),
     ),
-    *_in("hybridlio/sources/thinned_scan.py", MATCHING, _VOXEL_SHRINKAGE=("0.1",), _AMPLE=("0.1",)),
+    *_in(
+        "hybridlio/sources/thinned_scan.py",
+        MATCHING,
+        _VOXEL_SHRINKAGE=("0.1",),
+        _AMPLE=("0.1",),
+    ),
 ]
 
 
@@ -216,7 +221,7 @@ def replaced(source: str, name: str, value: str) -> str:
             head = lines[first].encode()[: old.col_offset].decode()  # columns count bytes
             tail = lines[last].encode()[old.end_col_offset :].decode()
             return "".join([*lines[:first], head + value + tail, *lines[last + 1 :]])
-    raise SystemExit(f"no constant {name} in its file; change the table in {Path(__file__).name}")
+    raise SystemExit(f"no constant {name} in this file; change the table in {Path(__file__).name}")
 
 
 def _value_of(node: ast.Assign | ast.AnnAssign, name: str) -> ast.expr | None:
@@ -271,13 +276,11 @@ def check(folder: Path, constant: Constant, value: str) -> bool:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", metavar="NAME", help="constants, or parts of their files' names")
-    parser.add_argument("--list", action="store_true", help="check that the table's constants exist, print it and end")
+    parser.add_argument("--list", action="store_true", help="print the table and end")
     options = parser.parse_args()
     chosen = [c for c in TABLE if not options.only or any(w == c.name or w in c.file for w in options.only)]
     if options.list:
         for constant in chosen:
-            for value in constant.gross:
-                replaced((ROOT / constant.file).read_text(), constant.name, value)
             print(constant.file, constant.name, *constant.gross, sep="\t")
         return CAUGHT
     if not chosen:

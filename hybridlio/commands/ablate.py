@@ -15,6 +15,7 @@ from hybridlio.commands.common import INTERRUPTED, guarded
 from hybridlio.commands.terminal import print_message, print_result, print_table
 from hybridlio.commands.train import Device, Recordings, first_process_progress, is_first_process
 from hybridlio.core.errors import ConfigError, HybridLioError
+from hybridlio.datasets.rosbag.topics import NO_CHOICE, BagTopics
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -50,6 +51,7 @@ Only = Annotated[str | None, typer.Option("--rows", metavar="A,B,…", help="Onl
 
 
 @guarded
+@common.with_topic_options
 def ablate(
     data: Recordings,
     table: Number,
@@ -63,6 +65,7 @@ def ablate(
     out: Out = None,
     cache: Cache = None,
     device: Device = "auto",
+    topics: BagTopics = NO_CHOICE,
     _verbosity: common.Verbose = 0,
 ) -> None:
     """Train and evaluate each row of one of the paper's tables with the same number of steps, and print the table.
@@ -77,7 +80,7 @@ def ablate(
         raise ConfigError("give either --test DATA, recordings to test on, or --split easy or hard for KITTI odometry")
     chosen = _choose_rows(table, None if rows is None else common.split_names(rows), split)
     folder = out or Path("ablation") / f"table-{table}"
-    options = DataOptions(cache or folder.parent / "shards", None, None, reader, raw_root)
+    options = DataOptions(cache or folder.parent / "shards", None, None, reader, raw_root, topics)
     budget = f"{steps} steps per row{', reduced size' if reduced else ''}"
     lines = _run_rows(table, chosen, _row_runner(data, test, options, folder, steps, reduced, device))
     _finish(folder, table, lines, budget)

@@ -10,6 +10,7 @@ import typer
 from hybridlio.commands import common
 from hybridlio.commands.common import guarded
 from hybridlio.commands.terminal import print_message, print_result, print_table, progress
+from hybridlio.datasets.rosbag.topics import NO_CHOICE, BagTopics
 from hybridlio.runs.engines import LOCAL
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 
 @guarded
+@common.with_topic_options
 def batch(
     data: Annotated[
         list[str],
@@ -59,6 +61,7 @@ def batch(
         str | None, typer.Option(metavar="ADDRESS", help="Address of the cluster, such as tcp://head:8786.")
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Run recordings again that have a run in -o.")] = False,
+    topics: BagTopics = NO_CHOICE,
     _verbosity: common.Verbose = 0,
 ) -> None:
     """Run the odometry on many recordings in parallel, each into a run folder below -o.
@@ -69,7 +72,7 @@ def batch(
     from hybridlio.runs.recordings import find_recordings
 
     settings = common.load_settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
-    found = find_recordings(data, sequence, reader, raw_root, frames, vertical_angle)
+    found = find_recordings(data, sequence, reader, raw_root, frames, vertical_angle, topics)
     options = BatchOptions(
         jobs=jobs, threads=threads, engine=engine, scheduler=scheduler, overwrite=overwrite,
         adapt_config=initial_pose is None and config is None,

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import signal
 import threading
 import traceback
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, NoReturn, ParamSpec
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, ParamSpec
 
 import typer
 
 from hybridlio.commands.terminal import print_message, set_up_logging
 from hybridlio.core.errors import ConfigError, DataError, HybridLioError
+from hybridlio.datasets.rosbag.topics import BagTopics, option_of
 from hybridlio.odometry.registry import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
 
 if TYPE_CHECKING:
@@ -52,7 +54,7 @@ Verbose = Annotated[
     ),
 ]
 Data = Annotated[
-    Path, typer.Argument(metavar="DATA", help="A recording, or a folder that contains one.", show_default=False)
+    Path, typer.Argument(metavar="DATA", help="A recording or bag, or a folder that contains one.", show_default=False)
 ]
 SequenceName = Annotated[
     str | None, typer.Option("--sequence", metavar="NAME", help="The recording to use if DATA contains several.")
@@ -63,7 +65,9 @@ SequenceNames = Annotated[
 ReaderName = Annotated[
     str | None,
     typer.Option(
-        "--reader", metavar="NAME", help="kitti-raw, kitti-odometry or folder; by default detected from the files."
+        "--reader",
+        metavar="NAME",
+        help="kitti-raw, kitti-odometry, folder or rosbag; by default detected from the files.",
     ),
 ]
 RawRoot = Annotated[
@@ -97,6 +101,46 @@ BackendName = Annotated[
 ConfigFile = Annotated[
     Path | None, typer.Option("--config", metavar="FILE", help="Settings file, as printed by `hybridlio config`.")
 ]
+
+
+_TOPIC_HELP = {
+    "lidar": "Topic of the point clouds.",
+    "imu": "Topic of the inertial data; `none` to use none.",
+    "gps": "Topic of the GPS fixes; `none` to use none.",
+    "reference": "Topic of reference poses; `none` to use none.",
+    "imu_frame": "Frame of the IMU, in place of that in its messages.",
+    "lidar_frame": "Frame of the lidar, in place of that in its messages.",
+}
+
+
+def with_topic_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Wrap a command whose parameter ``topics`` is a :class:`BagTopics`; it gets one option for each attribute.
+
+    Options are declared once here: typer takes them from the signature, which shows no ``topics``.
+    """
+
+    @functools.wraps(command)
+    def run(**kwargs: Any) -> None:
+        names = {name: kwargs.pop(_topic_parameter(name)) for name in _TOPIC_HELP}
+        command(**kwargs, topics=BagTopics(**names))
+
+    signature = inspect.signature(command, eval_str=True)
+    parameters = [p for name, p in signature.parameters.items() if name != "topics"]
+    options = [_topic_option(name, text) for name, text in _TOPIC_HELP.items()]
+    run.__signature__ = signature.replace(parameters=[*parameters, *options])  # type: ignore[attr-defined]
+    run.__annotations__ = {p.name: p.annotation for p in [*parameters, *options]} | {"return": None}
+    return run
+
+
+def _topic_parameter(name: str) -> str:
+    return option_of(name).removeprefix("--").replace("-", "_")
+
+
+def _topic_option(name: str, text: str) -> inspect.Parameter:
+    option = typer.Option(option_of(name), metavar="NAME", help=text, rich_help_panel="Bags")
+    return inspect.Parameter(
+        _topic_parameter(name), inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[str | None, option]
+    )
 
 
 def guarded(command: Callable[_P, None]) -> Callable[_P, None]:
@@ -151,6 +195,7 @@ def open_data(
     raw_root: Path | None,
     frames: str | None,
     vertical_angle_deg: float | None,
+    topics: BagTopics,
 ) -> Sequence:
     """Open the recording that the options name, or the part of it in ``frames``."""
     from hybridlio.datasets.registry import open_sequence
@@ -159,7 +204,7 @@ def open_data(
     if frames is not None:
         frame_range(frames)  # report a malformed range before opening a large recording
     whole = open_sequence(
-        data, sequence=sequence, reader=reader, raw_root=raw_root, vertical_angle_deg=vertical_angle_deg
+        data, sequence=sequence, reader=reader, raw_root=raw_root, vertical_angle_deg=vertical_angle_deg, topics=topics
     )
     return part_of(whole, frames)
 

@@ -12,6 +12,7 @@ from hybridlio.commands.common import guarded
 from hybridlio.commands.terminal import print_message, print_result, print_table, progress
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.tables import counted
+from hybridlio.datasets.rosbag.topics import NO_CHOICE, BagTopics
 from hybridlio.odometry.registry import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ def _choice_help(names: tuple[str, ...]) -> str:
 
 
 @guarded
+@common.with_topic_options
 def compare(
     data: common.Data,
     sequence: common.SequenceName = None,
@@ -46,6 +48,7 @@ def compare(
         Path | None,
         typer.Option("-o", "--out", metavar="DIR", help="Write compare.json and compare.md to this folder."),
     ] = None,
+    topics: BagTopics = NO_CHOICE,
     _verbosity: common.Verbose = 0,
 ) -> None:
     """Run the odometry on the same scans with every combination of sources, and print a table of the results."""
@@ -59,7 +62,7 @@ def compare(
         _choices(backend or settings.backend, _BACKENDS, "--backend"),
         settings,
     )
-    recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle)
+    recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle, topics)
     if out is not None:
         make_folder(out)  # fail before the runs, not after them
     with progress("comparing") as report:

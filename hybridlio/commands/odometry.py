@@ -11,6 +11,7 @@ from hybridlio.commands import common
 from hybridlio.commands.common import PartialResultError, guarded
 from hybridlio.commands.terminal import print_message, print_result, print_table, print_warning, progress
 from hybridlio.core.tables import counted
+from hybridlio.datasets.rosbag.topics import NO_CHOICE, BagTopics
 
 if TYPE_CHECKING:
     from hybridlio.evaluation.report_data import Findings
@@ -21,6 +22,7 @@ _SCANS_LISTED = 20  # fits on two lines of a terminal
 
 
 @guarded
+@common.with_topic_options
 def odometry(
     data: common.Data,
     sequence: common.SequenceName = None,
@@ -37,6 +39,7 @@ def odometry(
         typer.Option("-o", "--out", metavar="RUN", help="The run folder; default runs/<sequence>-<date-time>."),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing run in -o.")] = False,
+    topics: BagTopics = NO_CHOICE,
     _verbosity: common.Verbose = 0,
 ) -> None:
     """Estimate the trajectory of a recording; write poses, covariances, graph, metrics and report to a run folder.
@@ -49,7 +52,7 @@ def odometry(
 
     chosen = common.load_settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
     estimator = Odometry(config=chosen)  # report unknown names before the recording is opened
-    recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle)
+    recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle, topics)
     adapted = adapt_config(recording, chosen, is_explicit=initial_pose is not None or config is not None)
     if adapted != chosen:
         chosen, estimator = adapted, Odometry(config=adapted)

@@ -16,6 +16,7 @@ from hybridlio.commands.common import INTERRUPTED, guarded
 from hybridlio.commands.terminal import print_message, print_result, progress
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.progress import Progress
+from hybridlio.datasets.rosbag.topics import NO_CHOICE, BagTopics
 from hybridlio.odometry.registry import INITIAL_POSE_SOURCES
 
 if TYPE_CHECKING:
@@ -71,6 +72,7 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Delete an existing
 
 
 @guarded
+@common.with_topic_options
 def train(
     data: Recordings,
     preset: Preset = None,
@@ -88,6 +90,7 @@ def train(
     steps: Steps = None,
     device: Device = "auto",
     overwrite: Overwrite = False,
+    topics: BagTopics = NO_CHOICE,
     _verbosity: common.Verbose = 0,
 ) -> None:
     """Train the network, or adapt trained weights, without labels. Start it by torchrun to use several processes.
@@ -108,7 +111,7 @@ def train(
     if overwrite and is_first_process():
         _clear(folder)
     names = None if sequence is None else common.split_names(sequence)
-    options = DataOptions(cache or folder / "shards", initial_pose, names, reader, raw_root)
+    options = DataOptions(cache or folder / "shards", initial_pose, names, reader, raw_root, topics)
     with first_process_progress("preparing", "scans") as report:
         pairs, tests = training_pairs(data, validate, split, recipe, options, report)
     if steps is not None:

@@ -48,7 +48,7 @@ def read_imu_csv(path: Path, notes: Notes) -> ImuSamples:
             values[k] = [float(row[column]) * scale for column, scale in columns]
         except (ValueError, InvalidOperation, OverflowError):
             raise DataError(f"{path}, line {line}: expected numbers, found {','.join(row)[:80]}") from None
-    return _clean(path, stamps, values, notes)
+    return clean_imu(str(path), stamps, values, notes)
 
 
 def _columns(path: Path, header: list[str]) -> tuple[int, list[tuple[int, float]]]:
@@ -67,21 +67,35 @@ def _stamp_ns(text: str, name: str) -> int:
     return int(text) if name == "stamp_ns" else seconds_ns(text.strip())
 
 
-def _clean(path: Path, stamps: Stamps, values: Array, notes: Notes) -> ImuSamples:
-    """Sort the rows, drop those that repeat or are not finite, and note what looks like a wrong unit."""
+def clean_imu(source: str, stamps: Stamps, values: Array, notes: Notes) -> ImuSamples:
+    """Sort samples, drop those that repeat or are not finite, and note gaps and what looks like a wrong unit.
+
+    Args:
+        source: the file or topic, for messages.
+        stamps: ``(S,)`` int64 nanoseconds.
+        values: ``(S, 6)`` angular velocity in rad/s and specific force in m/s².
+        notes: receives the notes.
+
+    Raises:
+        DataError: no sample is finite.
+    """
     finite = np.isfinite(values).all(axis=1)
     if not finite.any():
-        raise DataError(f"{path}: no row of finite values")
+        raise DataError(f"{source}: no row of finite values")
     if not finite.all():
-        notes.add(f"{path}: dropped {int((~finite).sum())} rows that are not finite, first row {int(finite.argmin())}")
+        notes.add(
+            f"{source}: dropped {int((~finite).sum())} rows that are not finite, first row {int(finite.argmin())}"
+        )
     stamps, values = stamps[finite], values[finite]
-    order = sorted_unique(stamps, str(path), notes)
+    order = sorted_unique(stamps, source, notes)
     stamps, values = stamps[order], values[order]
-    note_gaps(stamps, str(path), notes, IMU_GAP_FACTOR)
+    note_gaps(stamps, source, notes, IMU_GAP_FACTOR)
     force = float(np.median(np.linalg.norm(values[:, 3:], axis=1)))
     if not _PLAUSIBLE_FORCE_M_S2[0] < force < _PLAUSIBLE_FORCE_M_S2[1]:
-        notes.add(f"{path}: the median specific force is {force:.2f} m/s², gravity is 9.81; check the unit")
+        notes.add(f"{source}: the median specific force is {force:.2f} m/s², gravity is 9.81; check the unit")
     rate = float(np.quantile(np.linalg.norm(values[:, :3], axis=1), 0.95))
     if rate > _MAX_RATE_RAD_S:
-        notes.add(f"{path}: angular velocities reach {rate:.0f} rad/s; check the unit (name columns gx_deg_s for °/s)")
+        notes.add(
+            f"{source}: angular velocities reach {rate:.0f} rad/s; check the unit (name columns gx_deg_s for °/s)"
+        )
     return ImuSamples(stamps, values[:, :3], values[:, 3:])

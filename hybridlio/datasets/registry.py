@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from hybridlio.core.errors import ConfigError, DataError
@@ -16,7 +16,24 @@ from hybridlio.datasets.imu_faults import without_spikes
 from hybridlio.datasets.kitti import odometry, raw
 from hybridlio.datasets.kitti.vertical_angle import check_angle
 from hybridlio.datasets.notes import Notes
+from hybridlio.datasets.rosbag import reader as rosbag
+from hybridlio.datasets.rosbag.topics import BagTopics
 from hybridlio.datasets.sequence import Sequence
+
+
+@dataclass(frozen=True)
+class ReaderOptions:
+    """What a reader may be told about a recording; each reader uses what concerns its layout.
+
+    Attributes:
+        raw_root: the root of raw drives to join inertial data from.
+        vertical_angle_deg: angle by which points are raised; None to decide by the recording.
+        topics: topics and frames of a bag.
+    """
+
+    raw_root: Path | None = None
+    vertical_angle_deg: float | None = None
+    topics: BagTopics = field(default_factory=BagTopics)
 
 
 @dataclass(frozen=True)
@@ -25,20 +42,31 @@ class Reader:
 
     Attributes:
         layout: description of the layout, for messages.
-        find: returns the recordings at or directly below a path, folders by name; empty if the layout does not match.
-        open: opens one of the folders. The second argument is the root of raw drives to join, or None; the third the
-            angle in degrees by which points are raised, or None to decide by the recording.
+        find: returns the recordings at or directly below a path, by name; empty if the layout does not match.
+        open: opens one of them.
+        suffixes: of files that are recordings by themselves; such files are given to :attr:`find` as folders are.
     """
 
     layout: str
     find: Callable[[Path], dict[str, Path]]
-    open: Callable[[Path, Path | None, float | None], Sequence]
+    open: Callable[[Path, ReaderOptions], Sequence]
+    suffixes: tuple[str, ...] = ()
 
 
 READERS: dict[str, Reader] = {  # tried in this order
-    "kitti-raw": Reader(raw.LAYOUT, raw.find, raw.open_drive),
-    "kitti-odometry": Reader(odometry.LAYOUT, odometry.find, odometry.open_sequence_folder),
-    "folder": Reader(folder.LAYOUT, folder.find, folder.open_folder),
+    "kitti-raw": Reader(raw.LAYOUT, raw.find, lambda p, o: raw.open_drive(p, o.raw_root, o.vertical_angle_deg)),
+    "kitti-odometry": Reader(
+        odometry.LAYOUT,
+        odometry.find,
+        lambda p, o: odometry.open_sequence_folder(p, o.raw_root, o.vertical_angle_deg),
+    ),
+    "folder": Reader(folder.LAYOUT, folder.find, lambda p, o: folder.open_folder(p, o.raw_root, o.vertical_angle_deg)),
+    "rosbag": Reader(
+        rosbag.LAYOUT,
+        rosbag.find,
+        lambda p, o: rosbag.open_bag(p, o.topics, o.vertical_angle_deg),
+        rosbag.SUFFIXES,
+    ),
 }
 
 
@@ -49,19 +77,21 @@ def open_sequence(
     reader: str | None = None,
     raw_root: str | os.PathLike[str] | None = None,
     vertical_angle_deg: float | None = None,
+    topics: BagTopics | None = None,
 ) -> Sequence:
     """Open the recording at ``path``.
 
     Args:
-        path: a recording's folder, or a folder that holds recordings.
+        path: a recording's folder or bag, or a folder that holds recordings.
         sequence: which of several recordings: its name, or its number alone (``0005``, ``09``).
         reader: a name of :data:`READERS`; by default the first whose layout matches.
         raw_root: for KITTI odometry, the folder that holds the raw data's date folders, to join inertial data from.
         vertical_angle_deg: angle by which each point's elevation is raised, to correct an error of the lidar's vertical
             angles. By default 0.205 for KITTI's own scans, which have this error, and 0 for all others.
+        topics: for bags, topics and frames to use; by default chosen by type.
 
     Raises:
-        DataError: no such folder, no reader fits (the message lists those tried), several recordings without a
+        DataError: no such path, no reader fits (the message lists those tried), several recordings without a
             ``sequence`` that selects one, or a recording that the reader cannot open.
         ConfigError: unknown ``reader``, or ``vertical_angle_deg`` is over 5°.
     """
@@ -69,7 +99,7 @@ def open_sequence(
     name, found = _find(root, reader)
     recording = found[_pick(root, found, sequence)]
     raw = Path(raw_root).expanduser() if raw_root is not None else None
-    return _without_spikes(READERS[name].open(recording, raw, vertical_angle_deg))
+    return _without_spikes(READERS[name].open(recording, ReaderOptions(raw, vertical_angle_deg, topics or BagTopics())))
 
 
 def _without_spikes(sequence: Sequence) -> Sequence:
@@ -90,7 +120,7 @@ def sequence_names(path: str | os.PathLike[str], *, reader: str | None = None) -
     """Return the names of the recordings at or directly below ``path``, as :func:`open_sequence` takes them.
 
     Raises:
-        DataError: no such folder, or no reader fits.
+        DataError: no such path, or no reader fits.
         ConfigError: unknown ``reader``.
     """
     return tuple(_find(Path(path).expanduser().resolve(), reader)[1])
@@ -117,9 +147,14 @@ def check_options(
 def _find(root: Path, reader: str | None) -> tuple[str, dict[str, Path]]:
     """Return the name of the first reader that finds recordings at ``root``, and the recordings."""
     check_options(reader)
-    if not root.is_dir():
-        raise DataError(f"{root}: {'not a folder' if root.exists() else 'no such folder'}; give a recording's folder")
+    if not root.exists():
+        raise DataError(f"{root}: no such folder or bag; give a recording's folder, or a bag")
     tried = [reader] if reader else list(READERS)
+    if root.is_file():
+        tried = [name for name in tried if root.suffix in READERS[name].suffixes]
+    if not tried:
+        known = ", ".join(suffix for one in READERS.values() for suffix in one.suffixes)
+        raise DataError(f"{root}: not a folder; give a recording's folder, or a bag ({known})")
     for name in tried:
         found = READERS[name].find(root)
         if found:

@@ -15,10 +15,11 @@ from typing import Any
 from hybridlio.core.errors import ConfigError, DataError, HybridLioError
 from hybridlio.core.files import read_yaml
 from hybridlio.datasets.registry import check_options, open_sequence, sequence_names
+from hybridlio.datasets.rosbag.topics import NO_CHOICE, BagTopics
 from hybridlio.datasets.sequence import Sequence, frame_range, part_of
 
 _YAML, _TEXT = (".yaml", ".yml"), (".txt", ".list")
-_ANGLE = "vertical_angle_deg"
+_ANGLE, _TOPICS = "vertical_angle_deg", "topics"
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class Recording:
         raw_root: KITTI raw data that provide the IMU of KITTI odometry sequences.
         frames: the range ``A:B`` to use; None for all.
         vertical_angle_deg: correction of the points' elevation; None for the recording's default.
+        topics: topics and frames of a bag; in a list file, a mapping such as ``{lidar: /points}``.
         name: the name of its run folder.
 
     Raises:
@@ -45,6 +47,7 @@ class Recording:
     frames: str | None = None
     vertical_angle_deg: float | None = None
     name: str = ""
+    topics: BagTopics = NO_CHOICE
 
     def __post_init__(self) -> None:
         check_options(self.reader, vertical_angle_deg=self.vertical_angle_deg)
@@ -63,12 +66,14 @@ class Recording:
             reader=self.reader,
             raw_root=self.raw_root,
             vertical_angle_deg=self.vertical_angle_deg,
+            topics=self.topics,
         )
         return part_of(found, self.frames)
 
-    def to_json_dict(self) -> dict[str, str | float | None]:
-        """Return all attributes except the name as plain values."""
-        return {key: value for key, value in asdict(self).items() if key != "name"}
+    def to_json_dict(self) -> dict[str, Any]:
+        """Return all attributes except the name as plain values; topics only if some are chosen."""
+        left_out = {"name", "topics"} if self.topics == NO_CHOICE else {"name"}
+        return {key: value for key, value in asdict(self).items() if key not in left_out}
 
 
 def find_recordings(
@@ -78,6 +83,7 @@ def find_recordings(
     raw_root: str | Path | None = None,
     frames: str | None = None,
     vertical_angle_deg: float | None = None,
+    topics: BagTopics = NO_CHOICE,
 ) -> tuple[Recording, ...]:
     """Return every recording in ``data`` once, with unique names.
 
@@ -89,7 +95,7 @@ def find_recordings(
             or mappings with :class:`Recording`'s attributes except ``name``; a text file has a path, optionally
             followed by a sequence, per line. Paths in a file are relative to its folder.
         sequence: comma-separated names of the recordings to use from a path that contains several.
-        reader, raw_root, frames, vertical_angle_deg: defaults for entries that do not set their own.
+        reader, raw_root, frames, vertical_angle_deg, topics: defaults for entries that do not set their own.
 
     Raises:
         ConfigError: there is no recording, a pattern matches nothing, a list file, ``reader`` or ``raw_root`` does
@@ -99,7 +105,7 @@ def find_recordings(
     check_options(raw_root=raw_root)
     data = [data] if isinstance(data, str | Path | Recording) else data
     root = None if raw_root is None else str(raw_root)
-    defaults = Recording("", sequence, reader, root, frames, vertical_angle_deg)
+    defaults = Recording("", sequence, reader, root, frames, vertical_angle_deg, topics=topics)
     entries = [_with_defaults(entry, defaults) for argument in data for entry in _expand(argument)]
     found = list(dict.fromkeys(one for entry in entries for one in _split(entry)))
     if not found:
@@ -169,9 +175,22 @@ def _parse_entry(entry: Any, place: str) -> Recording:
     angle = values.get(_ANGLE)
     if angle is not None and (isinstance(angle, bool) or not isinstance(angle, int | float)):
         raise DataError(f"{place}: {_ANGLE} {angle!r}: give a number of degrees")
-    texts = {key: str(value) for key, value in values.items() if value is not None and key != _ANGLE}
+    texts = {key: str(value) for key, value in values.items() if value is not None and key not in (_ANGLE, _TOPICS)}
+    topics = _parse_topics(values.get(_TOPICS), place)
     try:
-        return Recording(**texts, vertical_angle_deg=angle)
+        return Recording(**texts, vertical_angle_deg=angle, topics=topics)
+    except ConfigError as error:
+        raise DataError(f"{place}: {error}") from None
+
+
+def _parse_topics(value: Any, place: str) -> BagTopics:
+    known = [f.name for f in fields(BagTopics)]
+    if value is None:
+        return NO_CHOICE
+    if not isinstance(value, dict) or any(key not in known for key in value):
+        raise DataError(f"{place}: {_TOPICS} {value!r}: give a mapping with keys of {', '.join(known)}")
+    try:
+        return BagTopics(**{key: None if name is None else str(name) for key, name in value.items()})
     except ConfigError as error:
         raise DataError(f"{place}: {error}") from None
 
@@ -183,8 +202,8 @@ def _relative_to(folder: Path, entry: Recording) -> Recording:
 
 
 def _with_defaults(entry: Recording, defaults: Recording) -> Recording:
-    own = {key: value for key, value in asdict(entry).items() if value not in (None, "")}
-    return Recording(**(asdict(defaults) | own))
+    own = {key: value for key, value in vars(entry).items() if value not in (None, "", NO_CHOICE)}
+    return replace(defaults, **own)
 
 
 def _split(entry: Recording) -> Iterator[Recording]:

@@ -28,6 +28,7 @@ from hybridlio.core.motion_limits import UNKNOWN_TRANSLATION_SIGMA_M
 from hybridlio.core.progress import Progress
 from hybridlio.core.sensors import Scan
 from hybridlio.datasets.registry import check_options, open_sequence, sequence_names
+from hybridlio.datasets.rosbag.topics import NO_CHOICE, BagTopics
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.learned.data.pairs import Pairs
 from hybridlio.learned.data.preparing import KnownMotion, prepare_shard
@@ -58,6 +59,7 @@ class DataOptions:
         sequences: names of the recordings to use from a path that contains several; None for all.
         reader: see ``open_sequence``.
         raw_root: KITTI raw data that provide the IMU of KITTI odometry sequences.
+        topics: topics and frames of bags.
 
     Raises:
         ConfigError: the reader is unknown, or the folder ``raw_root`` does not exist.
@@ -68,6 +70,7 @@ class DataOptions:
     sequences: tuple[str, ...] | None = None
     reader: str | None = None
     raw_root: Path | None = None
+    topics: BagTopics = NO_CHOICE
 
     def __post_init__(self) -> None:
         check_options(self.reader, self.raw_root)
@@ -184,7 +187,9 @@ def _find(path: Path, options: DataOptions) -> Iterator[Sequence | Shard]:
     if options.sequences is not None:
         names = options.sequences
     for name in names:
-        yield open_sequence(path, sequence=name, reader=options.reader, raw_root=options.raw_root)
+        yield open_sequence(
+            path, sequence=name, reader=options.reader, raw_root=options.raw_root, topics=options.topics
+        )
 
 
 def _report(progress: Progress | None, name: str, before: int, total: int) -> _Done:

@@ -11,22 +11,22 @@ from hybridlio.core.errors import ConfigError
 from hybridlio.learned.networks import maps
 from hybridlio.learned.networks import torch_se3 as se3
 from hybridlio.learned.networks.imu_network import ImuNetwork
-from hybridlio.learned.networks.projective_steps import EncodedPoints, ProjectiveSteps
+from hybridlio.learned.networks.projective_steps import ProjectiveSteps, SeenPoints
 from hybridlio.learned.networks.residual_network import ResidualNetwork
 from hybridlio.learned.settings import NetworkSettings
 
 
 @dataclass(frozen=True, eq=False)
 class NetworkInput:
-    """The network's inputs of a batch of pairs.
+    """What the network sees of a batch of pairs.
 
     Attributes:
         last, current: vertex maps ``(B, 3, H, W)`` of scan k and k+1, each in its own frame.
-        imu: ``(B, S, 6)`` rows of :func:`hybridlio.learned.data.imu_rows.imu_rows`; zeros without an IMU.
+        imu: ``(B, S, 6)`` rows of :func:`hybridlio.learned.data.imu_rows.imu_rows`; zeros where there are none.
         dt_s: ``(B,)`` time between the scans.
-        velocity_m_s: ``(B, 3)`` at scan k, in its axes; zeros where it is not known.
-        initial: ``(B, 4, 4)`` given initial poses, for ``imu="given"``; ignored otherwise.
-        perturbation: ``(B, 4, 4)`` right perturbations of the initial poses before they are refined, or None.
+        velocity_m_s: ``(B, 3)`` at scan k, in its axes; zeros where not known.
+        initial: ``(B, 4, 4)`` initial poses from elsewhere, for ``imu="given"``; else None or not looked at.
+        shake: ``(B, 4, 4)`` by which initial poses are perturbed on the right before they are refined, or None.
     """
 
     last: Tensor
@@ -35,12 +35,12 @@ class NetworkInput:
     dt_s: Tensor
     velocity_m_s: Tensor
     initial: Tensor | None = None
-    perturbation: Tensor | None = None
+    shake: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class NetworkOutput:
-    """The network's estimate.
+    """What the network says.
 
     Attributes:
         initial: ``T̂`` ``(B, 4, 4)``.
@@ -52,31 +52,31 @@ class NetworkOutput:
 
     @property
     def pose(self) -> Tensor:
-        """``T_k_k1`` ``(B, 4, 4)`` after the last step."""
+        """``T_k_k1`` ``(B, 4, 4)``, the last step's."""
         return self.poses[-1]
 
     @property
     def residual(self) -> Tensor:
-        """``δT`` ``(B, 4, 4)`` of all steps together."""
+        """``δT`` ``(B, 4, 4)``, of all steps together."""
         return self.pose @ se3.inverse(self.initial)
 
 
 @dataclass(frozen=True, eq=False)
-class EncodedScan:
-    """Everything that depends on one scan only, computed once for the two pairs that contain it.
+class SeenScan:
+    """What is computed of a scan alone.
 
     Attributes:
         vertices, normals: maps ``(B, 3, H, W)`` in its own frame.
-        points: inputs of the projective steps; None in a network without them.
+        points: as the projective steps see it; None in a network without.
     """
 
     vertices: Tensor
     normals: Tensor
-    points: EncodedPoints | None
+    points: SeenPoints | None
 
 
 class OdometryNetwork(nn.Module):
-    """UnDeepLIO: from two vertex maps and the IMU samples between them to the relative pose ``T_k_k1``.
+    """UnDeepLIO: from two vertex maps and the inertial data between them to the relative pose ``T_k_k1``.
 
     Args:
         settings: its structure.
@@ -97,7 +97,7 @@ class OdometryNetwork(nn.Module):
         """Estimate the relative poses of a batch.
 
         Raises:
-            ConfigError: the maps have another geometry than the network's, or a required initial pose is missing.
+            ConfigError: the maps have other cells than the network, or an initial pose is to be given and is not.
         """
         geometry = self.settings.geometry
         if given.last.shape[-2:] != (geometry.rows, geometry.columns):
@@ -106,27 +106,27 @@ class OdometryNetwork(nn.Module):
                 f"the network takes maps of {geometry.rows} x {geometry.columns} cells, got {rows} x {columns}"
             )
         initial, features = self._from_imu(given)
-        start = initial if given.perturbation is None else initial @ given.perturbation
+        start = initial if given.shake is None else initial @ given.shake
         refined = self.refine(given, start, features)
-        # The loss sees the IMU network's own pose, without the perturbation; a given initial pose includes it.
+        # what the IMU network says is judged as it says it; a given initial pose counts with what shook it
         return refined if self.settings.imu == "given" else NetworkOutput(initial, refined.poses)
 
     def refine(
         self, given: NetworkInput, initial: Tensor, features: tuple[Tensor, Tensor] | None = None
     ) -> NetworkOutput:
-        """Refine initial poses ``(B, 4, 4)`` from any source; ``features`` are those of :meth:`imu_features`."""
-        return self.refine_encoded(self.encode(given.last), self.encode(given.current), initial, features)
+        """Estimate the residual of any initial poses ``(B, 4, 4)``; ``features`` are those of :meth:`imu_features`."""
+        return self.refine_seen(self.look(given.last), self.look(given.current), initial, features)
 
-    def encode(self, vertices: Tensor) -> EncodedScan:
-        """Compute everything that depends on one scan only from its vertex map ``(B, 3, H, W)``."""
+    def look(self, vertices: Tensor) -> SeenScan:
+        """What is computed of a scan alone, from its vertex map ``(B, 3, H, W)``: once for both pairs that it is in."""
         normals = maps.normal_map(vertices)
-        points = None if self.projective is None else self.projective.encode(vertices, normals)
-        return EncodedScan(vertices, normals, points)
+        points = None if self.projective is None else self.projective.look(vertices, normals)
+        return SeenScan(vertices, normals, points)
 
-    def refine_encoded(
-        self, last: EncodedScan, current: EncodedScan, initial: Tensor, features: tuple[Tensor, Tensor] | None = None
+    def refine_seen(
+        self, last: SeenScan, current: SeenScan, initial: Tensor, features: tuple[Tensor, Tensor] | None = None
     ) -> NetworkOutput:
-        """Refine as :meth:`refine` does, from scans that :meth:`encode` returned."""
+        """As :meth:`refine`, for scans that :meth:`look` has seen."""
         pose, poses = initial, []
         for _ in range(self.settings.iterations):
             if self.projective is not None and last.points is not None and current.points is not None:
@@ -142,7 +142,7 @@ class OdometryNetwork(nn.Module):
         return NetworkOutput(initial, tuple(poses))
 
     def imu_features(self, imu: Tensor, velocity_m_s: Tensor) -> tuple[Tensor, Tensor] | None:
-        """Return IMU features for the residual network, None unless ``imu="feature"``. See :class:`NetworkInput`."""
+        """What the residual network is told of the IMU; None but with ``imu="feature"``. See :class:`NetworkInput`."""
         if self.imu_network is None or self.settings.imu != "feature":
             return None
         return self.imu_network.features(imu, velocity_m_s)
@@ -150,7 +150,7 @@ class OdometryNetwork(nn.Module):
     def _from_imu(self, given: NetworkInput) -> tuple[Tensor, tuple[Tensor, Tensor] | None]:
         if self.settings.imu == "given":
             if given.initial is None:
-                raise ConfigError("this network (imu='given') needs an initial pose; set NetworkInput.initial")
+                raise ConfigError("this network takes its initial pose from elsewhere, and none was given")
             return given.initial, None
         nothing = se3.identity(len(given.last), given.last)
         if self.imu_network is None:
@@ -161,5 +161,5 @@ class OdometryNetwork(nn.Module):
 
 
 def parameter_count(network: nn.Module) -> int:
-    """Return the number of trained parameters; shared ones count once."""
+    """How many numbers training adjusts; shared ones count once."""
     return sum(parameter.numel() for parameter in network.parameters())

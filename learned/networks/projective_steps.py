@@ -1,10 +1,11 @@
-"""Point-to-plane registration steps between two maps, with point weights from a small network.
+"""Steps of point-to-plane registration between two maps, with weights that a small network gives.
 
-Not in the paper. Each point of the current scan, moved by the pose so far, is matched to the plane of the last scan in
-the cell that it falls into (projective association). One weighted Gauss-Newton step of the point-to-plane cost follows,
-in closed form. The steps are differentiable, so the unsupervised loss trains the weights to reject moving cars, edges
-and leaves. Both scans pass the same convolutions once; a small network computes a point's weight from the features and
-roughness of both cells and from its distance. Before training, all points have the weight of the robust kernel only.
+Not in the paper. Cells are the matches: each point of the current scan, moved by the pose so far, is held against the
+plane of the last scan in the cell that it falls into, and one weighted Gauss-Newton step of the point-to-plane loss is
+solved in closed form. The steps are differentiable, so the unsupervised loss teaches the weights which points to trust
+(moving cars, edges, leaves): both scans go through the same convolutions once, and a point's weight is a small network
+of the features of both its cells, of how rough they are and of its distance. Untrained, all points count alike but for
+a robust kernel.
 """
 
 from __future__ import annotations
@@ -22,33 +23,31 @@ from hybridlio.learned.networks import torch_se3 as se3
 from hybridlio.learned.networks.residual_network import CircularConv
 from hybridlio.learned.settings import NetworkSettings
 
-# Widths of the robust kernel in the first and the last step, before training: above the error of an initial pose
-# (0.15 m), and twice a lidar's range noise.
-_KERNELS_M = (0.4, 0.05)
-_KERNEL_GAIN = 10.0  # Adam moves this one parameter as slowly as a layer's weights; the gain lets widths follow
-_LEVER_M = 10.0  # lever arm for rotations, so that the normal equations are well scaled; the median range on a road
-_DAMPING = 1e-4  # of the normal equations, divided by the weight: keeps directions that hardly any cell constrains
-_LIMIT_M = 1.0  # farther from its plane a point belongs to another surface; several times an initial pose's error
-_DISTANCE_M = 0.1  # unit of distances: about the error of an initial pose, so that inputs are about 1
-_FEWEST = 9000  # maps with fewer points are not thinned: a quarter of a map of 52 x 720
-_ONE_OF = (4, 2)  # in the first half of the steps every fourth point, later every second: more do not gain accuracy
-_DILATION = 3  # of the last convolution, so that features see about 10° around
-_COARSE = 2  # rows and columns of the maps in a cell of the features, for a quarter of the time
+_KERNELS_M = (0.4, 0.05)  # of the first and the last step, before training
+_KERNEL_GAIN = 10.0  # Adam's steps are as large for one number as for a layer's weights
+_LEVER_M = 10.0  # rotations are measured at this lever, so that the system is well scaled
+_DAMPING = 1e-4  # of the normal equations a point: directions that hardly any cell constrains stay as they are
+_LIMIT_M = 1.0
+_DISTANCE_M = 0.1  # what is left after an initial pose, so that networks see numbers around 1
+_FEWEST = 9000  # so many points are not thinned any more
+_ONE_OF = (4, 2)  # so many points are taken in the first half of the steps, and in the others
+_DILATION = 3
+_COARSE = 2  # features have a cell for so many rows and columns of the maps
 
 
 @dataclass(frozen=True, eq=False)
-class EncodedPoints:
-    """Inputs of the steps from one scan, for its use as the last scan and as the current one.
+class SeenPoints:
+    """A scan as the steps see it, whether it is the last one or the current one; computed once a scan.
 
     Attributes:
         points: ``(B, 3, N)`` the cells of its vertex map, row by row.
-        seen: ``(B, 1, N)`` true where a cell holds a point.
-        planes: ``(B, 4, N)`` the normal n of each cell and n·v, which is infinite without a normal.
-        rough: ``(B, 1, N)`` of :func:`_roughness`; None without weights.
-        as_last, as_current: ``(B, n, C)`` contribution of the n coarse cells to the weights of points that fall into
-            them, and of their own points; None without weights. In a thinned scan ``as_current`` is that of each point,
-            ``(B, N, C)``.
-        coarse: ``(N,)`` index of the coarse cell that contains each cell.
+        seen: ``(B, 1, N)`` which cells hold a point.
+        planes: ``(B, 4, N)`` the normal n of each cell and n·v, which is infinite where there is no normal.
+        rough: ``(B, 1, N)`` of :func:`_roughness`; None without weights to be told of it.
+        as_last, as_current: ``(B, n, C)`` what the n coarse cells contribute to the weights of points that fall into
+            them, and of their own points; None without weights. Of a scan that is thinned ``as_current`` is each
+            point's, ``(B, N, C)``.
+        coarse: ``(N,)`` which coarse cell each point's own cell is a part of.
     """
 
     points: Tensor
@@ -61,7 +60,7 @@ class EncodedPoints:
 
 
 class ProjectiveSteps(nn.Module):
-    """Refines a pose between two scans, step by step."""
+    """From two scans and a pose to better poses, one for each step."""
 
     def __init__(self, settings: NetworkSettings) -> None:
         super().__init__()
@@ -71,24 +70,26 @@ class ProjectiveSteps(nn.Module):
         self.register_buffer("_start", torch.linspace(first, last, settings.projective_steps), persistent=False)
         self.weights = PointWeights(settings) if settings.weight_channels else None
 
-    def encode(self, vertices: Tensor, normals: Tensor) -> EncodedPoints:
-        """Return the inputs of the steps from a scan's maps ``(B, 3, H, W)`` in its own frame."""
+    def look(self, vertices: Tensor, normals: Tensor) -> SeenPoints:
+        """What the steps need of a scan, from its maps ``(B, 3, H, W)`` in its own frame."""
         offset = (normals * vertices).sum(dim=1, keepdim=True)
         offset = torch.where(maps.valid_cells(normals)[:, None], offset, torch.inf)
         planes = torch.cat([normals, offset], dim=1).flatten(2)
         seen = maps.valid_cells(vertices)[:, None]
-        points = EncodedPoints(vertices.flatten(2), seen.flatten(2), planes)
+        points = SeenPoints(vertices.flatten(2), seen.flatten(2), planes)
         if self.weights is None:
             return points
         rough = _roughness(vertices, normals)
-        as_last, as_current = self.weights.encode(vertices, normals, rough, seen)
+        as_last, as_current = self.weights.look(vertices, normals, rough, seen)
         coarse = self.weights.coarse
         return replace(points, rough=rough.flatten(2), as_last=as_last, as_current=as_current, coarse=coarse)
 
-    def forward(self, last: EncodedPoints, current: EncodedPoints, pose: Tensor) -> list[Tensor]:
-        """Return poses ``T_k_k1`` ``(B, 4, 4)`` after each step.
+    def forward(self, last: SeenPoints, current: SeenPoints, pose: Tensor) -> list[Tensor]:
+        """Poses ``T_k_k1`` ``(B, 4, 4)`` after each step.
 
-        No gradient goes back through earlier steps: each step is differentiable by its weights only.
+        A step takes the pose before it as given: gradients go through the weights, not back through earlier steps. The
+        first half of the steps takes every fourth point, the others every second, of large maps: more do not make
+        them better.
         """
         most = max(current.points.shape[-1] // _FEWEST, 1)
         few, more = (_thinned(current, min(by, most)) for by in _ONE_OF)
@@ -99,11 +100,11 @@ class ProjectiveSteps(nn.Module):
             poses.append(pose)
         return poses
 
-    def _step(self, last: EncodedPoints, current: EncodedPoints, pose: Tensor, kernel_m: Tensor) -> Tensor:
-        """Return ``δT`` ``(B, 4, 4)`` of one step."""
+    def _step(self, last: SeenPoints, current: SeenPoints, pose: Tensor, kernel_m: Tensor) -> Tensor:
+        """``δT`` ``(B, 4, 4)`` of one step."""
         moved = torch.baddbmm(pose[:, :3, 3:], pose[:, :3, :3], current.points)
         cell, inside = maps.cells(moved, self.settings.geometry)
-        normals, distance, there = _point_to_plane(last.planes, moved, cell, inside[:, None] & current.seen)
+        normals, distance, there = _held_against(last.planes, moved, cell, inside[:, None] & current.seen)
         weights = there * (kernel_m**2 / (kernel_m**2 + distance.square())).square()
         if self.weights is not None:
             weights = weights * self.weights(last, current, cell, distance, kernel_m)
@@ -117,7 +118,7 @@ class ProjectiveSteps(nn.Module):
 
 
 class PointWeights(nn.Module):
-    """Computes the weight of each point of the current scan from the features of both its cells and its distance."""
+    """What each point of the current scan counts, by the features of its cell in both maps and its distance."""
 
     def __init__(self, settings: NetworkSettings) -> None:
         super().__init__()
@@ -128,7 +129,7 @@ class PointWeights(nn.Module):
             nn.ReLU(),
             CircularConv(channels, channels, 3, (1, 1), bias=True),
             nn.ReLU(),
-            CircularConv(channels, channels, 3, (1, 1), bias=True, dilation=_DILATION),
+            CircularConv(channels, channels, 3, (1, 1), bias=True, dilation=_DILATION),  # sees about 10° around
             nn.ReLU(),
         )
         self.of_last = nn.Linear(channels, channels)
@@ -141,22 +142,22 @@ class PointWeights(nn.Module):
 
     @property
     def coarse(self) -> Tensor:
-        """``(H·W,)`` index of the coarse cell that contains each cell of a map."""
+        """``(H·W,)`` the coarse cell that each cell of a map is a part of."""
         return self.get_buffer("_coarse")
 
-    def encode(self, vertices: Tensor, normals: Tensor, rough: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the contributions of a scan's coarse cells ``(B, n, C)``, as the last scan and as the current one."""
+    def look(self, vertices: Tensor, normals: Tensor, rough: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+        """What a scan's coarse cells contribute ``(B, n, C)``, as the last scan's and as the current one's."""
         inputs = torch.cat([vertices / self.scale_m, normals, rough, seen.to(vertices.dtype)], dim=1)
         features = self.features(inputs).flatten(2)
-        # as convolutions with a copy: several times as fast as linear layers on the transposed features
+        # as convolutions and copied: several times as fast as linear layers of channels last
         as_last = functional.conv1d(features, self.of_last.weight[..., None], self.of_last.bias)
         as_current = functional.conv1d(features, self.of_current.weight[..., None])
         return as_last.transpose(1, 2).contiguous(), as_current.transpose(1, 2).contiguous()
 
     def forward(
-        self, last: EncodedPoints, current: EncodedPoints, cell: Tensor, distance: Tensor, kernel_m: Tensor
+        self, last: SeenPoints, current: SeenPoints, cell: Tensor, distance: Tensor, kernel_m: Tensor
     ) -> Tensor:
-        """Return weights ``(B, 1, N)`` from 0 to 1, from the cells ``(B, N)`` that points fall into and distances."""
+        """Weights ``(B, 1, N)`` from 0 to 1 of points by the cells ``(B, N)`` they fall into and their distances."""
         assert last.rough is not None
         assert last.as_last is not None
         assert current.rough is not None
@@ -166,25 +167,25 @@ class PointWeights(nn.Module):
         rough = last.rough.gather(2, cell[:, None])
         point = torch.cat([size / _DISTANCE_M, compared, rough, current.rough], dim=1)
         batch, cells, channels = last.as_last.shape
-        # gathering rows of a table is faster than gathering from each channel
+        # rows of a table are fetched, and worked on, faster than channels one by one
         first = torch.arange(0, batch * cells, cells, device=cell.device)[:, None]
         fallen_into = (self.coarse.index_select(0, cell.flatten()).reshape(cell.shape) + first).flatten()
         there = last.as_last.reshape(-1, channels).index_select(0, fallen_into).reshape(batch, -1, channels)
         of_point = torch.bmm(self.of_point.weight.expand(batch, -1, -1), point).transpose(1, 2)
-        # in place, since memory traffic dominates
+        # in place, since fetching memory is what takes time
         hidden = there.add_(current.as_current).add_(of_point).relu_()
         weights: Tensor = self.logit(hidden)
         return weights.sigmoid_().transpose(1, 2)
 
 
 def _coarse_cells(geometry: MapGeometry) -> Tensor:
-    """Return the index ``(H·W,)`` of the coarse cell that contains each cell, both counted row by row."""
+    """``(H·W,)`` the coarse cell that each cell is a part of, both counted row by row."""
     rows, columns = (torch.arange(n) // _COARSE for n in (geometry.rows, geometry.columns))
     return (rows[:, None] * (int(columns[-1]) + 1) + columns).flatten()
 
 
-def _thinned(scan: EncodedPoints, by: int) -> EncodedPoints:
-    """Return the scan with every ``by``-th point; data by cell stay whole."""
+def _thinned(scan: SeenPoints, by: int) -> SeenPoints:
+    """Every so-manieth point, laid out anew, with what it contributes itself; what belongs to cells stays."""
     rough, coarse = (None if x is None else x[..., ::by].contiguous() for x in (scan.rough, scan.coarse))
     points, seen = scan.points[..., ::by].contiguous(), scan.seen[..., ::by].contiguous()
     own = scan.as_current
@@ -194,10 +195,9 @@ def _thinned(scan: EncodedPoints, by: int) -> EncodedPoints:
 
 
 def _roughness(vertices: Tensor, normals: Tensor) -> Tensor:
-    """Return the distance ``(B, 1, H, W)`` of cells from the mean of their neighbours along the normal.
+    """``(B, 1, H, W)`` how far cells lie from between their neighbours along their normals, in units of 0.1 m, up to 5.
 
-    It is the larger one of both directions, in units of 0.1 m, at most 5, and 0 without a normal. On a plane it is the
-    range noise.
+    0 where there is no normal. On a plane it is the noise of the range.
     """
     around = functional.pad(vertices, (1, 1, 0, 0), mode="circular")
     beside = (around[..., 2:] + around[..., :-2]) / 2 - vertices
@@ -207,14 +207,14 @@ def _roughness(vertices: Tensor, normals: Tensor) -> Tensor:
     return (torch.maximum(*off) / _DISTANCE_M).clamp(max=5.0)
 
 
-def _point_to_plane(planes: Tensor, points: Tensor, cell: Tensor, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return normals ``(B, 3, N)``, signed distances ``(B, 1, N)`` in metres, and a mask of valid ones (0 or 1).
+def _held_against(planes: Tensor, points: Tensor, cell: Tensor, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Normals ``(B, 3, N)``, signed distances ``(B, 1, N)`` in metres, and where there are such, as 0 and 1.
 
     Args:
-        planes: ``(B, 4, H·W)`` as in :class:`EncodedPoints`.
+        planes: ``(B, 4, H·W)`` as in :class:`SeenPoints`.
         points: ``(B, 3, N)`` in the planes' frame.
-        cell: ``(B, N)`` the cell that each point falls into.
-        known: ``(B, 1, N)`` true for points inside the map.
+        cell: ``(B, N)`` they fall into.
+        known: ``(B, 1, N)`` which of them are points at all.
     """
     chosen = planes.gather(2, cell[:, None].expand(-1, 4, -1))
     normals = chosen[:, :3]
@@ -224,7 +224,7 @@ def _point_to_plane(planes: Tensor, points: Tensor, cell: Tensor, known: Tensor)
 
 
 def weighted_step(normals: Tensor, points: Tensor, distance: Tensor, weights: Tensor) -> Tensor:
-    """Return ``δT`` ``(B, 4, 4)`` of one Gauss-Newton step of ``Σ w d²`` for points matched to planes.
+    """``δT`` ``(B, 4, 4)`` of one Gauss-Newton step of ``Σ w d²``, for points and the planes that they belong to.
 
     Args:
         normals, points: ``(B, 3, N)`` in one frame.

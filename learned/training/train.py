@@ -173,7 +173,7 @@ class _Run:
             checkpoints.restore(found, self.network, self.optimiser)
             self.step = found.step
         elif start is not None:
-            put_weights(self.network, start, "initial weights")
+            put_weights(self.network, start, "the weights to start from")
         self.place.wait()  # before the first process writes where the others look
         if self.place.leads:
             self.log = TrainingLog(self.out, self.step)

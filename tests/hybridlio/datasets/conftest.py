@@ -7,13 +7,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import bags
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Stamps
-from hybridlio.core.sensors import ImuSamples
+from hybridlio.core.sensors import ImuSamples, Scan
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.core.trajectory_files import write_kitti, write_tum
 
@@ -159,6 +160,16 @@ def write_folder(root: Path, ride: Ride, write_scan: Callable[[Path, Array], Any
     return folder
 
 
+def write_bag(root: Path, ride: Ride) -> Path:
+    """Write the ride as a ROS 2 bag in SQLite; return its folder."""
+    messages = bags.Messages(is_ros2=True)
+    points = [ride.points(k).astype(np.float32) for k in range(ride.count)]
+    scans = [Scan(int(t), p[:, :3], p[:, 3]) for t, p in zip(ride.stamps_ns, points, strict=True)]
+    imu = ride.imu(ride.imu_stamps_ns(10))
+    content = bags.drive_messages(messages, scans, imu, ride.T_imu_lidar, ride.lidar)
+    return bags.write(root / "ride", messages, content, "sqlite3")
+
+
 class Recordings:
     """The ride and the writers, as one fixture."""
 
@@ -166,6 +177,7 @@ class Recordings:
     write_raw = staticmethod(write_raw)
     write_odometry = staticmethod(write_odometry)
     write_folder = staticmethod(write_folder)
+    write_bag = staticmethod(write_bag)
     put = staticmethod(put)
     put_bin = staticmethod(put_bin)
     put_oxts = staticmethod(put_oxts)

@@ -1,0 +1,143 @@
+"""Scans of a bag, read when they are asked for: in order without going back, others from their time of receipt on."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridlio.core.arrays import Stamps
+from hybridlio.core.errors import DataError
+from hybridlio.core.sensors import Scan
+from hybridlio.datasets.notes import Notes
+from hybridlio.datasets.points.point_times import PointTimes, find_point_times
+from hybridlio.datasets.rosbag.bag import Bag
+from hybridlio.datasets.rosbag.clouds import (
+    LIVOX_TIMES,
+    Columns,
+    cloud_columns,
+    full_scale,
+    intensity,
+    livox_columns,
+    valid_points,
+)
+from hybridlio.datasets.rosbag.topics import LIVOX_TYPES
+from hybridlio.datasets.rosbag.wire import read_header
+
+_SAMPLES = 5  # scans; more than one because the first may be a part of a sweep, few because they are read twice
+_MAX_SKIPPED = 5  # messages; reading on past them is quicker than to search a place in the bag
+
+
+@dataclass
+class BagScans:
+    """Loads scan ``k`` of a bag. Copies in other processes open the bag again.
+
+    Attributes:
+        path: the bag.
+        topic: the lidar's topic.
+        stamps_ns: ``(N,)`` of the scans.
+        messages: ``(N,)`` the position of each scan among the topic's messages.
+        received_ns: of all messages of the topic.
+        has_stamps: whether the stamps are those of the headers.
+        bag: the open bag, or None to open it when needed.
+        point_times: the convention of the points' times, found by :meth:`learn`; None if they have none.
+        full_scale: the intensity that counts as 1, found by :meth:`learn`.
+    """
+
+    path: Path
+    topic: str
+    stamps_ns: Stamps
+    messages: NDArray[np.intp]
+    received_ns: Stamps
+    has_stamps: bool
+    bag: Bag | None = None
+    point_times: PointTimes | None = None
+    full_scale: float = 1.0
+    _at: int = 0
+    _stream: Iterator[tuple[str, int, bytes]] | None = None
+    _lock: Any = field(default_factory=threading.Lock)
+
+    def __call__(self, k: int) -> Scan:
+        """Load scan ``k``; a :class:`DataError` names frame and bag."""
+        try:
+            with self._lock:
+                raw = self._message(int(self.messages[k]))
+            return self._scan(raw, int(self.stamps_ns[k]))
+        except DataError as error:
+            self._stream = None
+            text = str(error).removeprefix(f"{self.path}: ")
+            raise DataError(f"frame {k}: {self.path}, {self.topic}: {text}") from None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "bag": None, "_stream": None, "_lock": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _lock=threading.Lock())
+
+    def learn(self, notes: Notes) -> None:
+        """Find the convention of point times and the scale of intensities from the first scans that can be read.
+
+        Raises:
+            DataError: the convention of point times is ambiguous.
+        """
+        samples = []
+        for k in range(min(_SAMPLES, len(self.stamps_ns))):
+            try:
+                samples.append((int(self.stamps_ns[k]), self.columns(k)))
+            except DataError as error:
+                notes.add(f"frame {k}: {error}")
+        is_livox = self._bag().topics[self.topic].type in LIVOX_TYPES
+        step_ns = int(np.median(np.diff(self.stamps_ns))) if len(self.stamps_ns) > 1 else None
+        times = LIVOX_TIMES if is_livox else find_point_times(samples, step_ns, notes)
+        self.point_times, self.full_scale = times, full_scale([columns for _, columns in samples])
+
+    def columns(self, k: int) -> Columns:
+        """Return the columns of the valid points of scan ``k``, as the message holds them.
+
+        Raises:
+            DataError: the message cannot be read.
+        """
+        with self._lock:
+            raw = self._message(int(self.messages[k]))
+        return self._columns(raw, int(self.stamps_ns[k]))
+
+    def _columns(self, raw: bytes, stamp_ns: int) -> Columns:
+        bag = self._bag()
+        if bag.topics[self.topic].type in LIVOX_TYPES:
+            return valid_points(livox_columns(raw, bag.is_ros2, stamp_ns))
+        return valid_points(cloud_columns(bag.decode(self.topic, raw)))
+
+    def _scan(self, raw: bytes, stamp_ns: int) -> Scan:
+        if self.has_stamps and read_header(raw, self._bag().is_ros2).stamp_ns != stamp_ns:
+            raise DataError("the bag has changed since it was opened")
+        columns = self._columns(raw, stamp_ns)
+        points = np.column_stack([columns[axis] for axis in "xyz"])
+        offsets = None if self.point_times is None else self.point_times.offsets_ns(columns, stamp_ns)
+        scan = Scan(stamp_ns, points, intensity(columns, self.full_scale), offsets)
+        if not len(scan):
+            raise DataError("the scan has no finite points")
+        return scan
+
+    def _bag(self) -> Bag:
+        if self.bag is None:
+            self.bag = Bag(self.path)
+        return self.bag
+
+    def _message(self, position: int) -> bytes:
+        """Return the message at a position, and stay behind it."""
+        if self._stream is None or not 0 <= position - self._at <= _MAX_SKIPPED:
+            start_ns = int(self.received_ns[position])
+            # the stream leaves out messages that were received earlier, wherever they stand
+            self._at = position - int((self.received_ns[:position] >= start_ns).sum())
+            self._stream = self._bag().messages([self.topic], start_ns)
+        for _, _, raw in self._stream:
+            self._at += 1
+            if self._at > position:
+                return raw
+        self._stream = None
+        raise DataError("the message is missing, although the index counts it; the bag is damaged")

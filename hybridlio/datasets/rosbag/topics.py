@@ -1,0 +1,123 @@
+"""Which topics of a bag are used: chosen by the user, or the only one of a kind."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+
+from hybridlio.core.errors import ConfigError, DataError
+from hybridlio.core.tables import counted
+from hybridlio.datasets.notes import Notes
+from hybridlio.datasets.rosbag.bag import LIVOX_PACKAGES, Bag, Topic
+
+NONE = "none"  # an option's value to use no topic of a kind
+LIVOX_TYPES = frozenset(f"{package}/CustomMsg" for package in LIVOX_PACKAGES)
+TYPES: dict[str, frozenset[str]] = {
+    "lidar": frozenset({"sensor_msgs/PointCloud2"}) | LIVOX_TYPES,
+    "imu": frozenset({"sensor_msgs/Imu"}),
+    "gps": frozenset({"sensor_msgs/NavSatFix"}),
+    "reference": frozenset(
+        {
+            "nav_msgs/Odometry",
+            "geometry_msgs/PoseStamped",
+            "geometry_msgs/PoseWithCovarianceStamped",
+            "geometry_msgs/TransformStamped",
+        }
+    ),
+}
+TRANSFORM_TYPES = frozenset({"tf2_msgs/TFMessage", "tf/tfMessage"})
+_PACKETS = frozenset({"velodyne_msgs/VelodyneScan", "ouster_ros/PacketMsg", "ouster_sensor_msgs/PacketMsg"})
+
+
+@dataclass(frozen=True)
+class BagTopics:
+    """Topics and frames that the user names; None to choose by type, ``none`` to use no such topic.
+
+    Attributes:
+        lidar, imu, gps, reference: names of topics.
+        imu_frame, lidar_frame: names of frames, in place of those in the messages' headers.
+
+    Raises:
+        ConfigError: the lidar is ``none``, or a name is empty.
+    """
+
+    lidar: str | None = None
+    imu: str | None = None
+    gps: str | None = None
+    reference: str | None = None
+    imu_frame: str | None = None
+    lidar_frame: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.lidar == NONE:
+            raise ConfigError("--lidar-topic: odometry needs a lidar; give the name of its topic")
+        for option in fields(self):
+            if getattr(self, option.name) == "":
+                raise ConfigError(f"{option_of(option.name)}: the name is empty")
+
+
+NO_CHOICE = BagTopics()
+
+
+def option_of(name: str) -> str:
+    """Return the command line's option for an attribute of :class:`BagTopics`."""
+    return f"--{name.replace('_', '-')}" + ("" if name.endswith("_frame") else "-topic")
+
+
+def choose(bag: Bag, wanted: BagTopics, notes: Notes) -> dict[str, Topic]:
+    """Return the topics to use, by kind: ``lidar``, and of ``imu``, ``gps`` and ``reference`` those that there are.
+
+    Raises:
+        DataError: a wanted topic does not exist or has another type, there is no lidar, or there are several lidars or
+            IMUs; the message lists topics, and the option to choose one.
+    """
+    found = {kind: _choose(bag, kind, getattr(wanted, kind), notes) for kind in TYPES}
+    return {kind: topic for kind, topic in found.items() if topic is not None}
+
+
+def _choose(bag: Bag, kind: str, name: str | None, notes: Notes) -> Topic | None:
+    if name == NONE:
+        return None
+    option, fitting = option_of(kind), [topic for topic in bag.topics.values() if topic.type in TYPES[kind]]
+    if name is not None:
+        known = bag.topics.get(name) or bag.topics.get(f"/{name}")
+        if known is None or known.type not in TYPES[kind]:
+            problem = "no such topic" if known is None else f"its type is {known.type}"
+            listed = fitting or bag.topics.values()
+            raise DataError(f"{bag.path}: {option} {name}: {problem}; topics:\n{table(listed)}")
+        return known
+    if len(fitting) > 1 and kind in ("lidar", "imu"):
+        raise DataError(
+            f"{bag.path}: {len(fitting)} {kind} topics; choose one, for example {option} {_most(fitting).name}\n"
+            + table(fitting)
+        )
+    if len(fitting) > 1:
+        names = ", ".join(f"{topic.name} ({topic.type})" for topic in fitting)
+        what = {"gps": "GPS fixes", "reference": "reference poses"}[kind]
+        notes.add(f"no {what} used: {counted(len(fitting), 'topic')} could give them; choose by {option}: {names}")
+        return None
+    if not fitting and kind == "lidar":
+        raise DataError(_no_lidar(bag))
+    return fitting[0] if fitting else None
+
+
+def _no_lidar(bag: Bag) -> str:
+    packets = [topic for topic in bag.topics.values() if topic.type in _PACKETS]
+    remedy = f"; {packets[0].name} holds raw packets, record the driver's points" if packets else ""
+    types = ", ".join(sorted(TYPES["lidar"]))
+    return f"{bag.path}: no topic of point clouds ({types}){remedy}. Its topics:\n{table(bag.topics.values())}"
+
+
+def _most(topics: Iterable[Topic]) -> Topic:
+    return max(topics, key=lambda topic: topic.count)
+
+
+def table(topics: Iterable[Topic], marks: Mapping[str, str] | None = None) -> str:
+    """Return lines that list topics with types, counts and rates; ``marks`` are words put behind some of them."""
+    rows = [(t.name, t.type, str(t.count), f"{t.rate_hz:.1f} Hz", (marks or {}).get(t.name, "")) for t in topics]
+    if not rows:
+        return "  (none)"
+    width = [max(len(row[column]) for row in rows) for column in range(4)]
+    return "\n".join(
+        f"  {n:<{width[0]}}  {k:<{width[1]}}  {c:>{width[2]}}  {r:>{width[3]}}  {m}".rstrip() for n, k, c, r, m in rows
+    )
