@@ -88,6 +88,7 @@ PUBLISHED = Recipe(
         remap_gradient=False,
         distance="gradient",
         vertex_scale_m=20.0,
+        residual_scale=1.0,
         output_scale=0.1,
     ),
     LossSettings(

@@ -1,4 +1,4 @@
-"""A recording step after step, as at run time: what the network knows of its velocity is what it found before."""
+"""A network run over a recording step by step, as at run time: its last velocity is its own estimate."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from hybridlio.learned.networks.odometry_network import OdometryNetwork
 
 @dataclass(frozen=True, eq=False)
 class DrivenSteps:
-    """What a network says of a recording's steps, in order.
+    """A network's estimates of a recording's steps, in order.
 
     Attributes:
-        poses, initial, reference: ``T_k_k1`` ``(N, 4, 4)`` estimated, before the residual, and true (NaN where not
-            known).
+        poses, initial, reference: ``T_k_k1`` ``(N, 4, 4)`` estimated, before the residual, and true (NaN where
+            unknown).
     """
 
     poses: Array
@@ -33,7 +33,7 @@ class DrivenSteps:
 
     @property
     def drift(self) -> tuple[float, float] | None:
-        """KITTI's drift of the chained steps, see :func:`drift_of`."""
+        """KITTI drift of the chained steps, see :func:`drift_of`."""
         return drift_of(self.poses, self.reference)
 
 
@@ -45,8 +45,8 @@ def drive(
 ) -> DrivenSteps:
     """Estimate a recording's steps in order.
 
-    A network that is told the last velocity is told the one it found itself, but for the first step, which gets the
-    shard's: how a run finds its first velocity is not judged here.
+    A network with the last velocity as an input gets its own estimate, except for the first step, which gets the
+    shard's: how a run finds its first velocity is not evaluated here.
 
     Raises:
         DataError: the recording has no steps, or a gap between them.
@@ -77,9 +77,10 @@ def drive(
 
 
 def drift_of(poses: Array, reference: Array) -> tuple[float, float] | None:
-    """KITTI's t_rel (percent) and r_rel (degrees per 100 m) of chained steps ``(N, 4, 4)``, a segment from every scan.
+    """Return KITTI's t_rel (percent) and r_rel (degrees per 100 m) of chained steps ``(N, 4, 4)``.
 
-    None where the reference is not known throughout, or the path is too short for any segment.
+    Segments start at every scan. Return None where the reference is not known for all steps, or the path is shorter
+    than any segment.
     """
     if not len(poses) or not np.isfinite(reference).all():
         return None

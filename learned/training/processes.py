@@ -1,4 +1,4 @@
-"""One process or many: what training under ``torchrun`` needs to know of its place among the others."""
+"""One training process or several, as ``torchrun`` starts them."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Processes:
-    """This process's place.
+    """This process among all.
 
     Attributes:
-        rank: its number, from 0.
-        count: of all processes.
-        device: where it computes.
+        rank: its index, from 0.
+        count: number of processes.
+        device: its device.
     """
 
     rank: int
@@ -32,18 +32,18 @@ class Processes:
 
     @property
     def leads(self) -> bool:
-        """Whether this is the process that writes files and shows progress."""
+        """Whether this process writes files and shows progress."""
         return self.rank == 0
 
     def total(self, value: Tensor) -> Tensor:
-        """The sum of a value over all processes."""
+        """Return the sum of a value over all processes."""
         if self.count > 1:
             value = value.detach().clone()
             torch.distributed.all_reduce(value)
         return value.detach()
 
     def wait(self) -> None:
-        """Return when every process has come here."""
+        """Return when all processes have called this."""
         if self.count > 1:
             torch.distributed.barrier()
 
@@ -63,16 +63,16 @@ class Processes:
                 "depends on the number of processes; train with network.normalisation 'group' for one that does not",
                 self.count,
             )
-        # not every recipe's loss reaches every part: LSTMs, for one, are beyond it where steps forget their start
+        # some recipes give parts of the network no gradient, such as the LSTMs where steps ignore their start
         return DistributedDataParallel(network, find_unused_parameters=True)
 
 
 @contextlib.contextmanager
 def processes(device: str | None = None) -> Iterator[Processes]:
-    """Join the processes that ``torchrun`` started, or be the only one.
+    """Join the processes that ``torchrun`` started; without it, yield a single process.
 
     Args:
-        device: where to compute; by default this process's GPU, where there is any.
+        device: name of the device; None takes this process's GPU where there is one.
     """
     count, rank = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("RANK", "0"))
     local = int(os.environ.get("LOCAL_RANK", "0"))

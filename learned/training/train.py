@@ -3,10 +3,10 @@
 The result does not depend on the number of processes beyond rounding, with one exception: batch normalisation on CPUs
 (see :meth:`hybridlio.learned.training.processes.Processes.joined`).
 
-Source: UnDeepLIO, "Implementation Details". A run is a folder with ``recipe.json``, ``log.jsonl``, ``checkpoint.pt``
+Source: UnDeepLIO, "Implementation Details". The folder of a run has ``recipe.json``, ``log.jsonl``, ``checkpoint.pt``
 ``best.safetensors`` where there is something to validate on,
-and, when it has come to its end, ``weights.safetensors``; given the same folder again, it goes on exactly where its
-last checkpoint was.
+and after the last step ``weights.safetensors``. Given the same folder again, a run resumes exactly at its last
+checkpoint.
 """
 
 from __future__ import annotations
@@ -47,16 +47,16 @@ BEST = "best.safetensors"
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """Where a run is.
+    """State of a run after a step.
 
     Attributes:
-        step, steps: done, and in all.
-        epoch: from 0.
-        loss: of the last step, a pair's mean.
-        po2pl_m: mean distance to the matched planes in it.
-        learning_rate: in it.
-        pairs_per_s: since this start.
-        remaining_s: until all steps are done, at that rate.
+        step, steps: steps done, and steps in total.
+        epoch: index of the epoch, from 0.
+        loss: mean loss of the step's pairs.
+        po2pl_m: mean distance to the matched planes, in metres.
+        learning_rate: of the step.
+        pairs_per_s: average since the run was started or resumed.
+        remaining_s: time for the remaining steps at that rate.
     """
 
     step: int
@@ -71,14 +71,14 @@ class TrainingProgress:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a run is carried out; none of it changes the weights that it ends with.
+    """Options of a run that do not change its steps.
 
     Attributes:
-        device: where to compute; by default a GPU where there is one.
-        checkpoint_every: steps between checkpoints; there is one at the end of each epoch too.
+        device: name of the device; None takes a GPU where there is one.
+        checkpoint_every: steps between checkpoints; the end of each epoch has one, too.
         validate_every: epochs between validations.
-        max_steps: end after so many steps in all.
-        max_seconds: stop after so long, with a checkpoint.
+        max_steps: end the run after this many steps in total.
+        max_seconds: stop with a checkpoint after this time.
         about: text for the metadata of the weights.
     """
 
@@ -116,19 +116,19 @@ def train(
 
     Args:
         recipe: settings.
-        pairs: to train on.
-        out: the run's folder.
-        validation: pairs on which the error left and the drift are measured as training goes. The weights that are best
-            there are kept beside the last ones.
+        pairs: training data.
+        out: folder of the run.
+        validation: pairs on which error and drift are measured during training. The best weights are kept beside the
+            last ones.
         start: weights to start from, such as shipped ones, named as by
             :func:`hybridlio.learned.networks.weights.own_tensors`; ignored when resuming.
-        options: how to carry it out.
-        watchers: functions to call as it goes.
+        options: device, checkpoints, limits.
+        watchers: functions to call during training.
 
     Raises:
-        ConfigError: the folder holds a run of another recipe or on other data, or the weights to start from do not fit;
-            names what differs.
-        EstimationError: the loss or its gradient is not finite any more; the last good checkpoint is kept.
+        ConfigError: the folder holds a run of another recipe or on other data, or the initial weights do not fit; lists
+            what differs.
+        EstimationError: the loss or its gradient is not finite; the last good checkpoint is kept.
         DataError: the folder's checkpoint cannot be read.
     """
     options = options or RunOptions()
@@ -203,13 +203,13 @@ class _Run:
             save_weights(self.out / WEIGHTS, self.network, self.recipe, self._origin())
 
     def _step(self, indices: list[int], batch: PairBatch) -> tuple[float, float]:
-        """One step of the optimiser; the loss and the mean distance over all processes' pairs."""
+        """Take one step; return the mean loss and the mean distance over the pairs of all processes."""
         settings = self.recipe.optimiser
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(settings, self.step / self.steps_an_epoch)
         batch = batch.to(self.place.device)
         value: LossValue = self.objective(batch)
-        counted = self.place.rank < len(indices)  # whether this share is not a repetition
+        counted = self.place.rank < len(indices)  # else this share repeats a pair, see Feed
         share = value.total.sum() / len(indices) * float(counted)
         self.optimiser.zero_grad(set_to_none=True)
         torch.autograd.backward(share * self.place.count)  # gradients are averaged over processes
@@ -280,5 +280,5 @@ def _checkpoint_in(out: Path, recipe: Recipe, pairs: int) -> Checkpoint | None:
     if found.data != pairs:
         differing.append(f"pairs: {found.data} → {pairs}")
     if differing:
-        raise ConfigError(f"{path}: of another run ({'; '.join(differing)}); give another folder, or delete it")
+        raise ConfigError(f"{path}: of another run ({'; '.join(differing)}); choose another folder, or delete it")
     return found

@@ -1,4 +1,4 @@
-"""How good a network is on pairs with known truth: the error left in a step, and the drift of the steps in a row."""
+"""Validation of a network on pairs with a reference: the error of a step, and the drift of chained steps."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from hybridlio.learned.training.objective import objective
 
 @dataclass(frozen=True)
 class Validation:
-    """Figures over a set of pairs; those that need truth are None where there is none.
+    """Figures over a set of pairs; without a reference only the first two.
 
     Attributes:
         loss: mean over the pairs.
-        po2pl_m: mean distance to the matched planes.
-        rotation_rms_deg, translation_rms_m: root mean square over pairs of the error left.
-        initial_rotation_rms_deg, initial_translation_rms_m: the same before the residual.
+        po2pl_m: mean distance to the matched planes, in metres.
+        rotation_rms_deg, translation_rms_m: root mean square of the error of a step.
+        initial_rotation_rms_deg, initial_translation_rms_m: the same of the LSTMs' or given initial pose.
         t_rel_percent, r_rel_deg_per_100m: KITTI drift of the chained steps, averaged over recordings.
     """
 
@@ -41,7 +41,7 @@ class Validation:
 
     @property
     def score(self) -> float:
-        """What selects weights, lower is better: t_rel [%] + r_rel [°/100 m], or where drift is not known, the loss."""
+        """What selects weights, lower is better: t_rel [%] + r_rel [°/100 m], or the loss where drift is unknown."""
         if self.t_rel_percent is None or self.r_rel_deg_per_100m is None:
             return self.loss
         return self.t_rel_percent + self.r_rel_deg_per_100m
@@ -49,10 +49,10 @@ class Validation:
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """What a network says of every pair, in their order.
+    """A network's estimates of all pairs, in their order.
 
     Attributes:
-        poses, initial, reference: ``(N, 4, 4)``; the reference is NaN where not known.
+        poses, initial, reference: ``(N, 4, 4)``; the reference is NaN where unknown.
         loss, po2pl_m: ``(N,)``.
     """
 
@@ -71,7 +71,7 @@ def run_steps(
     device: torch.device | str = "cpu",
     progress: Callable[[int, int], None] | None = None,
 ) -> Steps:
-    """Estimate every pair. Initial poses are shaken as in training, by draws of seed 0."""
+    """Estimate every pair, with initial poses perturbed as in training, by draws of seed 0."""
     was_training, size = network.training, recipe.optimiser.batch
     network.eval()
     parts: list[tuple[Array, ...]] = []
@@ -89,7 +89,7 @@ def run_steps(
 
 
 def validate(network: OdometryNetwork, pairs: Pairs, recipe: Recipe, device: torch.device | str = "cpu") -> Validation:
-    """Run the network over pairs and compare with the truth where it is known."""
+    """Run the network over pairs and compare with the reference where there is one."""
     steps = run_steps(network, pairs, recipe, device)
     known = np.isfinite(steps.reference).all(axis=(1, 2))
     loss, po2pl = float(steps.loss.mean()), float(steps.po2pl_m.mean())
@@ -101,7 +101,7 @@ def validate(network: OdometryNetwork, pairs: Pairs, recipe: Recipe, device: tor
 
 
 def step_errors(poses: Array, reference: Array) -> tuple[float, float]:
-    """Root mean square of the rotation (degrees) and translation (metres) left between poses ``(N, 4, 4)``."""
+    """Return the root mean square error of poses ``(N, 4, 4)`` in degrees and in metres."""
     error = se3.between(reference, poses)
     angles = np.linalg.norm(se3.so3_log(error[:, :3, :3]), axis=1)
     distances = np.linalg.norm(error[:, :3, 3], axis=1)
@@ -109,7 +109,7 @@ def step_errors(poses: Array, reference: Array) -> tuple[float, float]:
 
 
 def _drift(pairs: Pairs, steps: Steps) -> tuple[float | None, float | None]:
-    """Drift by recording, averaged; None where none is without gaps and long enough."""
+    """Return the mean drift over recordings without gaps that are long enough, or None."""
     places = [pairs.where(i) for i in range(len(pairs))]
     found = []
     for shard in pairs.shards:
