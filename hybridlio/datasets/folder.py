@@ -5,7 +5,7 @@ recording/
                                  or directly in recording/
     timestamps.txt or times.txt  one stamp per scan, see `stamps.read_stamps`
     imu.csv                      optional, see `imu_csv`
-    calibration.yaml             needed with imu.csv, see `read_calibration_yaml`
+    calibration.yaml             needed with imu.csv, see `calibration_yaml`
     poses_tum.txt                optional reference: lidar poses on the scans' clock, TUM format
     gps.csv                      optional, see `gps_csv`
 """
@@ -18,13 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Stamps
 from hybridlio.core.errors import DataError
-from hybridlio.core.files import read_yaml
-from hybridlio.core.lidar_models import LIDAR_MODELS, LidarModel
-from hybridlio.core.sensors import Calibration, ImuSamples
+from hybridlio.core.sensors import NS_PER_S, ImuSamples
 from hybridlio.core.trajectory_files import read_tum
+from hybridlio.datasets.calibration_yaml import read_calibration_yaml
 from hybridlio.datasets.gps_csv import note_fixes, read_gps_csv
 from hybridlio.datasets.imu_csv import read_imu_csv
 from hybridlio.datasets.kitti.vertical_angle import raised
@@ -41,16 +39,12 @@ from hybridlio.datasets.stamps import (
     usable_scans,
 )
 
-LAYOUT = "a folder with timestamps.txt, and scans .bin, .npy, .pcd or .ply in it or in scans/"
+LAYOUT = f"a folder with timestamps.txt, and scans in it or in scans/ ({', '.join(SUFFIXES)})"
 
 _SCAN_FOLDERS = ("scans", "lidar", "points", "velodyne", "data", ".")  # the folder itself last: a map may be in it
 _MAX_LEVER_ARM_M = 20.0  # from IMU to lidar on any vehicle; more is another unit, such as millimetres
 _MAX_UPSIDE_DOWN = -0.5  # cosine of the angle between the specific force and the lidar's z axis: 120°, no hill
 _STAMP_FILES = ("timestamps.txt", "times.txt")
-_HOW_TO_CALIBRATE = (
-    "write the transform T_imu_lidar, which maps lidar points into the IMU's frame, such as\n"
-    "T_imu_lidar:\n  - [1, 0, 0, 0.1]\n  - [0, 1, 0, 0.0]\n  - [0, 0, 1, 0.3]\n  - [0, 0, 0, 1]"
-)
 
 
 def find(path: Path) -> dict[str, Path]:
@@ -59,13 +53,19 @@ def find(path: Path) -> dict[str, Path]:
     return {p.resolve().name: p for p in here}
 
 
-def open_folder(folder: Path, raw_root: Path | None = None, vertical_angle_deg: float | None = None) -> Sequence:
+def open_folder(
+    folder: Path,
+    raw_root: Path | None = None,
+    vertical_angle_deg: float | None = None,
+    rate_hz: float | None = None,
+) -> Sequence:
     """Open one recording in the layout above.
 
     Args:
         folder: the recording's folder.
         raw_root: not used.
         vertical_angle_deg: angle by which points are raised; none by default.
+        rate_hz: scans per second, if there is no file of stamps; ``rate_hz`` of ``calibration.yaml`` by default.
 
     Raises:
         DataError: stamps are missing or not one per scan, ``imu.csv`` has no ``T_imu_lidar``, or a file is malformed;
@@ -75,11 +75,12 @@ def open_folder(folder: Path, raw_root: Path | None = None, vertical_angle_deg: 
     del raw_root
     folder = folder.resolve()
     notes = Notes(folder.name)
-    stamps, paths = _stamped(folder, _scan_files(folder), notes)
     imu = read_imu_csv(folder / "imu.csv", notes) if (folder / "imu.csv").is_file() else ImuSamples.empty()
-    calibration, lidar = read_calibration_yaml(folder / "calibration.yaml", needs_imu=len(imu) > 0)
+    stated = read_calibration_yaml(folder / "calibration.yaml", needs_imu=len(imu) > 0)
+    stamps, paths = _stamped(folder, _scan_files(folder), stated.rate_hz if rate_hz is None else rate_hz, notes)
     if len(imu):
-        _note_mounting(imu, calibration.T_imu_lidar, notes)
+        imu = _on_scans_clock(imu, stated.imu_time_offset_ns, notes)
+        _note_mounting(imu, stated.calibration.T_imu_lidar, notes)
     else:
         notes.add(f"no inertial data: {folder / 'imu.csv'} does not exist")
     note_coverage(imu.stamps_ns, stamps, "inertial data", notes)
@@ -89,12 +90,13 @@ def open_folder(folder: Path, raw_root: Path | None = None, vertical_angle_deg: 
     return Sequence(
         name=folder.name,
         stamps_ns=stamps,
-        load_scan=raised(open_point_files(paths, stamps, notes), vertical_angle_deg),
+        load_scan=raised(open_point_files(paths, stamps, notes, stated.layout, stated.format), vertical_angle_deg),
         imu=imu,
-        calibration=calibration,
+        calibration=stated.calibration,
         reference=poses_at(stamps, poses.stamps_ns, poses.poses, "rows of poses_tum.txt", notes) if poses else None,
         gps=gps,
-        lidar=lidar,
+        lidar=stated.lidar,
+        imu_noise=stated.imu_noise,
         notes=tuple(notes.texts),
     )
 
@@ -116,7 +118,9 @@ def _scan_files(folder: Path) -> tuple[Path, ...]:
     return ()
 
 
-def _stamped(folder: Path, paths: tuple[Path, ...], notes: Notes) -> tuple[Stamps, tuple[Path, ...]]:
+def _stamped(
+    folder: Path, paths: tuple[Path, ...], rate_hz: float | None, notes: Notes
+) -> tuple[Stamps, tuple[Path, ...]]:
     """Return stamps and files of the scans, without those whose stamps do not increase."""
     if not paths:
         raise DataError(f"{folder}: no scans ({', '.join(SUFFIXES)})")
@@ -124,9 +128,15 @@ def _stamped(folder: Path, paths: tuple[Path, ...], notes: Notes) -> tuple[Stamp
     if len(suffixes) > 1:
         raise DataError(f"{paths[0].parent}: scans of several kinds ({', '.join(suffixes)}); keep one kind per folder")
     files = _stamp_files(folder)
+    if not files and rate_hz is not None:
+        notes.add(
+            f"no {' or '.join(_STAMP_FILES)}: scans are taken to be evenly spaced, {rate_hz:g} a second, from 0 s"
+        )
+        return np.round(np.arange(len(paths)) * (NS_PER_S / rate_hz)).astype(np.int64), paths
     if not files:
         raise DataError(
-            f"{folder}: no {' or '.join(_STAMP_FILES)}; write one stamp per line, in seconds, for each scan"
+            f"{folder}: no {' or '.join(_STAMP_FILES)}; write one stamp per line, in seconds, for each scan, or for "
+            "scans at a constant rate give --rate 10 ('rate_hz: 10' in calibration.yaml)"
         )
     stamps = read_stamps(files[0])
     if len(stamps) != len(paths) or (stamps == MISSING_STAMP).any():
@@ -137,6 +147,14 @@ def _stamped(folder: Path, paths: tuple[Path, ...], notes: Notes) -> tuple[Stamp
         notes.add(f"dropped {len(paths) - len(keep)} scans whose stamps repeat or go backwards, first {first}")
     note_gaps(stamps[keep], "scans", notes, SCAN_GAP_FACTOR)
     return stamps[keep], tuple(paths[k] for k in keep)
+
+
+def _on_scans_clock(imu: ImuSamples, offset_ns: int, notes: Notes) -> ImuSamples:
+    """Return the samples with their stamps moved by the stated offset of the clocks."""
+    if not offset_ns:
+        return imu
+    notes.found(f"IMU stamps are moved by {offset_ns / NS_PER_S:+.6f} s, as calibration.yaml states")
+    return ImuSamples(imu.stamps_ns + offset_ns, imu.gyro_rad_s, imu.accel_m_s2)
 
 
 def _note_mounting(imu: ImuSamples, T_imu_lidar: Array, notes: Notes) -> None:
@@ -150,60 +168,3 @@ def _note_mounting(imu: ImuSamples, T_imu_lidar: Array, notes: Notes) -> None:
             "the specific force points down in the lidar's frame, whose z axis must be up; check T_imu_lidar, and that "
             "the accelerometer at rest reads +9.81 on the axis that points up"
         )
-
-
-def read_calibration_yaml(path: Path, needs_imu: bool = False) -> tuple[Calibration, LidarModel | None]:
-    """Read extrinsics and lidar from a ``calibration.yaml``.
-
-    Keys, all optional: ``T_imu_lidar`` and ``T_camera_lidar``, four rows of four numbers in metres; ``antenna_imu_m``,
-    the GPS antenna in the IMU frame, three numbers; ``lidar``, a name of
-    :data:`hybridlio.core.sensors.LIDAR_MODELS`. Without ``T_imu_lidar`` it is the identity, the others are None.
-
-    Args:
-        path: the file, which need not exist.
-        needs_imu: whether there are inertial data, which need ``T_imu_lidar``.
-
-    Raises:
-        DataError: the file is not YAML, a key or lidar is unknown, a value has another shape, a matrix is no rigid
-            transform, or ``T_imu_lidar`` is needed and missing.
-    """
-    content = read_yaml(path) if path.is_file() else {}
-    known = ("T_imu_lidar", "T_camera_lidar", "lidar", "antenna_imu_m")
-    if not isinstance(content, dict):
-        raise DataError(f"{path}: expected a mapping; {_HOW_TO_CALIBRATE}")
-    if unknown := [key for key in content if key not in known]:
-        raise DataError(f"{path}: unknown key {unknown[0]!r}; the keys are {', '.join(known)}")
-    lidar = content.get("lidar")
-    if lidar is not None and str(lidar) not in LIDAR_MODELS:
-        raise DataError(f"{path}: unknown lidar {lidar!r}; known: {', '.join(LIDAR_MODELS)}")
-    T_imu_lidar, T_camera_lidar = (_matrix(path, name, content.get(name)) for name in known[:2])
-    if T_imu_lidar is None and needs_imu:
-        what = "lacks T_imu_lidar" if path.is_file() else "missing"
-        raise DataError(f"{path}: {what}, and imu.csv needs it: {_HOW_TO_CALIBRATE}")
-    antenna = _antenna(path, content.get("antenna_imu_m"))
-    calibration = Calibration(np.eye(4) if T_imu_lidar is None else T_imu_lidar, T_camera_lidar, antenna)
-    return calibration, LIDAR_MODELS[lidar] if lidar else None
-
-
-def _matrix(path: Path, name: str, value: Any) -> Array | None:
-    if value is None:
-        return None
-    try:
-        matrix = np.array(value, dtype=np.float64)
-    except (ValueError, TypeError):
-        matrix = np.empty(0)
-    if matrix.shape != (4, 4):
-        raise DataError(f"{path}: {name} must be four rows of four numbers; {_HOW_TO_CALIBRATE}")
-    return se3.check_pose(matrix, f"{path}: {name}")
-
-
-def _antenna(path: Path, value: Any) -> Array | None:
-    if value is None:
-        return None
-    try:
-        antenna = np.array(value, dtype=np.float64)
-    except (ValueError, TypeError):
-        antenna = np.empty(0)
-    if antenna.shape != (3,) or not np.isfinite(antenna).all():
-        raise DataError(f"{path}: antenna_imu_m must be three finite numbers, the GPS antenna in the IMU's frame")
-    return antenna

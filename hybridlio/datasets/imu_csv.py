@@ -2,69 +2,120 @@
 
 from __future__ import annotations
 
-from decimal import InvalidOperation
+from decimal import Decimal, InvalidOperation
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from hybridlio.core.arrays import Array, Stamps
 from hybridlio.core.errors import DataError
-from hybridlio.core.sensors import ImuSamples
+from hybridlio.core.sensors import NS_PER_S, ImuSamples
 from hybridlio.datasets.csv_rows import read_csv
+from hybridlio.datasets.imu_columns import STANDARD_GRAVITY_M_S2, ColumnError, ImuColumns, imu_columns
 from hybridlio.datasets.notes import Notes
-from hybridlio.datasets.stamps import IMU_GAP_FACTOR, note_gaps, seconds_ns, sorted_unique
+from hybridlio.datasets.stamps import IMU_GAP_FACTOR, note_gaps, sorted_unique
 
-_STANDARD_GRAVITY_M_S2 = 9.80665  # the unit g, by definition; not the gravity of a place
 _PLAUSIBLE_FORCE_M_S2 = (5.0, 20.0)  # of the median: half to twice gravity; values in g (1) or mm/s² (9810) are outside
 _MAX_RATE_RAD_S = 6.0  # 95 % quantile; a turn per second is beyond vehicles and hands, but 6 °/s taken for rad/s is not
-_UNITS = {
-    "g": {"": 1.0, "_rad_s": 1.0, "_deg_s": np.pi / 180},
-    "a": {"": 1.0, "_m_s2": 1.0, "_g": _STANDARD_GRAVITY_M_S2},
-}
-_EXPECTED = "stamp_ns (or t_s), gx gy gz (rad/s; or gx_deg_s …), ax ay az (m/s²; or ax_g …)"
+_NO_RATE_RAD_S = 35.0  # 95 % quantile: 2000 °/s, the full scale of usual gyroscopes, so the unit is °/s
+_ONE_G = (0.8, 1.25)  # of the median force: gravity in g, and some motion
+_STEPS_NS = (500_000, 400_000_000)  # between samples, 2.5 Hz to 2 kHz: units are 1000 apart, so at most one fits
+_EXPECTED = (
+    "a time (stamp_ns, t_s, timestamp …), gx gy gz (rad/s; or gx_deg_s …) and ax ay az (m/s²; or ax_g …), or the names "
+    "of ROS or EuRoC"
+)
+_TIME_UNITS = {"ns": 1, "us": 1000, "ms": 1_000_000, "s": NS_PER_S}
 
 
 def read_imu_csv(path: Path, notes: Notes) -> ImuSamples:
     """Read IMU samples from a CSV file, sorted by time.
 
-    Columns, in any order; others are ignored:
+    Columns, in any order, by the names of :mod:`hybridlio.datasets.imu_columns`; others are ignored:
 
-    * ``stamp_ns`` (whole nanoseconds) or ``t_s`` (seconds), on the scans' clock;
-    * angular velocity in the IMU frame: ``gx gy gz`` in rad/s, or ``gx_deg_s gy_deg_s gz_deg_s``;
-    * specific force in the IMU frame (+9.81 at rest on the axis that points up): ``ax ay az`` in m/s², or ``ax_g …``.
+    * the time, on the scans' clock. Without a unit in the header it is found from the distance between samples;
+    * angular velocity in the IMU frame, in rad/s unless the header says otherwise or values are beyond 2000 °/s;
+    * specific force in the IMU frame (+9.81 at rest on the axis that points up), in m/s² unless the header says
+      otherwise or its median is 1 g.
 
-    Repeated stamps and rows that are not finite are dropped. Both are noted, as are gaps and implausible units.
+    Repeated stamps and rows that are not finite are dropped. Both are noted, as are gaps, units that were found from
+    the values, and implausible units.
 
     Raises:
         DataError: a column is missing, a row is malformed, or no row is finite; the message names file and line.
     """
     header, rows = read_csv(path)
-    time_column, columns = _columns(path, header)
-    stamps = np.empty(len(rows), dtype=np.int64)
+    try:
+        columns = imu_columns(header)
+    except ColumnError as error:
+        found = ", ".join(header) or "nothing"
+        raise DataError(f"{path}: the header must name {_EXPECTED}; it {error}; found: {found}") from None
+    times: list[int | Decimal] = []
     values = np.empty((len(rows), 6))
     for k, (line, row) in enumerate(rows):
         try:
-            stamps[k] = _stamp_ns(row[time_column], header[time_column])
-            values[k] = [float(row[column]) * scale for column, scale in columns]
+            times.append(_time(row, columns))
+            values[k] = [float(row[column]) * (scale or 1.0) for column, scale in columns.values]
         except (ValueError, InvalidOperation, OverflowError):
             raise DataError(f"{path}, line {line}: expected numbers, found {','.join(row)[:80]}") from None
-    return clean_imu(str(path), stamps, values, notes)
+    stamps = _stamps(path, times, columns, header, notes)
+    return clean_imu(str(path), stamps, _in_si_units(path, values, columns, notes), notes)
 
 
-def _columns(path: Path, header: list[str]) -> tuple[int, list[tuple[int, float]]]:
-    """Return the column of the time, and for gx gy gz ax ay az the column and the factor to rad/s or m/s²."""
-    times = [header.index(name) for name in ("stamp_ns", "t_s") if name in header]
-    found = []
-    for kind, axis in ((kind, axis) for kind in "ga" for axis in "xyz"):
-        names = {kind + axis + unit: scale for unit, scale in _UNITS[kind].items()}
-        found += [(header.index(name), scale) for name, scale in names.items() if name in header][:1]
-    if not times or len(found) != 6:
-        raise DataError(f"{path}: the header must name {_EXPECTED}; found: {', '.join(header) or 'nothing'}")
-    return times[0], found
+def _time(row: list[str], columns: ImuColumns) -> int | Decimal:
+    """Return a row's time: an integer for nanoseconds, else decimal in the header's unit, both exact."""
+    text = row[columns.time].strip()
+    if columns.nanoseconds is not None:
+        return int(text) * NS_PER_S + int(row[columns.nanoseconds])
+    if columns.time_unit_ns == 1:
+        return int(text)
+    value = Decimal(text)
+    if not value.is_finite():
+        raise ValueError(text)
+    return value
 
 
-def _stamp_ns(text: str, name: str) -> int:
-    return int(text) if name == "stamp_ns" else seconds_ns(text.strip())
+def _stamps(path: Path, times: list[int | Decimal], columns: ImuColumns, header: list[str], notes: Notes) -> Stamps:
+    """Return the stamps in nanoseconds; without a unit in the header, that in which samples are usually spaced."""
+    unit_ns = 1 if columns.nanoseconds is not None else columns.time_unit_ns
+    if unit_ns is None:
+        steps = [float(abs(Decimal(b) - Decimal(a))) for a, b in pairwise(times) if a != b]
+        step = float(np.median(steps)) if steps else 0.0
+        fitting = [unit for unit, ns in _TIME_UNITS.items() if _STEPS_NS[0] <= step * ns <= _STEPS_NS[1]]
+        if times and len(fitting) != 1:
+            name = header[columns.time]
+            raise DataError(
+                f"{path}: the unit of '{name}' cannot be told, samples are {step:g} apart; name the column {name}_s, "
+                f"{name}_ms, {name}_us or {name}_ns"
+            )
+        if times:
+            unit_ns = _TIME_UNITS[fitting[0]]
+            notes.found(f"{path}: '{header[columns.time]}' is read in {fitting[0]}, samples are {step:g} apart")
+    try:
+        return np.array([round(time * (unit_ns or 1)) for time in times], dtype=np.int64)
+    except OverflowError:
+        raise DataError(f"{path}: a time is beyond the range of int64 nanoseconds; check its unit") from None
+
+
+def _in_si_units(path: Path, values: Array, columns: ImuColumns, notes: Notes) -> Array:
+    """Return the values in rad/s and m/s², where the header gives no unit and the values leave no doubt."""
+    finite = values[np.isfinite(values).all(axis=1)]
+    if not len(finite):
+        return values
+    factors = np.ones(6)
+    force = float(np.median(np.linalg.norm(finite[:, 3:], axis=1)))
+    rate = float(np.quantile(np.linalg.norm(finite[:, :3], axis=1), 0.95))
+    stated = [scale is not None for _, scale in columns.values]
+    for unit, size in (("g", 1.0), ("mg", 1000.0)):
+        if not any(stated[3:]) and _ONE_G[0] * size < force < _ONE_G[1] * size:
+            factors[3:] = STANDARD_GRAVITY_M_S2 / size
+            notes.add(
+                f"{path}: the median specific force is {force:.3g}: read in {unit}; columns in m/s² have 9.8 there"
+            )
+    if not any(stated[:3]) and rate > _NO_RATE_RAD_S:
+        factors[:3] = np.pi / 180
+        notes.add(f"{path}: angular velocities reach {rate:.0f}: read in °/s, as no gyroscope measures so many rad/s")
+    return values * factors
 
 
 def clean_imu(source: str, stamps: Stamps, values: Array, notes: Notes) -> ImuSamples:

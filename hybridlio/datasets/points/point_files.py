@@ -20,8 +20,7 @@ from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.points import pcd, ply, tables
 from hybridlio.datasets.points.bin_layout import BinLayout, column_names, find_layout
 from hybridlio.datasets.points.fields import Columns
-from hybridlio.datasets.points.point_format import PointFormat, find_format, sampled
-from hybridlio.datasets.points.point_times import StatedTimes
+from hybridlio.datasets.points.point_format import PointFormat, StatedFormat, find_format, sampled
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply", ".las", ".laz", ".feather", ".parquet")
 
@@ -71,7 +70,7 @@ def open_point_files(
     stamps_ns: Stamps,
     notes: Notes,
     layout: BinLayout | None = None,
-    times: StatedTimes | None = None,
+    stated: StatedFormat | None = None,
 ) -> PointFiles:
     """Look at some scans of a recording, and return the loader of all.
 
@@ -80,7 +79,7 @@ def open_point_files(
         stamps_ns: ``(N,)`` int64.
         notes: receives what was found.
         layout: the columns of ``.bin`` files; found by default.
-        times: what the user states about the points' times.
+        stated: what the user states about the points.
 
     Raises:
         DataError: the columns or their meaning cannot be found. A scan that cannot be read is passed over here; its
@@ -100,7 +99,7 @@ def open_point_files(
     if errors and not samples:
         raise DataError(errors[0])
     try:
-        found = find_format(samples, step_ns, notes, times)
+        found = find_format(samples, step_ns, notes, stated)
     except DataError as error:
         raise DataError(_at(paths[0].parent if len(paths) > 1 else paths[0], error)) from None
     return PointFiles(paths, stamps_ns, layout, step_ns, found)

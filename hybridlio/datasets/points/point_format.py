@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,19 @@ _MIN_CODE_ELEVATIONS_RAD = 0.03  # standard deviation: a code fills many beams, 
 
 
 @dataclass(frozen=True)
+class StatedFormat:
+    """What a user states about points; None where it is to be found.
+
+    Attributes:
+        times: about their times.
+        limits_m: smallest and largest range of points to use.
+    """
+
+    times: StatedTimes | None = None
+    limits_m: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
 class PointFormat:
     """How the columns of a recording's scans are read.
 
@@ -36,11 +49,13 @@ class PointFormat:
         scale_m: metres in one unit of x, y and z.
         no_return_m: range at which the sensor writes beams without a return, or None.
         times: the convention of the points' times; None if there are none.
+        limits_m: smallest and largest range of points to use, as the user states; None for all.
     """
 
     scale_m: float = 1.0
     no_return_m: float | None = None
     times: PointTimes | None = None
+    limits_m: tuple[float, float] | None = None
 
     def scan(self, columns: Columns, stamp_ns: int) -> Scan:
         """Return the scan of the columns, without points that are not finite, at the origin or no returns.
@@ -69,6 +84,9 @@ class PointFormat:
         keep = np.asarray(np.isfinite(points).all(axis=1) & points.any(axis=1), dtype=bool)
         if self.no_return_m is not None:
             keep &= np.abs(_ranges(points) - self.no_return_m) > _SAME_RANGE_M
+        if self.limits_m is not None:
+            ranges = _ranges(points)
+            keep &= (ranges >= self.limits_m[0]) & (ranges <= self.limits_m[1])
         return keep
 
 
@@ -89,7 +107,7 @@ def sampled(count: int) -> list[int]:
 
 
 def find_format(
-    samples: Sequence[tuple[int, Columns]], step_ns: int | None, notes: Notes, stated: StatedTimes | None = None
+    samples: Sequence[tuple[int, Columns]], step_ns: int | None, notes: Notes, stated: StatedFormat | None = None
 ) -> PointFormat:
     """Find the format of a recording from stamp and columns of some of its scans; note what is unusual.
 
@@ -97,23 +115,24 @@ def find_format(
         samples: at the indices of :func:`sampled`, without scans that cannot be read.
         step_ns: median distance between the stamps; None if there is one scan.
         notes: receives the findings.
-        stated: what the user states about the points' times.
+        stated: what the user states.
 
     Raises:
         DataError: x, y or z is missing, or the meaning of the points' times is not clear.
     """
+    stated = stated or StatedFormat()
     scale_m = _scale_m([coordinates(columns) for _, columns in samples], notes)
     plain = PointFormat(scale_m)
     clouds = [plain._points(columns) for _, columns in samples]
     zeros = float(np.mean([(~cloud.any(axis=1)).mean() for cloud in clouds if len(cloud)] or [0.0]))
     if zeros:
         notes.found(f"points at the origin, {zeros:.1%} of a scan, are left out: beams without a return")
-    found = PointFormat(scale_m, _no_return_m(clouds, notes))
+    found = PointFormat(scale_m, _no_return_m(clouds, notes), None, stated.limits_m)
     valid = []
     for (stamp, columns), cloud in zip(samples, clouds, strict=True):
         keep = found._returns(cloud)
         valid.append((stamp, {name: values[keep] for name, values in columns.items()}))
-    return PointFormat(scale_m, found.no_return_m, find_point_times(valid, step_ns, notes, stated))
+    return replace(found, times=find_point_times(valid, step_ns, notes, stated.times))
 
 
 def _scale_m(clouds: list[NDArray[Any]], notes: Notes) -> float:

@@ -11,7 +11,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.lidar_models import LidarModel
 from hybridlio.core.sensors import Calibration
-from hybridlio.datasets.folder import read_calibration_yaml
+from hybridlio.datasets.calibration_yaml import read_calibration_yaml
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.rosbag.bag import Bag, Topic
 from hybridlio.datasets.rosbag.topics import TRANSFORM_TYPES, BagTopics
@@ -59,7 +59,8 @@ class Mounting:
             DataError: the file is malformed, or there is an IMU and no transform.
         """
         file = calibration_file(self.bag.path)
-        given, model = read_calibration_yaml(file)
+        stated = read_calibration_yaml(file)
+        given, model = stated.calibration, stated.lidar
         T_imu_lidar = given.T_imu_lidar
         if has_imu and not _has_key(file, "T_imu_lidar"):
             T_imu_lidar = self._imu_lidar(file)

@@ -103,7 +103,7 @@ class TestInertialData:
 
     def test_a_specific_force_far_from_gravity_is_noted(self, recordings: Any, folder: Path) -> None:
         imu = recordings.ride.imu(recordings.ride.imu_stamps_ns(10))
-        csv = recordings.imu_csv(type(imu)(imu.stamps_ns, imu.gyro_rad_s, imu.accel_m_s2 / 9.81))
+        csv = recordings.imu_csv(type(imu)(imu.stamps_ns, imu.gyro_rad_s, imu.accel_m_s2 / 100))
         (folder / "imu.csv").write_text(csv)
         assert any("check the unit" in note for note in open_sequence(folder).notes)
 
@@ -149,7 +149,12 @@ class TestInertialData:
         [
             ("", "header"),
             ("stamp_ns,gx,gy,gz,ax,ay\n", "header must name"),
-            ("time,gx,gy,gz,ax,ay,az\n", "stamp_ns"),
+            ("gx,gy,gz,ax,ay,az\n", "lacks a time such as stamp_ns"),
+            ("when,gx,gy,gz,ax,ay,az\n", "lacks a time such as stamp_ns"),
+            ("t_s,gx,gy,ax,ay,az\n", "lacks gz"),
+            ("t_s,gx (turns),gy,gz,ax,ay,az\n", r"unknown unit 'turns' in 'gx \(turns\)'; known: rad/s"),
+            ("t_h,gx,gy,gz,ax,ay,az\n", "lacks a time"),
+            ("t (h),gx,gy,gz,ax,ay,az\n", "unknown unit 'h'"),
             ("stamp_ns,gx,gy,gz,ax,ay,az\n", "no row"),
             ("stamp_ns,gx,gy,gz,ax,ay,az\n1,0,0,0,0,0,9\n2,0,0,0,0,9\n", "line 3"),
             ("stamp_ns,gx,gy,gz,ax,ay,az\n1,0,0,0,0,0,up\n", "line 2"),

@@ -1,0 +1,182 @@
+"""The file ``calibration.yaml`` of a plain folder: extrinsics, sensors, and what the files' columns mean."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from hybridlio.core.arrays import Array
+from hybridlio.core.errors import DataError
+from hybridlio.core.files import read_yaml
+from hybridlio.core.lidar_models import LIDAR_MODELS, LidarModel
+from hybridlio.core.sensors import MAX_RANGE_M, NS_PER_S, Calibration, ImuNoise
+from hybridlio.core.setting_checks import SettingError
+from hybridlio.datasets.points.bin_layout import BinLayout, stated_layout
+from hybridlio.datasets.points.point_format import StatedFormat
+from hybridlio.datasets.points.point_times import NORMALISED, ORIGINS, UNITS_NS, StatedTimes
+from hybridlio.datasets.transform_forms import HOW_TO_WRITE, parse_transform
+
+_KEYS = (
+    *("T_imu_lidar", "T_camera_lidar", "lidar", "antenna_imu_m", "imu_time_offset_s", "imu_noise", "rate_hz"),
+    *("columns", "point_times"),
+)
+_LIDAR_KEYS = ("model", "min_range_m", "max_range_m")
+_TIMES_KEYS = ("column", "unit", "origin", "sweep_s")
+_MAX_TIME_OFFSET_S = 1e10  # of clocks that count from different years; larger ones are another unit
+_MAX_RATE_HZ = 500.0  # of scans; stamps under 2 ms apart are another unit
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True, eq=False)
+class StatedCalibration:
+    """What a ``calibration.yaml`` states; None where it is silent.
+
+    Attributes:
+        calibration: the extrinsics.
+        lidar: the lidar's model.
+        imu_noise: the IMU's noise densities.
+        imu_time_offset_ns: to add to the IMU's stamps to bring them to the scans' clock.
+        rate_hz: scans per second, for a folder without stamps.
+        layout: the columns of ``.bin`` scans.
+        format: what is stated about the points.
+    """
+
+    calibration: Calibration = field(default_factory=Calibration)
+    lidar: LidarModel | None = None
+    imu_noise: ImuNoise | None = None
+    imu_time_offset_ns: int = 0
+    rate_hz: float | None = None
+    layout: BinLayout | None = None
+    format: StatedFormat = field(default_factory=StatedFormat)
+
+
+def read_calibration_yaml(path: Path, needs_imu: bool = False) -> StatedCalibration:
+    """Read a ``calibration.yaml``.
+
+    Keys, all optional:
+
+    * ``T_imu_lidar`` and ``T_camera_lidar``: transforms in any form of :mod:`hybridlio.datasets.transform_forms`;
+      without ``T_imu_lidar`` it is the identity;
+    * ``antenna_imu_m``: the GPS antenna in the IMU frame, three numbers;
+    * ``lidar``: a name of :data:`hybridlio.core.lidar_models.LIDAR_MODELS`, or a mapping of ``model``, ``min_range_m``
+      and ``max_range_m``; points outside stated ranges are left out;
+    * ``imu_time_offset_s``: seconds to add to the IMU's stamps to bring them to the scans' clock;
+    * ``imu_noise``: noise densities by the names of :class:`hybridlio.core.sensors.ImuNoise`;
+    * ``rate_hz``: scans per second, for a folder without a file of stamps;
+    * ``columns``: see :func:`hybridlio.datasets.points.bin_layout.stated_layout`;
+    * ``point_times``: ``none``, or a mapping of the attributes of
+      :class:`hybridlio.datasets.points.point_times.StatedTimes`.
+
+    Args:
+        path: the file, which need not exist.
+        needs_imu: whether there are inertial data, which need ``T_imu_lidar``.
+
+    Raises:
+        DataError: the file is not YAML, a key or value is unknown, a transform is not rigid, or ``T_imu_lidar`` is
+            needed and missing; the message names the file.
+    """
+    content = read_yaml(path) if path.is_file() else {}
+    if not isinstance(content, dict):
+        raise DataError(f"{path}: expected a mapping; {HOW_TO_WRITE}")
+    if unknown := [key for key in content if key not in _KEYS]:
+        raise DataError(f"{path}: unknown key {unknown[0]!r}; the keys are {', '.join(_KEYS)}")
+    if content.get("T_imu_lidar") is None and needs_imu:
+        what = "lacks T_imu_lidar" if path.is_file() else "missing"
+        raise DataError(f"{path}: {what}, and imu.csv needs it: {HOW_TO_WRITE}")
+    try:
+        return _stated(content)
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from None
+
+
+def _stated(content: dict[str, Any]) -> StatedCalibration:
+    def read(key: str, parse: Callable[[str, Any], _T], default: _T) -> _T:
+        value = content.get(key)
+        return default if value is None else parse(key, value)
+
+    identity: Array = np.eye(4)
+    T_imu_lidar = read("T_imu_lidar", parse_transform, identity)
+    T_camera_lidar = read("T_camera_lidar", parse_transform, None)
+    lidar, limits_m = _lidar("lidar", content["lidar"]) if content.get("lidar") is not None else (None, None)
+    offset_s = read(
+        "imu_time_offset_s", lambda key, value: _number(key, value, -_MAX_TIME_OFFSET_S, _MAX_TIME_OFFSET_S), 0.0
+    )
+    return StatedCalibration(
+        calibration=Calibration(T_imu_lidar, T_camera_lidar, read("antenna_imu_m", _three_numbers, None)),
+        lidar=lidar,
+        imu_noise=read("imu_noise", _imu_noise, None),
+        imu_time_offset_ns=round(offset_s * NS_PER_S),
+        rate_hz=read("rate_hz", lambda key, value: _number(key, value, 0, _MAX_RATE_HZ), None),
+        layout=read("columns", lambda _, value: stated_layout(value), None),
+        format=StatedFormat(read("point_times", _point_times, None), limits_m),
+    )
+
+
+def _number(key: str, value: Any, above: float, most: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not above < value <= most:
+        raise DataError(f"{key}: expected a number above {above:g} and up to {most:g}, got {value!r}")
+    return float(value)
+
+
+def _mapping(key: str, value: Any, keys: tuple[str, ...]) -> dict[str, Any]:
+    if not isinstance(value, dict) or (unknown := [name for name in value if name not in keys]):
+        what = f"unknown key {unknown[0]!r}" if isinstance(value, dict) else f"got {value!r}"
+        raise DataError(f"{key}: expected a mapping of {', '.join(keys)}; {what}")
+    return value
+
+
+def _three_numbers(key: str, value: Any) -> Array:
+    try:
+        numbers = np.array(value, dtype=np.float64)
+    except (ValueError, TypeError):
+        numbers = np.empty(0)
+    if numbers.shape != (3,) or not np.isfinite(numbers).all():
+        raise DataError(f"{key} must be three finite numbers, the GPS antenna in the IMU's frame")
+    return numbers
+
+
+def _lidar(key: str, value: Any) -> tuple[LidarModel | None, tuple[float, float] | None]:
+    parts = {"model": value} if isinstance(value, str) else _mapping(key, value, _LIDAR_KEYS)
+    name = parts.get("model")
+    if name is not None and str(name) not in LIDAR_MODELS:
+        raise DataError(f"unknown lidar {name!r}; known: {', '.join(LIDAR_MODELS)}")
+    model = None if name is None else LIDAR_MODELS[str(name)]
+    unlimited = {"min_range_m": 0.0, "max_range_m": MAX_RANGE_M}
+    low, high = (
+        _number(f"{key}: {limit}", parts.get(limit, every), -np.inf, MAX_RANGE_M) for limit, every in unlimited.items()
+    )
+    if not 0 <= low < high:
+        raise DataError(f"{key}: expected 0 <= min_range_m < max_range_m, got {low:g} and {high:g}")
+    if not {"min_range_m", "max_range_m"} & parts.keys():
+        return model, None
+    stated = {name: float(parts[name]) for name in _LIDAR_KEYS[1:] if name in parts}
+    return None if model is None else replace(model, **stated), (low, high)  # type: ignore[arg-type]
+
+
+def _imu_noise(key: str, value: Any) -> ImuNoise:
+    values = _mapping(key, value, tuple(f.name for f in fields(ImuNoise)))
+    try:
+        return ImuNoise(**{name: _number(f"{key}: {name}", v, -np.inf, np.inf) for name, v in values.items()})
+    except SettingError as error:
+        raise DataError(f"{key}: {error}") from None
+
+
+def _point_times(key: str, value: Any) -> StatedTimes:
+    if value in ("none", False):
+        return StatedTimes(ignored=True)
+    parts = _mapping(key, value, _TIMES_KEYS)
+    unit = {"µs": "us", "normalized": NORMALISED}.get(parts.get("unit", ""), parts.get("unit"))
+    for name, stated, known in (("unit", unit, (*UNITS_NS, NORMALISED)), ("origin", parts.get("origin"), ORIGINS)):
+        if stated is not None and stated not in known:
+            raise DataError(f"{key}: unknown {name} {stated!r}; one of {', '.join(known)}")
+    column, sweep_s = parts.get("column"), parts.get("sweep_s")
+    return StatedTimes(
+        column=None if column is None else str(column).lower(),
+        unit=unit,
+        origin=parts.get("origin"),
+        sweep_s=None if sweep_s is None else _number(f"{key}: sweep_s", sweep_s, 0, 1),
+    )
