@@ -1,1 +1,1 @@
-"""The learned front end: PyTorch lives here and nowhere else."""
+"""The learned front end, the only part of the package that imports PyTorch."""

@@ -1,4 +1,4 @@
-"""Where to compute, by name."""
+"""Devices by name, and the set-up for inference."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from hybridlio.core.errors import ConfigError
 
 
 def pick_device(name: str = "auto") -> torch.device:
-    """The device of a name as PyTorch has it; ``auto`` is a GPU where there is one, else the CPU.
+    """Return a device by its PyTorch name; ``auto`` is a GPU where there is one, else the CPU.
 
     Raises:
-        ConfigError: there is no such device here.
+        ConfigError: this machine has no such device.
     """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -30,13 +30,13 @@ def pick_device(name: str = "auto") -> torch.device:
 
 
 def on_device(values: NDArray[np.float32] | NDArray[np.float64], device: torch.device) -> Tensor:
-    """Values as a float32 batch of one."""
+    """Return values as a float32 batch of one on a device."""
     return torch.from_numpy(np.asarray(values, np.float32))[None].to(device)
 
 
 @contextmanager
 def at_run_time() -> Iterator[None]:
-    """Without gradients, and on one thread: scan by scan a second gains nothing, and waits where cores are busy."""
+    """Disable gradients and use one thread: for single scans a second one gains nothing, and waits on busy cores."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

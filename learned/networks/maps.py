@@ -1,9 +1,8 @@
-"""Vertex and normal maps in PyTorch: batched, on any device, with gradients through what the cells hold.
+"""Vertex and normal maps in PyTorch: batched, on any device, with gradients through the contents of cells.
 
 The same cells as :mod:`hybridlio.cloud.projection` (UnDeepLIO, "Vertex map", "Normal map", "Mapping the point clouds of
-current frame to the last frame"). Which point a cell shows is a choice and has no gradient; the point's coordinates
-have, so the loss reaches the pose by which a map was moved. Geometry stays in single precision also where networks
-compute in half.
+current frame to the last frame"). The choice of a cell's point has no gradient; its coordinates have one, so the loss
+reaches the pose that moved a map. Geometry stays in single precision also where encoders compute in bfloat16.
 """
 
 from __future__ import annotations
@@ -24,9 +23,9 @@ _DEG = 180.0 / math.pi
 
 @torch.no_grad()
 def cells(points: Tensor, geometry: MapGeometry) -> tuple[Tensor, Tensor]:
-    """Flat cells ``(B, N)`` int64 that points ``(B, 3, N)`` fall into, and whether they fall into any ``(B, N)``.
+    """Return the flat cells ``(B, N)`` int64 of points ``(B, 3, N)``, and whether they lie in the map ``(B, N)``.
 
-    Points that are not finite, lie in the origin or outside the rows fall into none; their cell is 0.
+    Points that are not finite, at the origin or outside the rows do not; their cell is 0.
     """
     x, y, z = points.unbind(1)
     depth = (x * x + y * y + z * z).sqrt()
@@ -39,11 +38,11 @@ def cells(points: Tensor, geometry: MapGeometry) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def winners(points: Tensor, geometry: MapGeometry) -> Tensor:
-    """Which point each cell shows: the index of the nearest ``(B, H·W)`` int64, −1 where a cell is empty.
+    """Return the index of the nearest point in each cell ``(B, H·W)`` int64, −1 for empty cells.
 
     Args:
-        points: ``(B, N, 3)`` float32 metres. Points that are not finite, lie in the origin or outside the rows are left
-            out. Of points equally near, the first wins.
+        points: ``(B, N, 3)`` float32 metres. Points that are not finite, at the origin or outside the rows are left
+            out. Of equally near points the first wins.
         geometry: the cells.
     """
     batch, count, _ = points.shape
@@ -51,9 +50,9 @@ def winners(points: Tensor, geometry: MapGeometry) -> Tensor:
     cell, inside = cells(points.float().transpose(1, 2), geometry)
     depth = points.float().square().sum(-1).sqrt()
     index = torch.arange(count, device=points.device)
-    # positive floats order like their bits: the least of (depth, index) in one integer is the nearest point
+    # positive floats sort like their bits, so the minimum of (depth, index) packed into an integer is the nearest point
     key = (depth.view(torch.int32).long() << _INDEX_BITS) | index
-    cell = torch.where(inside, cell, number)  # one cell more, thrown away, takes what is outside
+    cell = torch.where(inside, cell, number)  # an extra cell, dropped below, takes points outside
     nearest = torch.full((batch, number + 1), _FAR, dtype=torch.int64, device=points.device)
     nearest.scatter_reduce_(1, cell, key, reduce="amin")
     nearest = nearest[:, :number]
@@ -69,15 +68,15 @@ def gather(values: Tensor, chosen: Tensor, geometry: MapGeometry) -> Tensor:
 
 
 def vertex_map(points: Tensor, geometry: MapGeometry) -> Tensor:
-    """Vertex maps ``(B, 3, H, W)`` of points ``(B, N, 3)``, metres: each cell's nearest point, 0 where there is none.
+    """Return vertex maps ``(B, 3, H, W)`` of points ``(B, N, 3)`` in metres: the nearest point of each cell, or 0.
 
-    Pad clouds of different sizes with zeros: a point in the origin falls into no cell.
+    Pad clouds of different sizes with zeros: a point at the origin falls into no cell.
     """
     return gather(points, winners(points, geometry), geometry)
 
 
 def valid_cells(maps: Tensor) -> Tensor:
-    """Cells ``(B, H, W)`` of maps ``(B, C, H, W)`` that hold something."""
+    """Return which cells ``(B, H, W)`` of maps ``(B, C, H, W)`` are not empty."""
     first, *others = maps.unbind(-3)
     found = first != 0
     for channel in others:  # twice as fast as any() along them
@@ -86,25 +85,25 @@ def valid_cells(maps: Tensor) -> Tensor:
 
 
 def as_points(maps: Tensor) -> Tensor:
-    """The cells of maps ``(B, 3, H, W)`` as a list ``(B, H·W, 3)``, row by row."""
+    """Return the cells of maps ``(B, 3, H, W)`` as a list ``(B, H·W, 3)``, row by row."""
     return maps.flatten(2).transpose(1, 2)
 
 
 def normal_map(vertices: Tensor) -> Tensor:
-    """Normal maps ``(B, 3, H, W)`` of vertex maps: unit normals towards the sensor, 0 where a neighbour is missing.
+    """Return normal maps ``(B, 3, H, W)`` of vertex maps: unit normals towards the sensor, 0 without all neighbours.
 
     The definition is that of :func:`hybridlio.cloud.projection.normal_map`.
     """
     depth = vertices.square().sum(-3, keepdim=True).sqrt()
     around = torch.cat([vertices, depth], dim=-3)
-    # the way to the next cell, weighed; seen from there, the way back is the same
-    to_right = _weighed(torch.roll(around, -1, dims=-1) - around)
-    to_below = _weighed(around[..., 1:, :] - around[..., :-1, :])
+    # weighted difference to the next cell; for that cell it is the negative difference to this one
+    to_right = _weighted(torch.roll(around, -1, dims=-1) - around)
+    to_below = _weighted(around[..., 1:, :] - around[..., :-1, :])
     there = depth[..., 0, :, :] > 0
     beside = torch.roll(there, 1, dims=-1) & torch.roll(there, -1, dims=-1)
     valid = functional.pad(there[..., 2:, :] & there[..., :-2, :], (0, 0, 1, 1)) & beside & there
     upwards = functional.pad(-to_below[..., :-1, :] - to_below[..., 1:, :], (0, 0, 1, 1))
-    # the four cyclic products in one
+    # sum of the four cyclic cross products, as one
     total = cross(upwards, to_right + torch.roll(to_right, 1, dims=-1), dim=-3)
     length = total.square().sum(-3).sqrt()
     valid = valid & (length > 0)
@@ -113,19 +112,19 @@ def normal_map(vertices: Tensor) -> Tensor:
     return torch.where(valid[..., None, :, :], total / signed[..., None, :, :], 0.0)
 
 
-def _weighed(difference: Tensor) -> Tensor:
-    """Differences ``(..., 3, H, W)`` of vertices by that of their ranges, which is their fourth channel."""
+def _weighted(difference: Tensor) -> Tensor:
+    """Weight differences ``(..., 3, H, W)`` of vertices by the difference of their ranges, the fourth channel."""
     return torch.exp(-0.5 * difference[..., 3:, :, :].abs()) * difference[..., :3, :, :]
 
 
 def cross(a: Tensor, b: Tensor, dim: int) -> Tensor:
-    """Cross products along a dimension of size 3: on a CPU several times as fast as PyTorch's own."""
+    """Return cross products along a dimension of size 3; on a CPU several times as fast as PyTorch's."""
     (ax, ay, az), (bx, by, bz) = a.unbind(dim), b.unbind(dim)
     return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], dim=dim)
 
 
 def remap(vertices: Tensor, normals: Tensor, T_a_b: Tensor, geometry: MapGeometry) -> tuple[Tensor, Tensor]:
-    """Both maps of frame b as seen from frame a: vertices moved and projected again, normals rotated with them.
+    """Project the maps of frame b into frame a: vertices are moved and projected again, normals rotated with them.
 
     Gradients reach ``T_a_b`` through the moved vertices and rotated normals.
 
@@ -135,7 +134,7 @@ def remap(vertices: Tensor, normals: Tensor, T_a_b: Tensor, geometry: MapGeometr
         geometry: the cells of the result.
     """
     there = valid_cells(vertices).flatten(1)[..., None]
-    moved = torch.where(there, se3.transform(T_a_b, as_points(vertices)), 0.0)  # an empty cell stays in the origin
+    moved = torch.where(there, se3.transform(T_a_b, as_points(vertices)), 0.0)  # empty cells stay at the origin
     chosen = winners(moved, geometry)
     rotated = se3.rotate(T_a_b, as_points(normals))
     return gather(moved, chosen, geometry), gather(rotated, chosen, geometry)

@@ -1,10 +1,10 @@
-"""Rigid transforms in PyTorch: differentiable everywhere that a network goes, batched, on any device.
+"""Rigid transforms in PyTorch: batched, differentiable also at the identity, on any device.
 
 The conventions are those of :mod:`hybridlio.core.se3`: a pose is ``(..., 4, 4)``, a tangent vector ``(..., 6)`` with
 rotation first, ``[ωx ωy ωz vx vy vz]``, perturbations are on the right, ``T·Exp(ξ)``.
 
 Euler angles are roll, pitch, yaw about the fixed x, y and z axis, in that order: ``R = Rz(yaw)·Ry(pitch)·Rx(roll)``.
-The paper says only "Euler angle"; at the angles between two scans all orders are nearly one.
+The paper says only "Euler angle"; at the small angles between two scans all orders nearly agree.
 
 Formulas: Solà, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics" (2018).
 """
@@ -14,7 +14,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-_SMALL2 = 1e-4  # squared angle below which the series are exact to float32's last digits, and nearly to float64's
+_SMALL2 = 1e-4  # squared angle below which the series are exact in float32, and to 1e-14 in float64
 
 
 def hat(v: Tensor) -> Tensor:
@@ -28,7 +28,7 @@ def _coefficients(rotvec: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """``sin θ/θ``, ``(1 − cos θ)/θ²`` and ``(θ − sin θ)/θ³`` as ``(..., 1, 1)``; their gradients are finite at 0."""
     squared = (rotvec * rotvec).sum(-1)[..., None, None]
     small = squared < _SMALL2
-    safe = torch.where(small, torch.ones_like(squared), squared)  # keeps the branch not taken from making NaN
+    safe = torch.where(small, torch.ones_like(squared), squared)  # the unused branch must not produce NaN gradients
     angle = safe.sqrt()
     a = torch.where(small, 1 - squared / 6 + squared**2 / 120, angle.sin() / angle)
     b = torch.where(small, 0.5 - squared / 24 + squared**2 / 720, 2 * (angle / 2).sin() ** 2 / safe)
@@ -57,7 +57,7 @@ def so3_left_jacobian(rotvec: Tensor) -> Tensor:
 def so3_log(R: Tensor) -> Tensor:
     """Rotation vectors ``(..., 3)`` in radians, of length at most π, of rotation matrices ``(..., 3, 3)``.
 
-    By the quaternion whose largest component comes first, so it keeps its digits, and its gradient, at 0 and near π.
+    Computed from the quaternion by its largest component, which is accurate and differentiable at 0 and near π.
     """
     q = _quaternion(R)
     w, v = q[..., 0], q[..., 1:]
@@ -75,7 +75,7 @@ def _quaternion(R: Tensor) -> Tensor:
     """Unit quaternions ``(..., 4)``, real part first, of either sign."""
     m = R.reshape(*R.shape[:-2], 9)
     m00, m01, m02, m10, m11, m12, m20, m21, m22 = m.unbind(-1)
-    # row i is the quaternion times four times its component i: the row of the largest component divides by no small one
+    # row i is 4·q_i times the quaternion; the row of the largest component is divided by no small number
     rows = torch.stack(
         [
             torch.stack([1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01], -1),
@@ -99,13 +99,13 @@ def make(R: Tensor, t: Tensor) -> Tensor:
 
 
 def identity(count: int, like: Tensor) -> Tensor:
-    """``count`` times the identity ``(count, 4, 4)``, of the type and on the device of ``like``."""
+    """Return identities ``(count, 4, 4)`` with the type and device of ``like``."""
     return torch.eye(4, dtype=like.dtype, device=like.device).expand(count, 4, 4)
 
 
 def exp(xi: Tensor) -> Tensor:
     """Poses ``(..., 4, 4)`` of tangent vectors ``(..., 6)`` (rad, m); inverse of :func:`log`."""
-    # not by torch.linalg.matrix_exp, whose last digits depend on what else is in the batch
+    # torch.linalg.matrix_exp would depend, in its last digits, on the rest of the batch
     rotvec, v = xi[..., :3], xi[..., 3:]
     a, b, c = _coefficients(rotvec)
     K, eye = hat(rotvec), _eye(rotvec)

@@ -20,25 +20,25 @@ from hybridlio.learned.networks.weights import load_weights, weights_path
 from hybridlio.learned.settings import NetworkSettings
 from hybridlio.learned.source_settings import LstmSettings
 
-_STEP_S = 0.1  # what the LSTMs are trained on: scans at 10 Hz; they do not see how long a step is
-_FORGETTING = 0.05  # share of the newest step in what is known of the LSTMs' errors
-_FIRST_SIGMAS = np.r_[np.full(3, 0.01), np.full(3, 0.3)]  # rad, m in a step
+_STEP_S = 0.1  # step of the training data (scans at 10 Hz): the duration is no input of the LSTMs
+_FORGETTING = 0.05  # share of the newest step in the variances: about 20 steps, 2 s, are remembered
+_FIRST_SIGMAS = np.r_[np.full(3, 0.01), np.full(3, 0.3)]  # rad, m of a step; several times the errors in training
 
 
 class LstmInitialPose:
     """Initial poses by the LSTMs of a trained network.
 
-    The covariance is what the steps so far have shown: it starts wide (0.6°, 0.3 m) and follows the differences between
-    prediction and outcome, the newest counting most. Where the LSTMs need the last velocity and it is not known, as at
-    the start, the translation is anyone's guess, and the covariance says so. Longer steps, over missing scans, are
-    predicted in parts of a tenth of a second.
+    The covariance starts at 0.6° and 0.3 m and follows the errors of the predictions so far, with exponential
+    forgetting. While the last velocity is an input but unknown, as at the start, the covariance of the translation is
+    that of an unknown motion. Longer steps, over missing scans, are predicted in parts of a tenth of a second.
 
     Args:
         settings: weights and device.
 
     Raises:
         DataError: the weights cannot be read.
-        ConfigError: they are of a network that takes no initial pose from the IMU, or there is no such device.
+        ConfigError: their network predicts no initial pose from the IMU, the device does not exist, or no weights of
+            that name are shipped.
     """
 
     name = "lstm"
@@ -53,12 +53,12 @@ class LstmInitialPose:
                 "weights (lstm.weights) or another initial pose"
             )
         self._network, self._settings = network.imu_network, network.settings
-        self._variances = _FIRST_SIGMAS**2  # of a step of a tenth of a second
+        self._variances = _FIRST_SIGMAS**2  # of a step of _STEP_S
         self._step: tuple[Array, float] | None = None
         self._predicted: tuple[Array, float, bool] | None = None
 
     def predict(self, frame: Frame, state: State) -> RelativePose:
-        """``T_k_k1`` from the samples since the last scan; without any, no motion, marked as not ok."""
+        """Return ``T_k_k1`` from the samples since the last scan; without samples the identity, marked as not ok."""
         dt_s = (frame.scan.stamp_ns - state.stamp_ns) / NS_PER_S
         informed = self._step is not None or not self._settings.velocity
         if not len(frame.imu):
@@ -72,7 +72,7 @@ class LstmInitialPose:
         return RelativePose(pose, covariance, source=self.name, from_imu=True)
 
     def correct(self, frame: Frame, estimate: RelativePose) -> None:  # noqa: ARG002
-        """Learn how far off the prediction was, and the velocity for the next one."""
+        """Update the variances by the error of the prediction, and the velocity for the next one."""
         if self._predicted is None:
             self._step = None
             return
@@ -85,7 +85,7 @@ class LstmInitialPose:
         self._step = (estimate.pose, dt_s)
 
     def _chained(self, frame: Frame, dt_s: float) -> Array:
-        """The motion in ``dt_s``, of as many equal parts as there are tenths of a second in it."""
+        """Return the motion in ``dt_s``, predicted in equal parts of about a tenth of a second."""
         parts, pose, step = max(round(dt_s / _STEP_S), 1), np.eye(4), self._step
         first_ns = frame.scan.stamp_ns - round(dt_s * NS_PER_S)
         ends_ns = [first_ns + round(part * dt_s * NS_PER_S / parts) for part in range(parts + 1)]
@@ -100,20 +100,20 @@ class LstmInitialPose:
         with at_run_time():
             imu, v = (torch.from_numpy(x)[None].to(self._device) for x in (rows, velocity))
             pose = self._network(imu, v, torch.tensor([_STEP_S], device=self._device))[0].double().cpu().numpy()
-        # the motion of a tenth of a second, for as long as the step took
+        # the network predicts the motion of _STEP_S: scale it to the duration of the part
         return se3.exp(se3.log(se3.orthonormalise(pose)) * dt_s / _STEP_S)
 
 
 def inertial(
     samples: ImuSamples, frame: Frame, settings: NetworkSettings, step: tuple[Array, float] | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Inertial rows ``(S, 6)``, zeros where there are none, and the velocity ``(3,)`` at the last scan, as in shards.
+    """Return IMU rows ``(S, 6)``, zeros without samples, and the velocity ``(3,)`` at the last scan, as in shards.
 
     Args:
         samples: between the scans, or a part of them.
         frame: the current scan's.
         settings: of the network.
-        step: the last relative pose and its duration in seconds, where there was any.
+        step: the last relative pose and its duration in seconds, or None at the start.
     """
     T_imu_lidar = None if frame.calibration is None else frame.calibration.T_imu_lidar
     rows = np.zeros((settings.imu_samples, 6), np.float32)

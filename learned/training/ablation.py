@@ -1,4 +1,4 @@
-"""Train and evaluate the rows of a comparison, each at the same budget; what is done already is not done again."""
+"""Train and evaluate the rows of a comparison, each with the same budget; finished rows are not repeated."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ Drift = tuple[float, float]
 
 @dataclass(frozen=True)
 class RowData:
-    """What a row is trained and evaluated on: prepared as its recipe wants (cells, inertial rows, ground).
+    """Shards of a row, prepared for its recipe (map geometry, IMU rows, ground).
 
     Attributes:
-        train, test: shards; drift is measured on both.
+        train, test: training and test recordings; drift is measured on both.
     """
 
     train: Sequence[Shard]
@@ -40,13 +40,13 @@ class RowData:
 
 @dataclass(frozen=True)
 class RowResult:
-    """A row, trained and evaluated.
+    """Figures of a trained row.
 
     Attributes:
         name: of its recipe.
-        steps, pairs: of the optimiser, and how many pairs they saw.
-        seconds: that training took.
-        train, test: t_rel (percent) and r_rel (degrees per 100 m) by recording; None where one is too short.
+        steps, pairs: training steps, and pairs in them.
+        seconds: duration of the training.
+        train, test: t_rel (percent) and r_rel (degrees per 100 m) by recording; None for a recording that is too short.
     """
 
     name: str
@@ -58,12 +58,12 @@ class RowResult:
 
     @property
     def train_average(self) -> Drift | None:
-        """Over the recordings trained on; None where none is long enough."""
+        """Mean over the training recordings; None where all are too short."""
         return _average(self.train)
 
     @property
     def test_average(self) -> Drift | None:
-        """Over the other recordings; None where none is long enough."""
+        """Mean over the test recordings; None where all are too short."""
         return _average(self.test)
 
 
@@ -75,24 +75,24 @@ def run_rows(
     options: RunOptions | None = None,
     progress: Callable[[Recipe, TrainingProgress], None] | None = None,
 ) -> list[RowResult]:
-    """Train each recipe for so many steps and measure the drift of its chained steps, row by row.
+    """Train each recipe for the same number of steps and measure the drift of its chained steps.
 
-    A row's folder, ``out/NAME``, holds its training run and ``result.json``. With the same recipe and budget a finished
-    row is read from there, and an interrupted one goes on from its checkpoint.
+    The folder of a row, ``out/NAME``, holds its training run and ``result.json``. With the same recipe and budget a
+    finished row is read from there, and an interrupted one resumes from its checkpoint.
 
     Args:
-        recipes: the rows, of different names.
-        data: gives a row's shards.
-        out: the comparison's folder.
-        steps: of the optimiser, the same for all rows.
-        options: device and checkpoints; ``max_steps`` is set to the budget.
-        progress: called after every step of training.
+        recipes: the rows, with different names.
+        data: returns the shards of a row.
+        out: folder of the comparison.
+        steps: training steps of each row.
+        options: device and checkpoints; ``max_steps`` is set to ``steps``.
+        progress: called after every training step.
 
     Raises:
         ConfigError: two rows have one name, or a row's folder holds a run with other settings.
     """
     if len({recipe.name for recipe in recipes}) != len(recipes):
-        raise ConfigError("rows of a comparison need names of their own")
+        raise ConfigError("two rows of a comparison have the same name; rename one recipe")
     return [_row(recipe, data, Path(out) / recipe.name, steps, options, progress) for recipe in recipes]
 
 
@@ -147,15 +147,15 @@ def _average(drifts: Mapping[str, Drift | None]) -> Drift | None:
 
 
 def reduced(recipe: Recipe, geometry: MapGeometry | None = None, batch: int = 8, rate: float = 1e-3) -> Recipe:
-    """A recipe that a CPU trains in minutes: coarser maps, a quarter of the encoder's channels, one block a stage.
+    """Return a recipe that a CPU trains in minutes: coarser maps, a quarter of the channels, one block in a stage.
 
-    What the rows of a comparison differ in stays as it is. Absolute figures are worse than at full size.
+    Settings in which the rows of a comparison differ stay. Figures are worse than at full size.
 
     Args:
         recipe: at full size.
-        geometry: cells of the maps; by default a half of the rows and a quarter of the columns.
-        batch: pairs a step.
-        rate: the learning rate, constant.
+        geometry: cells of the maps; None takes half of the rows and a quarter of the columns.
+        batch: pairs in a step.
+        rate: constant learning rate.
     """
     network, cells = recipe.network, recipe.network.geometry
     if geometry is None:

@@ -1,4 +1,4 @@
-"""Checkpoints: everything that decides how training goes on, in one file that appears whole."""
+"""Checkpoints: the full state of a training run, in one file that appears complete."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class Checkpoint:
     """A point in a training run.
 
     Attributes:
-        recipe: of the run.
-        data: how many pairs it sees an epoch.
+        recipe: settings of the run.
+        data: pairs in an epoch.
         step: steps done.
-        network: its state.
-        optimiser: its state.
-        random: states of PyTorch's generators by device type.
+        network: state of the network.
+        optimiser: state of the optimiser.
+        random: states of PyTorch's random generators by device type.
     """
 
     recipe: Recipe
@@ -43,7 +43,7 @@ class Checkpoint:
 
 
 def take(recipe: Recipe, data: int, step: int, network: nn.Module, optimiser: Optimizer) -> Checkpoint:
-    """The state of a run now."""
+    """Return the current state of a run."""
     random = {"cpu": torch.get_rng_state()}
     if torch.cuda.is_available():
         random["cuda"] = torch.cuda.get_rng_state()
@@ -51,7 +51,7 @@ def take(recipe: Recipe, data: int, step: int, network: nn.Module, optimiser: Op
 
 
 def restore(checkpoint: Checkpoint, network: nn.Module, optimiser: Optimizer) -> None:
-    """Bring network, optimiser and generators to where the checkpoint was taken."""
+    """Set network, optimiser and random generators to the state of a checkpoint."""
     network.load_state_dict(checkpoint.network)
     optimiser.load_state_dict(checkpoint.optimiser)
     torch.set_rng_state(checkpoint.random["cpu"])
@@ -60,7 +60,7 @@ def restore(checkpoint: Checkpoint, network: nn.Module, optimiser: Optimizer) ->
 
 
 def save(path: str | os.PathLike[str], checkpoint: Checkpoint) -> None:
-    """Write a checkpoint, whole or not at all."""
+    """Write a checkpoint; the file appears complete."""
     buffer = io.BytesIO()
     values = {
         "format": FORMAT,
@@ -76,10 +76,10 @@ def save(path: str | os.PathLike[str], checkpoint: Checkpoint) -> None:
 
 
 def load(path: str | os.PathLike[str]) -> Checkpoint:
-    """Read a checkpoint onto the CPU; only plain values and tensors are taken from it, never code.
+    """Read a checkpoint onto the CPU. Only plain values and tensors are loaded, never code.
 
     Raises:
-        DataError: it is not a checkpoint, or of another format.
+        DataError: the file is not a checkpoint, or has the format of another version.
     """
     path = Path(path)
     try:
@@ -95,11 +95,11 @@ def load(path: str | os.PathLike[str]) -> Checkpoint:
             values["random"],
         )
     except (OSError, RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, ConfigError) as error:
-        raise DataError(f"{path}: not a checkpoint that can be resumed ({error}); delete it to start anew") from error
+        raise DataError(f"{path}: not a checkpoint that can be resumed ({error}); delete it to start again") from error
 
 
 def differences(wanted: Recipe, found: Recipe) -> list[str]:
-    """Settings in which two recipes differ, as ``section.key: found → wanted``; names do not count."""
+    """Return the settings in which two recipes differ, as ``section.key: found → wanted``; names may differ."""
     texts = []
     a, b = to_dict(wanted), to_dict(found)
     for section in ("network", "loss", "optimiser"):

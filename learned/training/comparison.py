@@ -1,6 +1,6 @@
-"""A comparison's rows in the paper's form: drift by recording, averages over those trained on and those tested on.
+"""A comparison in the form of the paper's tables: drift by recording, means over training and test recordings.
 
-What was measured and what was published stand beside each other, and the latter is marked as such.
+Measured and published figures stand beside each other, and the published ones are marked.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ class Line:
     """A line of a table.
 
     Attributes:
-        method: the name that the paper gives it.
-        preset: what was trained for it; None where it has published figures alone.
-        result: what was measured; None where nothing was, or it failed.
+        method: name in the paper.
+        preset: name of the trained preset; None for a method with published figures only.
+        result: measured figures; None where there are none or training failed.
         published: the paper's figures.
-        error: why there is no result, where that is the reason.
+        error: why training failed, if it did.
     """
 
     method: str
@@ -39,10 +39,10 @@ class Line:
 
 
 def tables(lines: Sequence[Line]) -> dict[str, list[dict[str, str]]]:
-    """Tables by title, each a list of rows under the same headings.
+    """Return tables by title, each a list of rows with the same columns.
 
-    One where the recordings are KITTI's sequences. Else two: what was measured beside the published averages, and the
-    published figures by sequence.
+    For KITTI's sequences there is one table. For other recordings there are two: the measured figures beside the
+    published means, and the published figures by sequence.
     """
     recordings = _recordings(lines)
     if set(recordings) <= set(KITTI):
@@ -55,7 +55,7 @@ def tables(lines: Sequence[Line]) -> dict[str, list[dict[str, str]]]:
 
 
 def to_markdown(number: int, lines: Sequence[Line], budget: str) -> str:
-    """Everything as Markdown."""
+    """Return the comparison as Markdown."""
     parts = [f"# Table {number}\n\n{budget}\n\n{LEGEND}"]
     for title, rows in tables(lines).items():
         cells = [list(rows[0]), ["---"] * len(rows[0]), *(list(row.values()) for row in rows)]
@@ -65,7 +65,7 @@ def to_markdown(number: int, lines: Sequence[Line], budget: str) -> str:
 
 
 def to_json_dict(number: int, lines: Sequence[Line], budget: str) -> dict[str, Any]:
-    """Everything as plain values."""
+    """Return the comparison as plain values."""
     return {"table": number, "budget": budget, "lines": [asdict(line) for line in lines]}
 
 

@@ -1,4 +1,4 @@
-"""The paper's own figures, to be shown beside what was measured: tables 1 to 5 of UnDeepLIO, on KITTI odometry."""
+"""The paper's figures: tables 1 to 5 of UnDeepLIO, on KITTI odometry."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _METRICS = ("t_rel_percent", "r_rel_deg_per_100m")
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """One method's line in one of the tables.
+    """A row of one of the paper's tables.
 
     Attributes:
-        method: its name there.
-        t_rel_percent, r_rel_deg_per_100m: by KITTI sequence, ``00`` to ``10``, and averaged over those trained on
-            (``train``) and those tested on (``test``), as printed there; None where it gives none.
+        method: name in the paper.
+        t_rel_percent, r_rel_deg_per_100m: as printed, by KITTI sequence ``00`` to ``10``, and the means over training
+            (``train``) and test sequences (``test``); None where there is no figure.
     """
 
     method: str
@@ -30,10 +30,10 @@ class PublishedRow:
 
 
 def published(table: int) -> tuple[PublishedRow, ...]:
-    """The lines of a table, in its order.
+    """Return the rows of a table in their order.
 
     Raises:
-        ConfigError: there is no such table.
+        ConfigError: the number is not 1 to 5.
     """
     text = resources.files("hybridlio.learned.training").joinpath("published.csv").read_text(encoding="utf-8")
     rows = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
@@ -43,7 +43,7 @@ def published(table: int) -> tuple[PublishedRow, ...]:
             metric, method = row.pop("metric"), row.pop("method")
             found.setdefault(method, {})[metric] = {_AVERAGES.get(k, k): _number(v) for k, v in row.items()}
     if not found:
-        raise ConfigError(f"no table {table}; there are tables 1 to 5")
+        raise ConfigError(f"table {table} is not in the paper; choose 1 to 5")
     return tuple(PublishedRow(method, *(figures[metric] for metric in _METRICS)) for method, figures in found.items())
 
 

@@ -1,4 +1,4 @@
-"""The log of a training run: one JSON object a line, and the same as event files, which TensorBoard reads."""
+"""The log of a training run: one JSON object per line, and the same as event files for TensorBoard."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from hybridlio.core.files import write_atomically
 class TrainingLog:
     """Rows of numbers by step, in ``log.jsonl`` and in ``tensorboard/``.
 
-    Event files are written by tensorboardX, which needs no TensorBoard; a bare training machine may do without either.
+    tensorboardX writes the event files; without it there are none.
 
     Args:
         folder: of the run.
-        step: rows of later steps, which an interrupted run left behind its last checkpoint, are dropped.
+        step: step of the last checkpoint. Later rows of an interrupted run are dropped.
     """
 
     def __init__(self, folder: str | os.PathLike[str], step: int) -> None:
@@ -29,7 +29,7 @@ class TrainingLog:
         self._board = _tensorboard(Path(folder) / "tensorboard", step)
 
     def write(self, step: int, **values: float | None) -> None:
-        """Add a row; numbers that are not known or not finite are written as null."""
+        """Add a row; unknown and infinite numbers become null."""
         known = {name: v if v is not None and math.isfinite(v) else None for name, v in values.items()}
         with self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps({"step": step, **known}) + "\n")
@@ -39,13 +39,13 @@ class TrainingLog:
                     self._board.add_scalar(name, value, step)
 
     def close(self) -> None:
-        """Write out what TensorBoard has not yet."""
+        """Write buffered events."""
         if self._board is not None:
             self._board.close()
 
 
 def read_log(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
-    """The rows of a ``log.jsonl``; a last line that was cut off is left out."""
+    """Return the rows of a ``log.jsonl``, without an incomplete last line."""
     lines = Path(path).read_text(encoding="utf-8").splitlines(keepends=True)
     return [json.loads(line) for line in lines if line.endswith("\n")]
 

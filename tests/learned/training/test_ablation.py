@@ -69,7 +69,7 @@ def test_rows_share_a_budget_and_are_not_done_again(rooms, tiny_recipe, tmp_path
         run_rows(rows, data, tmp_path, 7, CPU)
     with pytest.raises(ConfigError, match=r"loss\.lambda_"):
         run_rows([replace(rows[1], name="one")], data, tmp_path, 6, CPU)
-    with pytest.raises(ConfigError, match="names"):
+    with pytest.raises(ConfigError, match="same name"):
         run_rows([rows[0], rows[0]], data, tmp_path, 6, CPU)
 
 
