@@ -81,7 +81,9 @@ class PointFormat:
         return xyz.astype(np.float32, copy=False)
 
     def _returns(self, points: Floats) -> Mask:
-        keep = np.asarray(np.isfinite(points).all(axis=1) & points.any(axis=1), dtype=bool)
+        # NaN or infinite where a coordinate is; a product with ones is far quicker than all() along rows of three
+        sums = np.abs(points) @ np.ones(3, np.float32)
+        keep = np.asarray((sums > 0) & (sums < np.inf), dtype=bool)
         if self.no_return_m is not None:
             keep &= np.abs(_ranges(points) - self.no_return_m) > _SAME_RANGE_M
         if self.limits_m is not None:

@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlio.core.arrays import Floats
 from hybridlio.core.errors import DataError
-from hybridlio.datasets.points.point_times import PointTimes
+from hybridlio.datasets.points.point_times import StatedTimes
 from hybridlio.datasets.rosbag.wire import read_livox
 
 Columns = dict[str, NDArray[Any]]
 
 # sensor_msgs/PointField: INT8, UINT8, INT16, UINT16, INT32, UINT32, FLOAT32, FLOAT64
 _KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_INTENSITIES = ("intensity", "reflectivity", "reflectance")
-_FULL_SCALES = (1.0, 255.0, 65535.0)  # of shares, 8-bit and 16-bit numbers
-LIVOX_TIMES = PointTimes("offset_time", 1, "stamp")  # as :func:`livox_columns` gives them
+LIVOX_TIMES = StatedTimes("offset_time", "ns", "stamp")  # as :func:`livox_columns` gives them
 _MAX_TIMEBASE_NS = 1_000_000_000  # no lidar turns slower: a timebase farther from the stamp is on another clock
 
 
 def cloud_columns(message: Any) -> Columns:
-    """Return the columns of a ``sensor_msgs/PointCloud2`` by field name, ``(N,)`` each; they share memory with it.
+    """Return the columns of a ``sensor_msgs/PointCloud2`` by lower-case name, ``(N,)`` each; they share memory with it.
 
     Raises:
         DataError: the message has fewer bytes than it announces, no fields ``x y z``, or a field that does not fit.
@@ -50,29 +46,6 @@ def livox_columns(raw: bytes, is_ros2: bool, stamp_ns: int) -> Columns:
     return columns
 
 
-def valid_points(columns: Columns) -> Columns:
-    """Return the columns without points that are not finite: organised clouds mark missing returns so."""
-    valid = np.isfinite(columns["x"]) & np.isfinite(columns["y"]) & np.isfinite(columns["z"])
-    return columns if valid.all() else {name: values[valid] for name, values in columns.items()}
-
-
-def full_scale(samples: Sequence[Columns]) -> float:
-    """Return the intensity that counts as 1 in a recording: 1, 255 or 65535, the least that no sample exceeds."""
-    seen = [values for columns in samples if (values := _intensities(columns)) is not None and len(values)]
-    largest = max((float(np.max(values, where=np.isfinite(values), initial=0)) for values in seen), default=0.0)
-    return next((scale for scale in _FULL_SCALES if largest <= scale), largest)
-
-
-def intensity(columns: Columns, scale: float) -> Floats | None:
-    """Return the points' intensities, ``(N,)`` from 0 to 1; None without such a field."""
-    values = _intensities(columns)
-    return None if values is None else np.asarray(values, dtype=np.float32) / np.float32(scale)
-
-
-def _intensities(columns: Columns) -> NDArray[Any] | None:
-    return next((columns[name] for name in _INTENSITIES if name in columns), None)
-
-
 def _point_type(message: Any) -> np.dtype[Any]:
     order = ">" if message.is_bigendian else "<"
     formats, offsets, names = [], [], []
@@ -83,10 +56,11 @@ def _point_type(message: Any) -> np.dtype[Any]:
         kind = np.dtype(order + _KINDS[field.datatype])
         if field.offset + count * kind.itemsize > message.point_step:
             raise DataError(f"field {field.name!r} of the cloud lies outside its {message.point_step} bytes per point")
-        if count == 1 and field.name and field.name not in names:  # vectors are no columns
+        name = field.name.lower()
+        if count == 1 and name and name not in names:  # vectors are no columns
             formats.append(kind)
             offsets.append(field.offset)
-            names.append(field.name)
+            names.append(name)
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": message.point_step})
 
 

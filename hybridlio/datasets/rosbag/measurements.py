@@ -92,14 +92,8 @@ def note_clocks(lidar: Log, imu: Log, notes: Notes) -> None:
         )
 
 
-def imu_values(message: Any) -> tuple[float, ...]:
-    """Return angular velocity (rad/s) and specific force (m/s²) of a ``sensor_msgs/Imu``."""
-    rate, force = message.angular_velocity, message.linear_acceleration
-    return rate.x, rate.y, rate.z, force.x, force.y, force.z
-
-
 def imu_samples(log: Log, topic: str, notes: Notes) -> ImuSamples:
-    """Return the samples of a log of :func:`imu_values`, sorted; what is corrected or unusual is noted.
+    """Return the samples of a log of angular velocity and specific force, sorted; corrections are noted.
 
     Raises:
         DataError: no sample is finite.

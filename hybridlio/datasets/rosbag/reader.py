@@ -22,7 +22,7 @@ from hybridlio.datasets.rosbag.measurements import Log
 from hybridlio.datasets.rosbag.scans import BagScans
 from hybridlio.datasets.rosbag.topics import TRANSFORM_TYPES, BagTopics, choose
 from hybridlio.datasets.rosbag.transforms import FrameTree
-from hybridlio.datasets.rosbag.wire import Header, read_header
+from hybridlio.datasets.rosbag.wire import Header, read_header, read_imu
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.datasets.stamps import SCAN_GAP_FACTOR, note_coverage, note_gaps, usable_scans
 
@@ -136,9 +136,10 @@ def _read(bag: Bag, chosen: dict[str, Topic]) -> _Contents:
             continue
         kind = kinds[name]
         log = contents.logs[kind]
-        log.add(_header(raw, bag.is_ros2), received_ns)
+        header = _header(raw, bag.is_ros2)
+        log.add(header, received_ns)
         if kind == "imu":
-            log.values.extend(measurements.imu_values(bag.decode(name, raw)))
+            log.values.extend(read_imu(raw, header, bag.is_ros2))
         elif kind == "gps":
             log.values.extend(measurements.fix_values(bag.decode(name, raw)))
         elif kind == "reference":

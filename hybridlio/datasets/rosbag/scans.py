@@ -15,21 +15,12 @@ from hybridlio.core.arrays import Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import Scan
 from hybridlio.datasets.notes import Notes
-from hybridlio.datasets.points.point_times import PointTimes, find_point_times
+from hybridlio.datasets.points.point_format import PointFormat, find_format, sampled
 from hybridlio.datasets.rosbag.bag import Bag
-from hybridlio.datasets.rosbag.clouds import (
-    LIVOX_TIMES,
-    Columns,
-    cloud_columns,
-    full_scale,
-    intensity,
-    livox_columns,
-    valid_points,
-)
+from hybridlio.datasets.rosbag.clouds import LIVOX_TIMES, Columns, cloud_columns, livox_columns
 from hybridlio.datasets.rosbag.topics import LIVOX_TYPES
 from hybridlio.datasets.rosbag.wire import read_header
 
-_SAMPLES = 5  # scans; more than one because the first may be a part of a sweep, few because they are read twice
 _MAX_SKIPPED = 5  # messages; reading on past them is quicker than to search a place in the bag
 
 
@@ -45,8 +36,7 @@ class BagScans:
         received_ns: of all messages of the topic.
         has_stamps: whether the stamps are those of the headers.
         bag: the open bag, or None to open it when needed.
-        point_times: the convention of the points' times, found by :meth:`learn`; None if they have none.
-        full_scale: the intensity that counts as 1, found by :meth:`learn`.
+        format: how columns are read, found by :meth:`learn`.
     """
 
     path: Path
@@ -56,8 +46,7 @@ class BagScans:
     received_ns: Stamps
     has_stamps: bool
     bag: Bag | None = None
-    point_times: PointTimes | None = None
-    full_scale: float = 1.0
+    format: PointFormat = field(default_factory=PointFormat)
     _at: int = 0
     _stream: Iterator[tuple[str, int, bytes]] | None = None
     _lock: Any = field(default_factory=threading.Lock)
@@ -80,24 +69,26 @@ class BagScans:
         self.__dict__.update(state, _lock=threading.Lock())
 
     def learn(self, notes: Notes) -> None:
-        """Find the convention of point times and the scale of intensities from the first scans that can be read.
+        """Find how columns are read from some scans; those that cannot be read are noted.
 
         Raises:
-            DataError: the convention of point times is ambiguous.
+            DataError: no scan can be read, or the meaning of a column is not clear.
         """
-        samples = []
-        for k in range(min(_SAMPLES, len(self.stamps_ns))):
+        samples, errors = [], []
+        for k in sampled(len(self.stamps_ns)):
             try:
                 samples.append((int(self.stamps_ns[k]), self.columns(k)))
             except DataError as error:
+                errors.append(error)
                 notes.add(f"frame {k}: {error}")
-        is_livox = self._bag().topics[self.topic].type in LIVOX_TYPES
+        if not samples:
+            raise errors[0]
         step_ns = int(np.median(np.diff(self.stamps_ns))) if len(self.stamps_ns) > 1 else None
-        times = LIVOX_TIMES if is_livox else find_point_times(samples, step_ns, notes)
-        self.point_times, self.full_scale = times, full_scale([columns for _, columns in samples])
+        is_livox = self._bag().topics[self.topic].type in LIVOX_TYPES
+        self.format = find_format(samples, step_ns, notes, LIVOX_TIMES if is_livox else None)
 
     def columns(self, k: int) -> Columns:
-        """Return the columns of the valid points of scan ``k``, as the message holds them.
+        """Return the columns of scan ``k``, as the message holds them.
 
         Raises:
             DataError: the message cannot be read.
@@ -109,19 +100,13 @@ class BagScans:
     def _columns(self, raw: bytes, stamp_ns: int) -> Columns:
         bag = self._bag()
         if bag.topics[self.topic].type in LIVOX_TYPES:
-            return valid_points(livox_columns(raw, bag.is_ros2, stamp_ns))
-        return valid_points(cloud_columns(bag.decode(self.topic, raw)))
+            return livox_columns(raw, bag.is_ros2, stamp_ns)
+        return cloud_columns(bag.decode(self.topic, raw))
 
     def _scan(self, raw: bytes, stamp_ns: int) -> Scan:
         if self.has_stamps and read_header(raw, self._bag().is_ros2).stamp_ns != stamp_ns:
             raise DataError("the bag has changed since it was opened")
-        columns = self._columns(raw, stamp_ns)
-        points = np.column_stack([columns[axis] for axis in "xyz"])
-        offsets = None if self.point_times is None else self.point_times.offsets_ns(columns, stamp_ns)
-        scan = Scan(stamp_ns, points, intensity(columns, self.full_scale), offsets)
-        if not len(scan):
-            raise DataError("the scan has no finite points")
-        return scan
+        return self.format.scan(self._columns(raw, stamp_ns), stamp_ns)
 
     def _bag(self) -> Bag:
         if self.bag is None:

@@ -1,7 +1,7 @@
-"""The serialised form of messages, as far as it is read without ``rosbags``: headers, and Livox's point clouds.
+"""The serialised form of messages, as far as it is read without ``rosbags``, for speed: headers, IMU, Livox's clouds.
 
-``rosbags`` builds a Python object per point of a Livox cloud, which takes far longer than reading all points at once;
-and it deserialises a whole cloud where only the stamp is needed.
+``rosbags`` builds a Python object per point of a Livox cloud, several per inertial sample, and deserialises a whole
+cloud where only the stamp is needed.
 
 ROS 1 packs fields without gaps, little-endian. ROS 2 uses CDR: four bytes tell the byte order, and then a field of n
 bytes starts at a multiple of n (OMG specification of DDS-XTypes 1.3, section 7.4.1).
@@ -60,6 +60,23 @@ def read_header(raw: bytes, is_ros2: bool) -> Header:
         raise DataError(f"a message of {len(raw)} bytes ends within its header")
     frame = bytes(raw[start : start + size]).rstrip(b"\0").decode("utf-8", "replace")
     return Header(seconds * NS_PER_S + nanoseconds, frame.lstrip("/"), start + size, order)
+
+
+def read_imu(raw: bytes, header: Header, is_ros2: bool) -> tuple[float, ...]:
+    """Return angular velocity (rad/s) and specific force (m/s²) of a ``sensor_msgs/Imu``.
+
+    Behind the header there are 37 numbers: orientation (4) and its covariance (9), then each vector (3) and its
+    covariance (9).
+
+    Raises:
+        DataError: the message is too short.
+    """
+    at = _aligned(header.end, 8) if is_ros2 else header.end
+    try:
+        rate = struct.unpack_from(header.order + "3d", raw, at + 8 * 13)
+        return rate + struct.unpack_from(header.order + "3d", raw, at + 8 * 25)
+    except struct.error:
+        raise DataError("an inertial message is too short") from None
 
 
 def read_livox(raw: bytes, is_ros2: bool) -> tuple[int, NDArray[Any]]:

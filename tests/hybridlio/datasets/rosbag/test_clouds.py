@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridlio.core.errors import DataError
-from hybridlio.datasets.rosbag.clouds import cloud_columns, full_scale, intensity, valid_points
+from hybridlio.datasets.rosbag.clouds import cloud_columns
 from hybridlio.datasets.rosbag.wire import read_header, read_livox
 
 MAKER = bags.Messages(is_ros2=True)
@@ -58,14 +58,6 @@ def test_padded_rows_of_an_organised_cloud_are_read() -> None:
         np.testing.assert_array_equal(columns["y"], rows["y"].ravel())
 
 
-def test_missing_returns_are_left_out() -> None:
-    rows = points([*AXES, ("t", "u4")], (2, 3))
-    rows["x"][0, 1] = np.nan
-    rows["z"][1, 2] = np.inf
-    columns = valid_points(cloud_columns(MAKER.cloud(0, rows)))
-    assert columns["t"].tolist() == [30, 32, 33, 34]
-
-
 def test_fields_of_several_values_and_repeated_names_are_no_columns() -> None:
     message = MAKER.cloud(0, points([*AXES, ("n", "f4"), ("m", "f4")]))
     message.fields[3].count = 2
@@ -97,17 +89,6 @@ def test_a_cloud_that_does_not_fit_its_description_is_refused(change: Any, text:
     change(message)
     with pytest.raises(DataError, match=text):
         cloud_columns(message)
-
-
-@pytest.mark.parametrize(("largest", "scale"), [(0.9, 1.0), (1.0, 1.0), (200, 255.0), (3000, 65535.0), (1e6, 1e6)])
-def test_intensities_are_scaled_to_one_over_the_whole_recording(largest: float, scale: float) -> None:
-    samples = [{"intensity": np.array([0.5, np.nan])}, {"intensity": np.array([largest])}]
-    assert full_scale(samples) == scale
-    scaled = intensity({"reflectivity": np.array([largest])}, scale)
-    assert scaled is not None
-    np.testing.assert_allclose(scaled, largest / scale)
-    assert full_scale([]) == 1
-    assert intensity({}, 1) is None
 
 
 @pytest.mark.parametrize("is_ros2", [False, True])

@@ -137,6 +137,19 @@ class TestExtrinsics:
 
 
 class TestMeasurements:
+    def test_missing_returns_of_organised_clouds_are_left_out(self, small: Any) -> None:
+        points = np.ones((2, 3), [("X", "<f4"), ("Y", "<f4"), ("Z", "<f4"), ("t", "<u4")])
+        points["X"][0, 1], points["Z"][1, 2] = np.nan, np.inf
+        points["t"] = np.arange(6).reshape(2, 3) * 15_000_000
+        clouds = [
+            (t, "/points", "sensor_msgs/msg/PointCloud2", small.maker.cloud(t, points))
+            for t in range(STAMP, STAMP + 4 * 10**8, 10**8)
+        ]
+        scan = open_sequence(small.write(clouds, small.imu(), [small.mount()]))[1].scan
+        assert len(scan) == 4
+        assert scan.time_offsets_ns is not None
+        assert scan.time_offsets_ns.tolist() == [0, 30_000_000, 45_000_000, 60_000_000]
+
     def test_forces_in_g_are_scaled_with_a_note(self, small: Any) -> None:
         sequence = open_sequence(small.write(small.clouds(), small.imu(factor=1 / 9.81), [small.mount()]))
         np.testing.assert_allclose(sequence.imu.accel_m_s2[:, 2], 9.80665)
