@@ -79,8 +79,8 @@ def open_folder(
     stated = read_calibration_yaml(folder / "calibration.yaml", needs_imu=len(imu) > 0)
     stamps, paths = _stamped(folder, _scan_files(folder), stated.rate_hz if rate_hz is None else rate_hz, notes)
     if len(imu):
-        imu = _on_scans_clock(imu, stated.imu_time_offset_ns, notes)
-        _note_mounting(imu, stated.calibration.T_imu_lidar, notes)
+        imu = on_scans_clock(imu, stated.imu_time_offset_ns, notes)
+        note_mounting(imu, stated.calibration.T_imu_lidar, notes)
     else:
         notes.add(f"no inertial data: {folder / 'imu.csv'} does not exist")
     note_coverage(imu.stamps_ns, stamps, "inertial data", notes)
@@ -149,7 +149,7 @@ def _stamped(
     return stamps[keep], tuple(paths[k] for k in keep)
 
 
-def _on_scans_clock(imu: ImuSamples, offset_ns: int, notes: Notes) -> ImuSamples:
+def on_scans_clock(imu: ImuSamples, offset_ns: int, notes: Notes) -> ImuSamples:
     """Return the samples with their stamps moved by the stated offset of the clocks."""
     if not offset_ns:
         return imu
@@ -157,7 +157,7 @@ def _on_scans_clock(imu: ImuSamples, offset_ns: int, notes: Notes) -> ImuSamples
     return ImuSamples(imu.stamps_ns + offset_ns, imu.gyro_rad_s, imu.accel_m_s2)
 
 
-def _note_mounting(imu: ImuSamples, T_imu_lidar: Array, notes: Notes) -> None:
+def note_mounting(imu: ImuSamples, T_imu_lidar: Array, notes: Notes) -> None:
     """Note extrinsics that contradict the samples: lengths in another unit, or gravity that points up."""
     distance_m = float(np.linalg.norm(T_imu_lidar[:3, 3]))
     if distance_m > _MAX_LEVER_ARM_M:

@@ -19,7 +19,7 @@ from hybridlio.datasets.stamps import IMU_GAP_FACTOR, note_gaps, sorted_unique
 _PLAUSIBLE_FORCE_M_S2 = (5.0, 20.0)  # of the median: half to twice gravity; values in g (1) or mm/s² (9810) are outside
 _MAX_RATE_RAD_S = 6.0  # 95 % quantile; a turn per second is beyond vehicles and hands, but 6 °/s taken for rad/s is not
 _NO_RATE_RAD_S = 35.0  # 95 % quantile: 2000 °/s, the full scale of usual gyroscopes, so the unit is °/s
-_ONE_G = (0.8, 1.25)  # of the median force: gravity in g, and some motion
+ONE_G = (0.8, 1.25)  # of the median force: gravity in g, and some motion
 _STEPS_NS = (500_000, 400_000_000)  # between samples, 2.5 Hz to 2 kHz: units are 1000 apart, so at most one fits
 _EXPECTED = (
     "a time (stamp_ns, t_s, timestamp …), gx gy gz (rad/s; or gx_deg_s …) and ax ay az (m/s²; or ax_g …), or the names "
@@ -107,7 +107,7 @@ def _in_si_units(path: Path, values: Array, columns: ImuColumns, notes: Notes) -
     rate = float(np.quantile(np.linalg.norm(finite[:, :3], axis=1), 0.95))
     stated = [scale is not None for _, scale in columns.values]
     for unit, size in (("g", 1.0), ("mg", 1000.0)):
-        if not any(stated[3:]) and _ONE_G[0] * size < force < _ONE_G[1] * size:
+        if not any(stated[3:]) and ONE_G[0] * size < force < ONE_G[1] * size:
             factors[3:] = STANDARD_GRAVITY_M_S2 / size
             notes.add(
                 f"{path}: the median specific force is {force:.3g}: read in {unit}; columns in m/s² have 9.8 there"

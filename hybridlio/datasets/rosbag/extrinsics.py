@@ -9,9 +9,7 @@ import numpy as np
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
-from hybridlio.core.lidar_models import LidarModel
 from hybridlio.core.sensors import Calibration
-from hybridlio.datasets.calibration_yaml import read_calibration_yaml
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.rosbag.bag import Bag, Topic
 from hybridlio.datasets.rosbag.topics import TRANSFORM_TYPES, BagTopics
@@ -50,17 +48,13 @@ class Mounting:
         """The IMU's frame: the user's, or that of the messages."""
         return (self.wanted.imu_frame or self.frames.get("imu", "")).lstrip("/")
 
-    def calibration(self, has_imu: bool, has_gps: bool) -> tuple[Calibration, LidarModel | None]:
-        """Return extrinsics and lidar model.
-
-        ``calibration.yaml`` beside the bag, or in its folder, comes first; without ``T_imu_lidar`` in it, the frames.
+    def calibration(self, given: Calibration, has_imu: bool, has_gps: bool) -> Calibration:
+        """Return the extrinsics: those that ``calibration.yaml`` gives and, without ``T_imu_lidar`` in it, the frames'.
 
         Raises:
-            DataError: the file is malformed, or there is an IMU and no transform.
+            DataError: there is an IMU and no transform.
         """
         file = calibration_file(self.bag.path)
-        stated = read_calibration_yaml(file)
-        given, model = stated.calibration, stated.lidar
         T_imu_lidar = given.T_imu_lidar
         if has_imu and not _has_key(file, "T_imu_lidar"):
             T_imu_lidar = self._imu_lidar(file)
@@ -68,7 +62,7 @@ class Mounting:
         if antenna is None and has_gps and has_imu:
             T_imu_gps = self.find(self.imu_frame, self.frames.get("gps", ""))
             antenna = None if T_imu_gps is None else T_imu_gps[:3, 3]
-        return Calibration(T_imu_lidar, given.T_camera_lidar, antenna), model
+        return Calibration(T_imu_lidar, given.T_camera_lidar, antenna)
 
     def body_lidar(self, body_frame: str, topic: Topic, calibration: Calibration) -> Array:
         """Return ``T_body_lidar`` of the frame whose poses a reference topic gives; what is assumed is noted."""

@@ -13,7 +13,8 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.geodesy import GeodeticPoint, check_geodetic, enu_from_geodetic
 from hybridlio.core.sensors import NS_PER_S, GpsFix, ImuSamples
 from hybridlio.core.tables import counted
-from hybridlio.datasets.imu_csv import clean_imu
+from hybridlio.datasets.imu_columns import STANDARD_GRAVITY_M_S2
+from hybridlio.datasets.imu_csv import ONE_G, clean_imu
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.rosbag.transforms import pose_of
 from hybridlio.datasets.rosbag.wire import Header
@@ -23,8 +24,6 @@ _MAX_DELAY_S = 1.0  # between a stamp and its receipt; drivers and networks take
 _MAX_DELAY_DIFFERENCE_S = 0.2  # between lidar and IMU; a sweep is stamped 0.1 s before it is sent
 _MIN_SIGMA_M = 1e-3  # a fix declared exact still needs an invertible covariance
 _DEFAULT_SIGMA_M = 5.0  # of a fix without covariance: that of satellite navigation without corrections
-_STANDARD_GRAVITY_M_S2 = 9.80665  # the unit g, by definition
-_ONE_G = (0.9, 1.1)  # of the median specific force: values in g; no vehicle falls at 9 m/s² half of the time
 
 
 @dataclass
@@ -102,9 +101,9 @@ def imu_samples(log: Log, topic: str, notes: Notes) -> ImuSamples:
     values = log.rows()
     force = np.linalg.norm(values[:, 3:], axis=1)
     median = float(np.median(force[np.isfinite(force)])) if np.isfinite(force).any() else 0.0
-    if _ONE_G[0] < median < _ONE_G[1]:
+    if ONE_G[0] < median < ONE_G[1]:
         notes.add(f"{topic}: the median specific force is {median:.2f}, so it is in g; multiplied by 9.80665")
-        values[:, 3:] *= _STANDARD_GRAVITY_M_S2
+        values[:, 3:] *= STANDARD_GRAVITY_M_S2
     return clean_imu(topic, stamps[known], values[known], notes)
 
 

@@ -11,13 +11,15 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import Calibration, ImuSamples
 from hybridlio.core.trajectory import Trajectory
+from hybridlio.datasets.calibration_yaml import read_calibration_yaml
+from hybridlio.datasets.folder import note_mounting, on_scans_clock
 from hybridlio.datasets.gps_csv import note_fixes
 from hybridlio.datasets.kitti.vertical_angle import raised
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.reference import poses_at
 from hybridlio.datasets.rosbag import measurements
 from hybridlio.datasets.rosbag.bag import METADATA, ROS_1, ROS_2_FILES, Bag, Topic, bag_files, part_number
-from hybridlio.datasets.rosbag.extrinsics import Mounting
+from hybridlio.datasets.rosbag.extrinsics import Mounting, calibration_file
 from hybridlio.datasets.rosbag.measurements import Log
 from hybridlio.datasets.rosbag.scans import BagScans
 from hybridlio.datasets.rosbag.topics import TRANSFORM_TYPES, BagTopics, choose
@@ -92,13 +94,17 @@ def open_bag(path: Path, topics: BagTopics | None = None, vertical_angle_deg: fl
 def _open(path: Path, wanted: BagTopics, vertical_angle_deg: float | None) -> Sequence:
     notes, bag = Notes(path.stem if path.is_file() else path.name), Bag(path)
     _note_part(path, notes)
+    stated = read_calibration_yaml(calibration_file(path))
     chosen = choose(bag, wanted, notes)
     contents = _read(bag, chosen)
     mounting = Mounting(bag, contents.tree, wanted, {kind: log.frame for kind, log in contents.logs.items()}, notes)
     scans = _scans(bag, chosen["lidar"], contents.logs["lidar"], notes)
-    scans.learn(notes)
+    scans.learn(stated.format, notes)
     imu = _imu(chosen.get("imu"), contents.logs, notes)
-    calibration, lidar = mounting.calibration(has_imu=len(imu) > 0, has_gps="gps" in chosen)
+    calibration = mounting.calibration(stated.calibration, has_imu=len(imu) > 0, has_gps="gps" in chosen)
+    if len(imu):
+        imu = on_scans_clock(imu, stated.imu_time_offset_ns, notes)
+        note_mounting(imu, calibration.T_imu_lidar, notes)
     note_coverage(imu.stamps_ns, scans.stamps_ns, "inertial data", notes)
     gps = measurements.gps_fixes(contents.logs["gps"], chosen["gps"].name, notes) if "gps" in chosen else ()
     note_fixes(gps, scans.stamps_ns, notes)
@@ -111,7 +117,8 @@ def _open(path: Path, wanted: BagTopics, vertical_angle_deg: float | None) -> Se
         calibration=calibration,
         reference=reference,
         gps=gps,
-        lidar=lidar,
+        lidar=stated.lidar,
+        imu_noise=stated.imu_noise,
         notes=tuple(notes.texts),
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from hybridlio.core.arrays import Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import Scan
 from hybridlio.datasets.notes import Notes
-from hybridlio.datasets.points.point_format import PointFormat, find_format, sampled
+from hybridlio.datasets.points.point_format import PointFormat, StatedFormat, find_format, sampled
 from hybridlio.datasets.rosbag.bag import Bag
 from hybridlio.datasets.rosbag.clouds import LIVOX_TIMES, Columns, cloud_columns, livox_columns
 from hybridlio.datasets.rosbag.topics import LIVOX_TYPES
@@ -68,8 +68,8 @@ class BagScans:
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state, _lock=threading.Lock())
 
-    def learn(self, notes: Notes) -> None:
-        """Find how columns are read from some scans; those that cannot be read are noted.
+    def learn(self, stated: StatedFormat, notes: Notes) -> None:
+        """Find how columns are read from some scans, unless the user states it; scans that cannot be read are noted.
 
         Raises:
             DataError: no scan can be read, or the meaning of a column is not clear.
@@ -84,8 +84,9 @@ class BagScans:
         if not samples:
             raise errors[0]
         step_ns = int(np.median(np.diff(self.stamps_ns))) if len(self.stamps_ns) > 1 else None
-        is_livox = self._bag().topics[self.topic].type in LIVOX_TYPES
-        self.format = find_format(samples, step_ns, notes, LIVOX_TIMES if is_livox else None)
+        if stated.times is None and self._bag().topics[self.topic].type in LIVOX_TYPES:
+            stated = replace(stated, times=LIVOX_TIMES)
+        self.format = find_format(samples, step_ns, notes, stated)
 
     def columns(self, k: int) -> Columns:
         """Return the columns of scan ``k``, as the message holds them.

@@ -89,7 +89,7 @@ def test_the_printed_configuration_can_be_edited_and_used(tiny_drive, tmp_path, 
         (("odometry", "DRIVE", "--residual", "guess"), "'guess'"),
         (("odometry", "DRIVE", "--backend", "guess"), "'guess'"),
         (("odometry", "DRIVE", "--sequence", "7"), "'7'"),
-        (("odometry", "DRIVE", "--reader", "rosbag"), "'rosbag'"),
+        (("odometry", "DRIVE", "--reader", "rosbags"), "'rosbags'"),
         (("odometry", "DRIVE", "--frames", "x"), "'x'"),
         (("odometry", "nowhere", "--frames", "x"), "'x'"),  # checked before the recording is opened
         (("odometry", "DRIVE", "--config", "none.yaml"), "none.yaml"),
