@@ -82,6 +82,10 @@ VerticalAngle = Annotated[
         help="Correct the elevation of all points by this angle; default: 0.205 for recordings by KITTI, else 0.",
     ),
 ]
+Rate = Annotated[
+    float | None,
+    typer.Option("--rate", metavar="HZ", help="Scans per second, for a folder of scans without a file of stamps."),
+]
 Frames = Annotated[str | None, typer.Option("--frames", metavar="A:B", help="Use scans A to B-1 only, counted from 0.")]
 InitialPoseName = Annotated[
     str | None,
@@ -196,6 +200,7 @@ def open_data(
     frames: str | None,
     vertical_angle_deg: float | None,
     topics: BagTopics,
+    rate_hz: float | None,
 ) -> Sequence:
     """Open the recording that the options name, or the part of it in ``frames``."""
     from hybridlio.datasets.registry import open_sequence
@@ -204,7 +209,13 @@ def open_data(
     if frames is not None:
         frame_range(frames)  # report a malformed range before opening a large recording
     whole = open_sequence(
-        data, sequence=sequence, reader=reader, raw_root=raw_root, vertical_angle_deg=vertical_angle_deg, topics=topics
+        data,
+        sequence=sequence,
+        reader=reader,
+        raw_root=raw_root,
+        vertical_angle_deg=vertical_angle_deg,
+        topics=topics,
+        rate_hz=rate_hz,
     )
     return part_of(whole, frames)
 

@@ -44,6 +44,7 @@ def compare(
     config: common.ConfigFile = None,
     frames: common.Frames = None,
     vertical_angle: common.VerticalAngle = None,
+    rate: common.Rate = None,
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", metavar="DIR", help="Write compare.json and compare.md to this folder."),
@@ -62,7 +63,7 @@ def compare(
         _choices(backend or settings.backend, _BACKENDS, "--backend"),
         settings,
     )
-    recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle, topics)
+    recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle, topics, rate)
     if out is not None:
         make_folder(out)  # fail before the runs, not after them
     with progress("comparing") as report:

@@ -34,6 +34,7 @@ def odometry(
     config: common.ConfigFile = None,
     frames: common.Frames = None,
     vertical_angle: common.VerticalAngle = None,
+    rate: common.Rate = None,
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", metavar="RUN", help="The run folder; default runs/<sequence>-<date-time>."),
@@ -52,7 +53,7 @@ def odometry(
 
     chosen = common.load_settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
     estimator = Odometry(config=chosen)  # report unknown names before the recording is opened
-    recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle, topics)
+    recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle, topics, rate)
     adapted = adapt_config(recording, chosen, is_explicit=initial_pose is not None or config is not None)
     if adapted != chosen:
         chosen, estimator = adapted, Odometry(config=adapted)

@@ -27,7 +27,7 @@ _KEYS = (
 _LIDAR_KEYS = ("model", "min_range_m", "max_range_m")
 _TIMES_KEYS = ("column", "unit", "origin", "sweep_s")
 _MAX_TIME_OFFSET_S = 1e10  # of clocks that count from different years; larger ones are another unit
-_MAX_RATE_HZ = 500.0  # of scans; stamps under 2 ms apart are another unit
+MAX_RATE_HZ = 500.0  # of scans; stamps under 2 ms apart are another unit
 _T = TypeVar("_T")
 
 
@@ -110,7 +110,7 @@ def _stated(content: dict[str, Any]) -> StatedCalibration:
         lidar=lidar,
         imu_noise=read("imu_noise", _imu_noise, None),
         imu_time_offset_ns=round(offset_s * NS_PER_S),
-        rate_hz=read("rate_hz", lambda key, value: _number(key, value, 0, _MAX_RATE_HZ), None),
+        rate_hz=read("rate_hz", lambda key, value: _number(key, value, 0, MAX_RATE_HZ), None),
         layout=read("columns", lambda _, value: stated_layout(value), None),
         format=StatedFormat(read("point_times", _point_times, None), limits_m),
     )

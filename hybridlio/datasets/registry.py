@@ -12,6 +12,7 @@ from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.tables import counted
 from hybridlio.datasets import folder
+from hybridlio.datasets.calibration_yaml import MAX_RATE_HZ
 from hybridlio.datasets.imu_faults import without_spikes
 from hybridlio.datasets.kitti import odometry, raw
 from hybridlio.datasets.kitti.vertical_angle import check_angle
@@ -29,11 +30,13 @@ class ReaderOptions:
         raw_root: the root of raw drives to join inertial data from.
         vertical_angle_deg: angle by which points are raised; None to decide by the recording.
         topics: topics and frames of a bag.
+        rate_hz: scans per second of a plain folder without stamps.
     """
 
     raw_root: Path | None = None
     vertical_angle_deg: float | None = None
     topics: BagTopics = field(default_factory=BagTopics)
+    rate_hz: float | None = None
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,9 @@ READERS: dict[str, Reader] = {  # tried in this order
         odometry.find,
         lambda p, o: odometry.open_sequence_folder(p, o.raw_root, o.vertical_angle_deg),
     ),
-    "folder": Reader(folder.LAYOUT, folder.find, lambda p, o: folder.open_folder(p, o.raw_root, o.vertical_angle_deg)),
+    "folder": Reader(
+        folder.LAYOUT, folder.find, lambda p, o: folder.open_folder(p, o.raw_root, o.vertical_angle_deg, o.rate_hz)
+    ),
     "rosbag": Reader(
         rosbag.LAYOUT,
         rosbag.find,
@@ -78,6 +83,7 @@ def open_sequence(
     raw_root: str | os.PathLike[str] | None = None,
     vertical_angle_deg: float | None = None,
     topics: BagTopics | None = None,
+    rate_hz: float | None = None,
 ) -> Sequence:
     """Open the recording at ``path``.
 
@@ -89,17 +95,21 @@ def open_sequence(
         vertical_angle_deg: angle by which each point's elevation is raised, to correct an error of the lidar's vertical
             angles. By default 0.205 for KITTI's own scans, which have this error, and 0 for all others.
         topics: for bags, topics and frames to use; by default chosen by type.
+        rate_hz: for plain folders without a file of stamps, the scans per second.
 
     Raises:
         DataError: no such path, no reader fits (the message lists those tried), several recordings without a
             ``sequence`` that selects one, or a recording that the reader cannot open.
-        ConfigError: unknown ``reader``, or ``vertical_angle_deg`` is over 5°.
+        ConfigError: unknown ``reader``, ``vertical_angle_deg`` is over 5°, or ``rate_hz`` is not above 0.
     """
+    if rate_hz is not None and not 0 < rate_hz <= MAX_RATE_HZ:
+        raise ConfigError(f"rate_hz: must be above 0 and up to {MAX_RATE_HZ:g} scans per second, got {rate_hz:g}")
     root = Path(path).expanduser().resolve()
     name, found = _find(root, reader)
     recording = found[_pick(root, found, sequence)]
     raw = Path(raw_root).expanduser() if raw_root is not None else None
-    return _without_spikes(READERS[name].open(recording, ReaderOptions(raw, vertical_angle_deg, topics or BagTopics())))
+    options = ReaderOptions(raw, vertical_angle_deg, topics or BagTopics(), rate_hz)
+    return _without_spikes(READERS[name].open(recording, options))
 
 
 def _without_spikes(sequence: Sequence) -> Sequence:

@@ -160,6 +160,14 @@ def test_the_vertical_angle_can_be_set(tiny_drive, tmp_path, without_pages):
     assert heights[1] > heights[0] + 0.05
 
 
+def test_scans_without_stamps_run_at_a_given_rate(tiny_drive, tmp_path, without_pages):
+    shutil.copytree(tiny_drive / "velodyne_points/data", tmp_path / "bare")
+    command = ("odometry", tmp_path / "bare", "--residual", "none", "--frames", ":3")
+    assert "give --rate 10" in refused(2, *command)
+    ok(*command, "--rate", 20, "-o", tmp_path / "run")
+    assert read_tum(tmp_path / "run/poses_tum.txt").stamps_ns.tolist() == [0, 50_000_000, 100_000_000]
+
+
 def test_a_reason_shared_by_combinations_is_printed_once(tiny_drive, monkeypatch):
     from hybridlio.core.errors import GraphError
     from hybridlio.graph.run.isam_backend import IncrementalBackend

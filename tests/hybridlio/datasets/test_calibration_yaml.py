@@ -11,7 +11,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from hybridlio.core import se3
-from hybridlio.core.errors import DataError
+from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.lidar_models import LIDAR_MODELS
 from hybridlio.core.sensors import ImuNoise
 from hybridlio.datasets import open_sequence
@@ -145,6 +145,15 @@ class TestInAFolder:
         sequence = open_sequence(tmp_path / "bare")
         np.testing.assert_array_equal(np.diff(sequence.stamps_ns), 50_000_000)
         assert any("20 a second, from 0 s" in note for note in sequence.notes)
+
+    def test_the_rate_given_when_opening_comes_before_that_in_the_file(self, recordings: Any, tmp_path: Path) -> None:
+        for k in range(5):
+            recordings.put_bin(tmp_path / f"bare/{k}.bin", recordings.ride.points(k))
+        (tmp_path / "bare/calibration.yaml").write_text("rate_hz: 20\n")
+        np.testing.assert_array_equal(np.diff(open_sequence(tmp_path / "bare", rate_hz=10).stamps_ns), 100_000_000)
+        for wrong in (0.0, -1.0, 1e9, float("nan")):
+            with pytest.raises(ConfigError, match="rate_hz: must be above 0"):
+                open_sequence(tmp_path / "bare", rate_hz=wrong)
 
     def test_stated_columns_and_times_of_bin_scans_are_used(self, recordings: Any, tmp_path: Path) -> None:
         folder = recordings.write_folder(tmp_path, recordings.ride)
