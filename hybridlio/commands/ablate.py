@@ -72,7 +72,9 @@ def ablate(
 
     Published results are shown beside them. The same command resumes. A row that fails does not stop the others.
     """
+    from hybridlio.datasets.protection import check_output
     from hybridlio.learned.networks.devices import pick_device
+    from hybridlio.runs.own_files import TRAINING, table_files
     from hybridlio.runs.training_data import DataOptions
 
     pick_device(device)
@@ -80,7 +82,12 @@ def ablate(
         raise ConfigError("give either --test DATA, recordings to test on, or --split easy or hard for KITTI odometry")
     chosen = _choose_rows(table, None if rows is None else common.split_names(rows), split)
     folder = out or Path("ablation") / f"table-{table}"
-    options = DataOptions(cache or folder.parent / "shards", None, None, reader, raw_root, topics)
+    shards = cache or folder.parent / "shards"
+    for output in (folder, shards):
+        check_output(output)
+    for files, place in ((table_files(table), folder), *((TRAINING, folder / row.name) for row in chosen)):
+        files.check(place)
+    options = DataOptions(shards, None, None, reader, raw_root, topics)
     budget = f"{steps} steps per row{', reduced size' if reduced else ''}"
     lines = _run_rows(table, chosen, _row_runner(data, test, options, folder, steps, reduced, device))
     _finish(folder, table, lines, budget)

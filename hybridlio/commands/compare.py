@@ -54,7 +54,9 @@ def compare(
 ) -> None:
     """Run the odometry on the same scans with every combination of sources, and print a table of the results."""
     from hybridlio.core.files import make_folder
+    from hybridlio.datasets.protection import check_output
     from hybridlio.runs.compare import combinations, compare_configs, table, write_comparison
+    from hybridlio.runs.own_files import COMPARISON
 
     settings = common.load_settings(config)
     configs = combinations(
@@ -64,8 +66,10 @@ def compare(
         settings,
     )
     recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle, topics, rate)
-    if out is not None:
-        make_folder(out)  # fail before the runs, not after them
+    if out is not None:  # fail before the runs, not after them
+        check_output(out, data)
+        COMPARISON.check(out)
+        make_folder(out)
     with progress("comparing") as report:
         comparison = compare_configs(recording, configs, report)
     print_table(table(comparison))

@@ -41,11 +41,14 @@ def georeference(
     _verbosity: Verbose = 0,
 ) -> None:
     """Align a run with its GPS fixes by one rigid motion; write it as CSV, GeoJSON and TUM."""
+    from hybridlio.datasets.protection import check_output
     from hybridlio.record.record import Record
     from hybridlio.runs.folder import RECORD, read_run
     from hybridlio.smoothing.georeference import georeference as place
     from hybridlio.smoothing.georeference import write_georeferenced
 
+    folder = run if out is None else out
+    check_output(folder)
     stored = read_run(run)
     path = next((p for p in (run / RECORD, run.parent / RECORD) if p.is_file()), None)
     if path is None:
@@ -63,7 +66,7 @@ def georeference(
         f"{stored.metrics['sequence']}: {int(fit.inliers.sum())} of {len(fit.used)} fixes are inliers, "
         f"{fit.rmse_m:.2f} m RMSE, clock offset {1e3 * fit.shift_s:.0f} ± {1e3 * fit.shift_sigma_s:.0f} ms"
     )
-    for written in write_georeferenced(run if out is None else out, placed):
+    for written in write_georeferenced(folder, placed):
         print_result(f"wrote   {written}")
     if placed.origin is None:
         print_warning("the fixes have no geodetic origin; give --origin to get latitudes and longitudes")

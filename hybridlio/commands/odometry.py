@@ -48,7 +48,7 @@ def odometry(
     Without -o, runs/latest links to the newest run. Ctrl-C stops the run and writes what is estimated by then.
     """
     from hybridlio.odometry.odometry import Odometry
-    from hybridlio.runs.folder import new_run_folder
+    from hybridlio.runs.new_folder import new_run_folder
     from hybridlio.runs.run import adapt_config, run_odometry
 
     chosen = common.load_settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
@@ -57,19 +57,18 @@ def odometry(
     adapted = adapt_config(recording, chosen, is_explicit=initial_pose is not None or config is not None)
     if adapted != chosen:
         chosen, estimator = adapted, Odometry(config=adapted)
-    folder = new_run_folder(recording.name, out, overwrite)
-    with progress("odometry") as report:
-        run = run_odometry(recording, estimator, report)
-    _finish(folder, run, chosen, is_latest=out is None)
+    with new_run_folder(recording.name, out, overwrite, data) as folder:
+        with progress("odometry") as report:
+            run = run_odometry(recording, estimator, report)
+        _finish(folder, run, chosen, is_latest=out is None)
 
 
 def _finish(folder: Path, run: Run, config: Config, is_latest: bool) -> None:
     """Write the run and print its result; exit with an error code where it was stopped."""
-    from hybridlio.runs.folder import link_latest
+    from hybridlio.runs.new_folder import link_latest
     from hybridlio.runs.write import write_run
 
     if run.stopped is not None and len(run.estimates) < 2:  # the first pose is the origin, so nothing is estimated
-        _remove_if_empty(folder)
         raise run.stopped
     if isinstance(run.stopped, KeyboardInterrupt):
         print_message("interrupted: writing the estimates so far; interrupt again to discard them", "yellow")
@@ -108,8 +107,3 @@ def _print_result(folder: Path, run: Run, findings: Findings) -> None:
         print_table(metrics_table(findings.evaluations))
     print_result(f"poses   {folder / POSES}")
     print_result(f"report  {folder / REPORT}")
-
-
-def _remove_if_empty(folder: Path) -> None:
-    if not any(folder.iterdir()):
-        folder.rmdir()

@@ -45,6 +45,7 @@ def simulate(
     from pydantic import ValidationError
 
     from hybridlio.datasets.registry import open_sequence
+    from hybridlio.runs.new_folder import RUN
     from hybridlio.simulation import SimulationConfig
     from hybridlio.simulation import simulate as write_drive
 
@@ -57,6 +58,9 @@ def simulate(
         config = SimulationConfig.model_validate(values)
     except ValidationError as error:
         raise ConfigError("; ".join(_describe(e["loc"], e["msg"]) for e in error.errors())) from None
+    place = out.expanduser().resolve()
+    if run := next((above for above in (place, *place.parents) if RUN.are_in(above)), None):
+        raise ConfigError(f"{out} is or lies inside the run folder {run}; choose another folder")
     try:
         with progress("simulating") as report:
             drive = write_drive(out, config, report)

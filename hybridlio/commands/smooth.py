@@ -49,7 +49,8 @@ def smooth(
     """Optimise all poses of a finished run together; write the smoothed trajectory and its report."""
     from hybridlio.record.loop_keyframes import LoopKeyframes
     from hybridlio.record.record import Record
-    from hybridlio.runs.folder import KEYFRAMES, RECORD, SMOOTHED, new_run_folder, read_run
+    from hybridlio.runs.folder import KEYFRAMES, RECORD, SMOOTHED, read_run
+    from hybridlio.runs.new_folder import new_run_folder
     from hybridlio.runs.write import write_smoothed
 
     if not gps and not (antenna is None and outage is None and max_shift is None):
@@ -63,10 +64,9 @@ def smooth(
         record = replace(record, keyframes=LoopKeyframes.load(run / KEYFRAMES))
     start_ns = int(record.online.stamps_ns[0])
     options = gps and gps_options(antenna, max_shift, outage, start_ns)
-    if out is not None:
-        new_run_folder(stored.metrics["sequence"], out, overwrite)
-    smoothed = _smooth(record, loops, options, robust)
-    findings = write_smoothed(folder, stored, record, smoothed)
+    with new_run_folder(stored.metrics["sequence"], folder, overwrite or out is None):
+        smoothed = _smooth(record, loops, options, robust)
+        findings = write_smoothed(folder, stored, record, smoothed)
     _print_result(folder, stored.metrics["sequence"], smoothed, findings)
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -97,10 +96,13 @@ def train(
 
     The same command resumes an interrupted run from its last checkpoint.
     """
+    from hybridlio.datasets.protection import check_output
     from hybridlio.learned.networks.devices import pick_device
     from hybridlio.learned.networks.weights import load_weights, weights_path
+    from hybridlio.runs.own_files import TRAINING
     from hybridlio.runs.recipes import choose_recipe, for_steps
     from hybridlio.runs.training_data import DataOptions, training_pairs
+    from hybridlio.runs.whole_folder import held
 
     pick_device(device)
     if steps is not None and epochs is not None:
@@ -108,15 +110,21 @@ def train(
     start = load_weights(weights_path(init_from)) if init_from is not None else None
     recipe = choose_recipe(preset, start.recipe if start else None, config, initial_pose, epochs)
     folder = out or Path("training") / recipe.name
-    if overwrite and is_first_process():
-        _clear(folder)
-    names = None if sequence is None else common.split_names(sequence)
-    options = DataOptions(cache or folder / "shards", initial_pose, names, reader, raw_root, topics)
-    with first_process_progress("preparing", "scans") as report:
-        pairs, tests = training_pairs(data, validate, split, recipe, options, report)
-    if steps is not None:
-        recipe = for_steps(recipe, steps, len(pairs))
-    _run(recipe, pairs, tests, folder, (init_from, start), device, steps)
+    check_output(folder)
+    if cache is not None:
+        check_output(cache)
+    with held(folder) if is_first_process() else nullcontext():
+        if is_first_process():
+            TRAINING.check(folder)
+            if overwrite:
+                _clear(folder)
+        names = None if sequence is None else common.split_names(sequence)
+        options = DataOptions(cache or folder / "shards", initial_pose, names, reader, raw_root, topics)
+        with first_process_progress("preparing", "scans") as report:
+            pairs, tests = training_pairs(data, validate, split, recipe, options, report)
+        if steps is not None:
+            recipe = for_steps(recipe, steps, len(pairs))
+        _run(recipe, pairs, tests, folder, (init_from, start), device, steps)
 
 
 def _run(
@@ -168,9 +176,12 @@ def _clear(folder: Path) -> None:
     """Delete the files of a training run, and nothing else."""
     from hybridlio.learned.training.train import BEST, CHECKPOINT, WEIGHTS
 
-    for name in (CHECKPOINT, WEIGHTS, BEST, "recipe.json", "log.jsonl"):
-        (folder / name).unlink(missing_ok=True)
-    shutil.rmtree(folder / "tensorboard", ignore_errors=True)
+    events = (folder / "tensorboard").glob("events.out.tfevents.*")
+    files = (folder / name for name in (CHECKPOINT, WEIGHTS, BEST, "log.jsonl", "recipe.json"))
+    for path in (*events, *files):  # the recipe last: it identifies the others
+        path.unlink(missing_ok=True)
+    with suppress(OSError):  # it does not exist, or holds other files
+        (folder / "tensorboard").rmdir()
 
 
 def _describe(p: TrainingProgress) -> str:

@@ -53,6 +53,11 @@ def find(path: Path) -> dict[str, Path]:
     return {p.resolve().name: p for p in here}
 
 
+def is_recording(folder: Path) -> bool:
+    """Return whether the folder itself is a recording: it has a file of stamps, and scans."""
+    return bool(_stamp_files(folder) and _scan_files(folder))
+
+
 def open_folder(
     folder: Path,
     raw_root: Path | None = None,

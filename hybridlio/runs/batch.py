@@ -7,25 +7,28 @@ from __future__ import annotations
 
 import json
 import logging
-import threading
 from collections.abc import Generator, Iterator
 from collections.abc import Sequence as Items
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hybridlio.core.errors import ConfigError, DataError, HybridLioError
+from hybridlio.core.errors import ConfigError, HybridLioError
 from hybridlio.core.files import make_folder, write_atomically
 from hybridlio.core.progress import Progress
+from hybridlio.datasets.protection import check_output
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.registry import check_implementations, check_names
 from hybridlio.runs import engines
-from hybridlio.runs import folder as run_folder
 from hybridlio.runs.batch_table import DONE, DONE_BEFORE, FAILED, NOT_RUN, Batch, BatchRow, summary_metrics, write_batch
+from hybridlio.runs.folder import JOB, LOG, METRICS, is_own_file
+from hybridlio.runs.new_folder import check_free
+from hybridlio.runs.own_files import BATCH
 from hybridlio.runs.recordings import Recording
+from hybridlio.runs.run_log import logged_to
+from hybridlio.runs.whole_folder import held, partial_folder, replaced_folder
 
-JOB, LOG = "batch_job.json", "run.log"
 _log = logging.getLogger("hybridlio")
 
 
@@ -82,7 +85,8 @@ def run_batch(
 ) -> Batch:
     """Run recordings in parallel; write each to ``out/<name>``, and ``batch.json`` and ``batch.md`` to ``out``.
 
-    Complete runs are kept. An interrupt (Ctrl-C) ends the batch and is returned in :attr:`Batch.stopped`.
+    Complete runs are kept. An interrupt (Ctrl-C) ends the batch and is returned in :attr:`Batch.stopped`. With
+    ``overwrite``, an older run stays until the new one is complete.
 
     Args:
         recordings: the recordings, from :func:`hybridlio.runs.recordings.find_recordings`.
@@ -92,8 +96,9 @@ def run_batch(
         progress: called after each recording with its name, recordings done and recordings in all.
 
     Raises:
-        ConfigError: ``out`` holds runs of other recordings or with other settings, the engine is unknown, or the
-            settings are invalid. Nothing is run or removed then.
+        ConfigError: ``out`` touches a recording, holds runs of other recordings or with other settings or files of
+            somebody else, or is being written by another batch; the engine is unknown, or the settings are invalid.
+            Nothing is run or removed then.
         DataError: the folder cannot be created.
         MissingDependencyError: the engine is not installed.
     """
@@ -102,18 +107,21 @@ def run_batch(
         check_names(config.initial_pose, config.residual, config.backend)
     else:
         check_implementations(config)
+    check_output(out, *(recording.path for recording in recordings))
+    BATCH.check(out)
     parallel, threads = _workers(options, len(recordings))
     jobs = [Job(r, out / r.name, config, threads, options.adapt_config) for r in recordings]
     complete = {job.recording for job in jobs if _is_complete(job, options.overwrite)}
     missing = [job for job in jobs if job.recording not in complete]
+    for job in missing:
+        check_free(job.folder, overwrite=True)
     with engines.engine(options.engine, parallel, threads, options.scheduler):
         make_folder(out)
-        for job in missing:
-            _clear(job)
-        rows = {job.recording: _row(job, DONE_BEFORE if job.recording in complete else NOT_RUN) for job in jobs}
-        stopped = _run_missing(missing, rows, out, progress)
-    batch = Batch(out, tuple(rows.values()), stopped)
-    write_batch(batch)
+        with held(out):
+            rows = {job.recording: _row(job, DONE_BEFORE if job.recording in complete else NOT_RUN) for job in jobs}
+            stopped = _run_missing(missing, rows, out, progress)
+            batch = Batch(out, tuple(rows.values()), stopped)
+            write_batch(batch)
     return batch
 
 
@@ -130,6 +138,7 @@ def _run_missing(
     missing: list[Job], rows: dict[Recording, BatchRow], out: Path, progress: Progress | None
 ) -> BaseException | None:
     """Run jobs and update the row of each as it ends; return the interrupt that stopped them, if any."""
+    before = {job.recording: _version(job.folder) for job in missing}
     try:
         for job, reason in _run_all(missing):
             rows[job.recording] = _row(job, DONE if reason is None else FAILED, reason)
@@ -138,7 +147,8 @@ def _run_missing(
                 ended = sum(row.status != NOT_RUN for row in rows.values())
                 progress(job.recording.name, ended, len(rows))
     except KeyboardInterrupt as error:
-        rows |= {job.recording: _row(job, DONE) for job in missing if _is_whole(_metrics(job.folder))}
+        new = (job for job in missing if _version(job.folder) != before[job.recording])
+        rows |= {job.recording: _row(job, DONE) for job in new if _is_whole(_metrics(job.folder))}
         return error
     return None
 
@@ -160,9 +170,10 @@ def _is_complete(job: Job, overwrite: bool) -> bool:
     return False
 
 
-def _clear(job: Job) -> None:
-    run_folder.clear(job.folder)
-    (job.folder / JOB).unlink(missing_ok=True)
+def _version(folder: Path) -> tuple[int, int] | None:
+    """Return what changes when the folder gets a new run."""
+    path = folder / METRICS
+    return (path.stat().st_ino, path.stat().st_mtime_ns) if path.is_file() else None
 
 
 def _is_whole(metrics: dict[str, Any]) -> bool:
@@ -178,13 +189,15 @@ def _description(folder: Path) -> Any:
 
 def _metrics(folder: Path) -> dict[str, Any]:
     try:
-        return dict(json.loads((folder / run_folder.METRICS).read_text(encoding="utf-8")))
+        return dict(json.loads((folder / METRICS).read_text(encoding="utf-8")))
     except (OSError, ValueError):
         return {}
 
 
 def _row(job: Job, status: str, reason: str | None = None) -> BatchRow:
     metrics = _metrics(job.folder)
+    if status in (FAILED, NOT_RUN) and _is_whole(metrics):  # an older run, which the new one would have replaced
+        metrics = {}
     return BatchRow(job.recording, job.folder, status, reason, summary_metrics(metrics) if metrics else {})
 
 
@@ -205,7 +218,7 @@ def _run_all(jobs: list[Job]) -> Iterator[tuple[Job, str | None]]:
                 broken = error
         if broken is None:
             return
-        suspects = [job for job in waiting.values() if (job.folder / JOB).exists()]
+        suspects = [job for job in waiting.values() if (partial_folder(job.folder) / JOB).exists()]
         if not suspects:
             raise broken
         for job in suspects:
@@ -228,73 +241,54 @@ def _run_alone(job: Job) -> str | None:
 def run_job(job: Job) -> tuple[Recording, str | None]:
     """Run one recording and write its run folder; return the recording, and the reason if it failed.
 
-    The library's log of the run is written to the folder's ``run.log``, with the traceback of an unexpected error.
+    The library's log of the run is written to the folder's ``run.log``, with the traceback of an unexpected error. If
+    the run fails without a result, an older run in the folder stays, with the new log.
     """
     try:
-        job.folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(job.folder / JOB, json.dumps(job.description, indent=2) + "\n")
-        with _logged_to(job.folder / LOG):
-            try:
-                _run(job)
-            except HybridLioError as error:
-                _log.error("%s", error)
-                return job.recording, str(error)
-            except Exception as error:
-                _log.exception("a bug in hybridlio")
-                return job.recording, f"{type(error).__name__}: {error} (a bug in hybridlio; {LOG} has the traceback)"
-    except (OSError, DataError) as error:
+        check_free(job.folder, overwrite=True)
+        with replaced_folder(job.folder, is_own_file) as part:
+            write_atomically(part / JOB, json.dumps(job.description, indent=2) + "\n")
+            with logged_to(part / LOG):
+                reason = _run_in(part, job)
+            if reason is not None and not (part / METRICS).exists() and (job.folder / METRICS).exists():
+                write_atomically(job.folder / LOG, (part / LOG).read_bytes())
+                raise _NoResultError(reason)
+    except _NoResultError as error:
+        return job.recording, str(error)
+    except (OSError, HybridLioError) as error:
         return job.recording, f"{job.folder}: cannot be written: {error}"
-    return job.recording, None
+    return job.recording, reason
 
 
-def _run(job: Job) -> None:
+class _NoResultError(Exception):
+    """Keeps an older run from being replaced by one without a result."""
+
+
+def _run_in(folder: Path, job: Job) -> str | None:
+    """Run a job and write the files to a folder; return the reason if it failed."""
+    try:
+        _run(job, folder)
+    except HybridLioError as error:
+        _log.error("%s", error)
+        return str(error)
+    except Exception as error:
+        _log.exception("a bug in hybridlio")
+        return f"{type(error).__name__}: {error} (a bug in hybridlio; {LOG} has the traceback)"
+    return None
+
+
+def _run(job: Job, folder: Path) -> None:
     from hybridlio.odometry.odometry import Odometry
     from hybridlio.runs.run import adapt_config, run_odometry
-    from hybridlio.runs.write import write_run
+    from hybridlio.runs.write import write_run_files
 
     sequence = job.recording.open()
     config = adapt_config(sequence, job.config, is_explicit=not job.adapt_config)
-    run = run_odometry(sequence, Odometry(config=_with_thread_limit(config, job.threads)))
+    run = run_odometry(sequence, Odometry(config=engines.with_thread_limit(config, job.threads)))
     if isinstance(run.stopped, KeyboardInterrupt):
         raise run.stopped
     if run.stopped is not None and len(run.estimates) < 2:
         raise run.stopped
-    write_run(job.folder, run, config)
+    write_run_files(folder, run, config)
     if run.stopped is not None:
         raise run.stopped
-
-
-def _with_thread_limit(config: Config, threads: int) -> Config:
-    """Return the settings with every ``threads`` reduced to the limit."""
-
-    def limit(tree: dict[str, Any]) -> dict[str, Any]:
-        return {
-            key: limit(value)
-            if isinstance(value, dict)
-            else min(value, threads)
-            if key == "threads" and value is not None
-            else value
-            for key, value in tree.items()
-        }
-
-    return Config.model_validate(limit(config.model_dump()))
-
-
-@contextmanager
-def _logged_to(file: Path) -> Iterator[None]:
-    """Write what hybridlio and matplotlib log in this thread to a file."""
-    thread = threading.get_ident()
-    handler = logging.FileHandler(file, mode="w", encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    handler.addFilter(lambda record: record.thread == thread)
-    loggers, level = (_log, logging.getLogger("matplotlib")), _log.level
-    for logger in loggers:
-        logger.addHandler(handler)
-    _log.setLevel(min(logging.INFO, level) if level else logging.INFO)
-    try:
-        yield
-    finally:
-        _log.setLevel(level)
-        for logger in loggers:
-            logger.removeHandler(handler)
-        handler.close()

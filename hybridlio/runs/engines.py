@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from hybridlio.core.errors import ConfigError, MissingDependencyError
+from hybridlio.odometry.config import Config
 
 Task = tuple[Callable[..., Any], tuple[Any, ...]]
 
@@ -125,3 +126,19 @@ def _or_none(get_client: Callable[[], Any]) -> Any:
 
 
 _CONNECT: dict[str, Callable[[str | None, int | None], Any]] = {"dask": _dask, "ray": _ray}
+
+
+def with_thread_limit(config: Config, threads: int) -> Config:
+    """Return the settings with every ``threads`` reduced to the limit."""
+
+    def limit(tree: dict[str, Any]) -> dict[str, Any]:
+        return {
+            key: limit(value)
+            if isinstance(value, dict)
+            else min(value, threads)
+            if key == "threads" and value is not None
+            else value
+            for key, value in tree.items()
+        }
+
+    return Config.model_validate(limit(config.model_dump()))

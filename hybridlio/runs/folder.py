@@ -1,25 +1,21 @@
-"""Run folders: the files of a run, and how to create, write and read them.
+"""Run folders: the files of a run, and how to write and read them.
 
 ``metrics.json`` is written last: a folder that has it is complete.
 """
 
 from __future__ import annotations
 
-import datetime
 import json
-import logging
-import os
+import re
 from collections.abc import Sequence as Items
-from contextlib import suppress
 from dataclasses import dataclass
-from itertools import count
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybridlio.core.errors import ConfigError, DataError
+from hybridlio.core.errors import DataError
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.files import UNREADABLE_NPZ, atomic_path, write_atomically
 from hybridlio.core.motion_limits import unknown_motion_covariance
@@ -29,12 +25,14 @@ from hybridlio.core.trajectory_files import read_tum, write_kitti, write_tum
 from hybridlio.evaluation.ate_rpe import select
 from hybridlio.evaluation.evaluate import Steps
 
-_log = logging.getLogger(__name__)
-
 POSES, KITTI, COVARIANCES, GRAPH = "poses_tum.txt", "poses_kitti.txt", "covariances.npz", "graph.g2o"
 RECORD, CONFIG, METRICS, REFERENCE = "odometry.npz", "config.yaml", "metrics.json", "reference_tum.txt"
 REPORT, PICTURE, SMOOTHED, KEYFRAMES = "report.html", "trajectory.png", "smoothed", "keyframes.npz"
 FILES = (POSES, KITTI, COVARIANCES, GRAPH, RECORD, KEYFRAMES, CONFIG, METRICS, REFERENCE, REPORT, PICTURE)
+JOB, LOG = "batch_job.json", "run.log"  # of a run by `hybridlio batch`
+_OWN = frozenset((*FILES, JOB, LOG))
+_STEMS = "|".join(Path(name).stem for name in sorted(_OWN))
+_TEMPORARY = re.compile(rf"\.({_STEMS})\.[0-9a-f]{{12}}\.\w+")  # names of hybridlio.core.files.atomic_path
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,74 +62,13 @@ class StoredRun:
         return None if T is None else np.array(T, dtype=np.float64)
 
 
-def new_run_folder(sequence: str, out: Path | None, overwrite: bool) -> Path:
-    """Create and return the folder to write a run to. Called before the run, so that missing rights show early.
-
-    Without ``out`` it is ``runs/<sequence>-<date-time>``, with a number appended if that folder exists.
-
-    Raises:
-        ConfigError: ``out`` holds a run, or other files with the names of a run's files, and ``overwrite`` is not set.
-        DataError: the folder cannot be created.
-    """
-    if out is not None and not overwrite:
-        _check_free(out)
-    wanted = out or Path("runs") / f"{sequence}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-    try:
-        if out is None:
-            return _create_unique(wanted)
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"cannot create the run folder {wanted}: {error.strerror}; choose another with -o") from None
-    return out
-
-
-def _check_free(out: Path) -> None:
-    if (out / METRICS).exists():
-        raise ConfigError(f"{out} already holds a run; choose another folder, or give --overwrite to replace it")
-    existing = [name for name in (*FILES, SMOOTHED) if (out / name).exists()]
-    if existing:
-        raise ConfigError(
-            f"{out} holds {existing[0]} but no finished run; choose another folder, or give --overwrite to replace it"
-        )
-
-
-def _create_unique(wanted: Path) -> Path:
-    """Create the folder, or one with a number appended, such that no other process has or gets the same."""
-    for number in count(1):
-        folder = wanted if number == 1 else wanted.with_name(f"{wanted.name}-{number}")
-        with suppress(FileExistsError):
-            folder.mkdir(parents=True)
-            return folder
-    raise AssertionError("unreachable")
-
-
-def clear(folder: Path) -> None:
-    """Remove the files of a run and of its smoothing, and nothing else.
-
-    ``metrics.json`` goes first, so that a folder that is left half-way does not count as complete.
-    """
-    for one in (folder, folder / SMOOTHED):
-        for name in (METRICS, *FILES):
-            (one / name).unlink(missing_ok=True)
-    with suppress(OSError):  # it does not exist, or it holds other files
-        (folder / SMOOTHED).rmdir()
-
-
-def link_latest(folder: Path) -> None:
-    """Make ``latest`` beside the folder a link to it; an older link is replaced in one step.
-
-    Failure, as on a file system without links, is only logged: it must not lose a finished run.
-    """
-    link = folder.parent / "latest"
-    if link.exists() and not link.is_symlink():
-        return
-    temporary = folder.parent / f".latest.{os.getpid()}"
-    try:
-        temporary.unlink(missing_ok=True)
-        temporary.symlink_to(folder.name)
-        temporary.replace(link)
-    except OSError as error:
-        _log.warning("cannot link %s to %s: %s", link, folder.name, error.strerror or error)
+def is_own_file(path: PurePath) -> bool:
+    """Return whether a path, relative to a run folder, is that of a file which the program writes there."""
+    head, *rest = path.parts
+    if head.startswith(f".{SMOOTHED}."):  # a smoothing that was killed
+        return True
+    name = rest[0] if head == SMOOTHED and len(rest) == 1 else head if not rest else ""
+    return name in _OWN or bool(_TEMPORARY.fullmatch(name))
 
 
 def write_trajectory(

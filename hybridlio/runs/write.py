@@ -20,7 +20,9 @@ from hybridlio.evaluation.report_data import Findings, ReportData, analyse
 from hybridlio.odometry.config import Config, config_to_yaml
 from hybridlio.record.record import Record
 from hybridlio.runs import folder as run_folder
+from hybridlio.runs.new_folder import check_free
 from hybridlio.runs.run import Run
+from hybridlio.runs.whole_folder import replaced_folder
 
 if TYPE_CHECKING:
     from hybridlio.smoothing.gps_options import GpsFit
@@ -34,18 +36,27 @@ _LARGE_SHARE = 0.1  # of all scans; more conflicts with the IMU than single bad 
 
 
 def write_run(folder: Path, run: Run, config: Config) -> Findings:
-    """Write all files of a run, complete or interrupted, and remove those of an earlier run in the folder.
+    """Write all files of a run, complete or interrupted, to a folder that appears whole or replaces an earlier run.
+
+    Files in the folder that no run has are kept.
 
     Returns:
         The evaluation of the run.
 
     Raises:
         EstimationError: the run has no estimate.
+        ConfigError: the folder is no run folder, touches a recording, or is being written by another process.
         DataError: a file cannot be written.
     """
+    check_free(folder, overwrite=True)
+    with replaced_folder(folder, run_folder.is_own_file) as part:
+        return write_run_files(part, run, config)
+
+
+def write_run_files(folder: Path, run: Run, config: Config) -> Findings:
+    """Write all files of a run to an empty folder; see :func:`write_run`, which callers want."""
     if not run.estimates:
         raise EstimationError(f"{run.sequence.name}: the run has no estimate to write")
-    run_folder.clear(folder)
     sequence, trajectory, record = run.sequence, run.trajectory, run.record
     if record is not None:
         record.save(folder / run_folder.RECORD)
@@ -196,9 +207,15 @@ def write_smoothed(folder: Path, stored: run_folder.StoredRun, record: Record, s
         The evaluation of both trajectories.
 
     Raises:
+        ConfigError: the folder is no run folder, touches a recording, or is being written by another process.
         DataError: a file cannot be written.
     """
-    run_folder.clear(folder)
+    check_free(folder, overwrite=True)
+    with replaced_folder(folder, run_folder.is_own_file) as part:
+        return _write_smoothed_files(part, stored, record, smoothed)
+
+
+def _write_smoothed_files(folder: Path, stored: run_folder.StoredRun, record: Record, smoothed: Smoothed) -> Findings:
     trajectory, T = smoothed.trajectory, stored.T_camera_lidar
     steps = Steps(se3.between(trajectory.poses[:-1], trajectory.poses[1:]), smoothed.step_covariances)
     run_folder.write_trajectory(folder, trajectory, T, steps, stored.stamps_before)

@@ -15,6 +15,7 @@ from hybridlio.core.files import locked, write_atomically
 from hybridlio.core.geodesy import origin_of
 from hybridlio.core.progress import Progress
 from hybridlio.core.sensors import NS_PER_S
+from hybridlio.datasets.protection import check_output
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.kitti_writer import (
     FIRST_PLACE,
@@ -62,10 +63,11 @@ def simulate(out: Path, config: SimulationConfig, progress: Progress | None = No
         calibration and the 100 Hz rows (``…_extract``) are beside it.
 
     Raises:
-        DataError: ``out`` holds a drive of this seed with other settings or cannot be written to, or the pose file is
-            malformed.
-        ConfigError: there is no such pose file.
+        DataError: ``out`` holds a drive of this seed with other settings, or other files in its place, or cannot be
+            written to, or the pose file is malformed.
+        ConfigError: there is no such pose file, or ``out`` is or lies inside a recording.
     """
+    check_output(out, may_hold=True)
     description = describe(config)
     done = DriveFolders(Path(out), config.seed % 10000)
     if done.sync.exists():
@@ -85,10 +87,33 @@ def simulate(out: Path, config: SimulationConfig, progress: Progress | None = No
 
 def _move(partial: DriveFolders, done: DriveFolders) -> None:
     """Move a drive to its place. The ``sync`` folder, whose existence marks a finished drive, is moved last."""
-    write_calibration(done.date)
+    write_calibration(partial.date)
+    done.date.mkdir(parents=True, exist_ok=True)
+    for source in sorted(partial.date.glob("calib_*.txt")):
+        _move_new(source, done.date / source.name)
     for source, target in ((partial.extract, done.extract), (partial.sync, done.sync)):
-        shutil.rmtree(target, ignore_errors=True)
-        source.rename(target)
+        _move_new(source, target)
+
+
+def _move_new(source: Path, target: Path) -> None:
+    """Move a file or folder to its place, which is free, or holds the same already after a killed move.
+
+    Raises:
+        DataError: it holds something else, which this program did not write.
+    """
+    if target.exists() or target.is_symlink():
+        if not _are_equal(source, target):
+            raise DataError(f"{target} exists and is not of this simulation; choose another folder")
+        return
+    source.rename(target)
+
+
+def _are_equal(a: Path, b: Path) -> bool:
+    """Return whether two files, or all files of two folders, are equal to the last byte."""
+    if a.is_file() or b.is_file():
+        return a.is_file() and b.is_file() and a.read_bytes() == b.read_bytes()
+    files, others = ({p.relative_to(root) for p in root.rglob("*") if p.is_file()} for root in (a, b))
+    return files == others and all((a / name).read_bytes() == (b / name).read_bytes() for name in files)
 
 
 def describe(config: SimulationConfig) -> dict[str, Any]:

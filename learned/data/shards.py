@@ -87,9 +87,12 @@ def write_shard(
     """Write scans, taken one by one, as a shard that appears when it is complete; one that is there is replaced.
 
     Raises:
-        DataError: there are fewer than two scans, or a record's arrays have wrong shapes.
+        DataError: the folder holds something else than a shard, there are fewer than two scans, or a record's arrays
+            have wrong shapes.
     """
     folder = Path(folder)
+    if folder.exists() and not (folder / "shard.json").is_file():
+        raise DataError(f"{folder} exists and is no shard; choose another folder for prepared recordings")
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:12]}")
     temporary.mkdir()

@@ -176,9 +176,9 @@ class _Run:
             put_weights(self.network, start, "the weights to start from")
         self.place.wait()  # before the first process writes where the others look
         if self.place.leads:
+            write_atomically(self.out / "recipe.json", json.dumps(to_dict(self.recipe), indent=2) + "\n")
             self.log = TrainingLog(self.out, self.step)
             self.best.forget_after(self.step)
-            write_atomically(self.out / "recipe.json", json.dumps(to_dict(self.recipe), indent=2) + "\n")
         self.objective = self.place.joined(Objective(self.network, self.recipe.loss))
 
     def train(self, validation: Pairs | None) -> None:

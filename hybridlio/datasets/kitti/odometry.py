@@ -63,15 +63,16 @@ RAW_DRIVES: dict[str, RawDrive] = {
 }
 
 
-def _is_sequence(path: Path) -> bool:
+def is_sequence(path: Path) -> bool:
+    """Return whether the folder itself is a sequence: it has ``velodyne/`` and ``times.txt``."""
     return (path / "velodyne").is_dir() and (path / "times.txt").is_file()
 
 
 def find(path: Path) -> dict[str, Path]:
     """Find the sequences at, below or directly above ``path``: folders by name, such as ``00``."""
-    here = [p for p in (path, path.parent) if _is_sequence(p)][:1]
+    here = [p for p in (path, path.parent) if is_sequence(p)][:1]
     below = (p for pattern in ("*", "sequences/*", "dataset/sequences/*") for p in path.glob(pattern))
-    return {p.resolve().name: p for p in here or sorted(filter(_is_sequence, below))}
+    return {p.resolve().name: p for p in here or sorted(filter(is_sequence, below))}
 
 
 def open_sequence_folder(

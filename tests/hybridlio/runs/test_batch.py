@@ -15,6 +15,7 @@ from hybridlio.runs import batch, engines
 from hybridlio.runs.batch import BatchOptions, Job, run_batch, run_job
 from hybridlio.runs.batch_table import DONE, DONE_BEFORE, FAILED, NOT_RUN
 from hybridlio.runs.recordings import Recording, find_recordings
+from hybridlio.runs.whole_folder import partial_folder
 
 cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers cannot import tests
 
@@ -77,8 +78,9 @@ def test_an_interrupted_run_is_run_again(two, tmp_path):
 
 def run_or_die(job: Job) -> tuple[Recording, str | None]:
     if job.recording.name == "deadly":
-        job.folder.mkdir(parents=True, exist_ok=True)
-        (job.folder / batch.JOB).write_text("{}")
+        partial = partial_folder(job.folder)
+        partial.mkdir(parents=True)
+        (partial / batch.JOB).write_text("{}")
         os._exit(9)
     return run_job(job)
 
@@ -118,9 +120,9 @@ def test_each_job_runs_in_its_own_process_with_the_given_threads():
 
 
 def test_the_thread_limit_applies_to_all_parts_of_the_settings():
-    matching = batch._with_thread_limit(Config(), 1).scan_matching
+    matching = engines.with_thread_limit(Config(), 1).scan_matching
     assert (matching.registration.threads, matching.local_map.threads) == (1, 1)
-    assert batch._with_thread_limit(Config(), 99) == Config()
+    assert engines.with_thread_limit(Config(), 99) == Config()
 
 
 def test_a_batch_runs_on_a_dask_cluster(two, tmp_path):
@@ -210,7 +212,7 @@ def test_a_range_outside_one_recording_fails_for_that_recording_only(two, tmp_pa
 
 
 def test_an_unexpected_error_is_the_recordings_reason_with_a_traceback_in_its_log(two, tmp_path, monkeypatch):
-    monkeypatch.setattr("hybridlio.runs.write.write_run", lambda *_: 1 // 0)
+    monkeypatch.setattr("hybridlio.runs.write.write_run_files", lambda *_: 1 // 0)
     done = run_batch(two[:1], tmp_path, QUICK, BatchOptions(engine="sequential"))
     assert "ZeroDivisionError" in done.rows[0].reason
     assert "Traceback" in (done.rows[0].folder / "run.log").read_text()

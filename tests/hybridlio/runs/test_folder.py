@@ -1,10 +1,8 @@
 import json
 import re
 import shutil
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from threading import Barrier
 
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ from scipy.integrate import trapezoid
 from scipy.spatial.transform import Rotation
 
 from hybridlio.core import se3
-from hybridlio.core.errors import ConfigError, DataError, EstimationError
+from hybridlio.core.errors import DataError, EstimationError
 from hybridlio.core.sensors import Calibration
 from hybridlio.core.trajectory_files import read_kitti, read_tum
 from hybridlio.datasets.registry import open_sequence
@@ -166,88 +164,6 @@ def test_writing_a_run_without_estimates_is_an_error_and_keeps_an_older_run(fold
     with pytest.raises(EstimationError, match="no estimate to write"):
         write_run(folder, run, CONFIG)
     assert run_folder.is_run_folder(folder)
-
-
-def test_a_run_is_replaced_only_with_overwrite(folder):
-    with pytest.raises(ConfigError, match="--overwrite"):
-        run_folder.new_run_folder("town", folder, overwrite=False)
-    assert run_folder.new_run_folder("town", folder, overwrite=True) == folder
-
-
-def test_a_new_run_removes_the_files_of_an_old_one_and_keeps_other_files(without_pages, run, tmp_path):
-    write_run(tmp_path, run, CONFIG)
-    (tmp_path / "smoothed").mkdir()
-    (tmp_path / "smoothed/poses_tum.txt").write_text("old")
-    (tmp_path / "my notes.txt").write_text("mine")
-    short = replace(run, sequence=replace(run.sequence, reference=None))
-    write_run(tmp_path, short, CONFIG)
-    assert not (tmp_path / "smoothed").exists()
-    assert not (tmp_path / "reference_tum.txt").exists()
-    assert (tmp_path / "my notes.txt").read_text() == "mine"
-
-
-@pytest.mark.parametrize("name", ["config.yaml", "smoothed/thesis.txt"])
-def test_a_folder_with_files_named_like_a_runs_is_used_only_with_overwrite(tmp_path, name):
-    mine = tmp_path / name
-    mine.parent.mkdir(exist_ok=True)
-    mine.write_text("mine")
-    with pytest.raises(ConfigError, match=f"holds {name.split('/')[0]} but no finished run"):
-        run_folder.new_run_folder("town", tmp_path, overwrite=False)
-    assert run_folder.new_run_folder("town", tmp_path, overwrite=True) == tmp_path
-    assert mine.read_text() == "mine"
-
-
-def test_clear_removes_only_files_of_a_run(without_pages, run, tmp_path):
-    write_run(tmp_path, run, CONFIG)
-    (tmp_path / "smoothed").mkdir()
-    for name in ("poses_tum.txt", "metrics.json", "thesis.txt"):
-        (tmp_path / "smoothed" / name).write_text("old")
-    run_folder.clear(tmp_path)
-    assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.*")] == ["smoothed/thesis.txt"]
-
-
-def test_default_folders_are_named_after_the_sequence_and_unique_within_a_second(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    made = [run_folder.new_run_folder("town", None, overwrite=False) for _ in range(3)]
-    assert len(set(made)) == 3
-    assert all(re.fullmatch(r"runs/town-\d{8}-\d{6}(-\d)?", str(path)) for path in made)
-    assert all(path.is_dir() for path in made)
-
-
-def test_runs_that_begin_at_once_get_different_folders(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    ready = Barrier(8)
-
-    def begin(_: int) -> Path:
-        ready.wait()
-        return run_folder.new_run_folder("town", None, overwrite=False)
-
-    with ThreadPoolExecutor(8) as runs:
-        assert len(set(runs.map(begin, range(8)))) == 8
-
-
-def test_the_error_for_a_run_folder_that_cannot_be_created_names_it(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("runs").write_text("a file")
-    for out in (None, Path("runs/mine")):
-        with pytest.raises(DataError, match="cannot create the run folder runs/"):
-            run_folder.new_run_folder("town", out, overwrite=False)
-
-
-def test_latest_links_to_the_newest_run_by_a_relative_path(tmp_path):
-    for name in ("a", "b"):
-        (tmp_path / "runs" / name).mkdir(parents=True)
-        run_folder.link_latest(tmp_path / "runs" / name)
-    (tmp_path / "runs").rename(tmp_path / "moved")
-    assert (tmp_path / "moved/latest").resolve() == tmp_path / "moved/b"
-    assert sorted(path.name for path in (tmp_path / "moved").iterdir()) == ["a", "b", "latest"]
-
-
-def test_an_existing_folder_named_latest_is_kept(tmp_path):
-    (tmp_path / "latest").mkdir()
-    (tmp_path / "a").mkdir()
-    run_folder.link_latest(tmp_path / "a")
-    assert not (tmp_path / "latest").is_symlink()
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,81 @@
+"""Keeps recordings from being written to: decides whether a folder may take the output of a command."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from hybridlio.core.errors import ConfigError
+from hybridlio.datasets import folder as plain_folder
+from hybridlio.datasets.kitti import odometry
+from hybridlio.datasets.rosbag.reader import SUFFIXES
+
+# Levels below the output folder that are searched for recordings: KITTI's root/date/drive is 2 deep, its
+# dataset/sequences/00 is 3 deep.
+_SEARCH_DEPTH = 3
+_MAX_FOLDERS = 5000  # keeps the search below about a second, also where somebody writes to a home folder
+
+
+def check_output(folder: str | os.PathLike[str], *recordings: str | os.PathLike[str], may_hold: bool = False) -> None:
+    """Check that writing to a folder cannot damage a recording. It need not exist.
+
+    Args:
+        folder: the folder to write to.
+        recordings: paths of recordings that must be neither the folder nor below it, whatever their layout.
+        may_hold: allow recordings below the folder, for a command that writes recordings itself.
+
+    Raises:
+        ConfigError: the folder is a recording, lies inside one, or holds one.
+    """
+    out = Path(folder).expanduser().resolve()
+    inside = next((above for above in (out, *out.parents) if is_recording(above)), None)
+    if inside is not None:
+        raise _refusal(folder, "is" if inside == out else "lies inside", inside)
+    if may_hold:
+        return
+    given = (Path(path).expanduser().resolve() for path in recordings)
+    held = next((path for path in given if path == out or out in path.parents), None) or next(_below(out), None)
+    if held is not None:
+        raise _refusal(folder, "is" if held == out else "holds", held)
+
+
+def _refusal(folder: str | os.PathLike[str], how: str, recording: Path) -> ConfigError:
+    which = "a recording" if how == "is" else f"the recording {recording}"
+    return ConfigError(f"{os.fspath(folder)} {how} {which}; recordings are never written to: choose another folder")
+
+
+def is_recording(folder: Path) -> bool:
+    """Return whether the folder itself is a recording of any layout: KITTI's, a plain folder or a split bag."""
+    if not folder.is_dir():
+        return False
+    if (folder / "velodyne_points").is_dir() or odometry.is_sequence(folder) or plain_folder.is_recording(folder):
+        return True
+    return (folder / "metadata.yaml").is_file() and any(p.suffix in SUFFIXES for p in folder.iterdir())
+
+
+def _below(out: Path) -> Iterator[Path]:
+    """Yield the recordings below a folder, those of the upper levels first; hidden folders and links are left out."""
+    level, visited = [out], 0
+    for _ in range(_SEARCH_DEPTH + 1):
+        deeper: list[Path] = []
+        for path in level:
+            visited += 1
+            if visited > _MAX_FOLDERS:
+                return
+            folders, bags = _entries(path)
+            yield from bags
+            yield from (one for one in folders if is_recording(one))
+            deeper += folders
+        level = deeper
+
+
+def _entries(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Return the folders and the bags directly below a folder; none if it cannot be listed."""
+    try:
+        with os.scandir(folder) as found:
+            entries = sorted((entry for entry in found if not entry.name.startswith(".")), key=lambda e: e.name)
+            folders = [Path(entry) for entry in entries if entry.is_dir(follow_symlinks=False)]
+    except OSError:
+        return [], []
+    return folders, [Path(entry) for entry in entries if Path(entry).suffix in SUFFIXES]

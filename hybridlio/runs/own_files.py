@@ -1,0 +1,62 @@
+"""The files that each command writes, and how they are told from files of the same names by somebody else."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hybridlio.core.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class OwnFiles:
+    """The files that a command writes to a folder.
+
+    Attributes:
+        names: their names.
+        marker: the one among them that identifies all: a JSON object.
+        keys: keys that this object always has.
+    """
+
+    names: tuple[str, ...]
+    marker: str
+    keys: frozenset[str]
+
+    def are_in(self, folder: Path) -> bool:
+        """Return whether the command wrote its files to the folder before."""
+        return self.keys <= _keys(folder / self.marker)
+
+    def check(self, folder: Path) -> None:
+        """Check that writing the files, or removing them, concerns no file of somebody else.
+
+        Raises:
+            ConfigError: the folder holds a file of such a name, but not the command's marker.
+        """
+        present = [name for name in self.names if (folder / name).exists() or (folder / name).is_symlink()]
+        if present and not self.are_in(folder):
+            raise ConfigError(f"{folder / present[0]} was not written by hybridlio; choose another folder with -o")
+
+
+def _keys(path: Path) -> set[str]:
+    try:
+        content: Any = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return set()
+    return set(content) if isinstance(content, dict) else set()
+
+
+BATCH = OwnFiles(("batch.json", "batch.md"), "batch.json", frozenset({"summary", "recordings"}))
+COMPARISON = OwnFiles(("compare.json", "compare.md"), "compare.json", frozenset({"sequence", "scans", "rows"}))
+TRAINING = OwnFiles(
+    ("recipe.json", "checkpoint.pt", "weights.safetensors", "best.safetensors", "log.jsonl"),
+    "recipe.json",
+    frozenset({"name", "network", "loss", "optimiser"}),
+)
+
+
+def table_files(number: int) -> OwnFiles:
+    """Return the files of the ablation's table ``number``."""
+    name = f"table-{number}"
+    return OwnFiles((f"{name}.json", f"{name}.md"), f"{name}.json", frozenset({"table", "budget", "lines"}))

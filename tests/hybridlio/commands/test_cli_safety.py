@@ -1,0 +1,141 @@
+"""No command writes to a recording or replaces a file that it did not write; a killed run loses no result."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import ok, refused
+
+from hybridlio.datasets.registry import open_sequence
+from hybridlio.runs.folder import is_run_folder
+from hybridlio.runs.whole_folder import held
+
+pytestmark = pytest.mark.usefixtures("plain_logging", "without_pages")
+QUICK = ("--residual", "none", "--frames", ":4")
+
+
+def snapshot(root: Path) -> dict[str, str]:
+    files = (p for p in root.rglob("*") if p.is_file())
+    return {str(p.relative_to(root)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+@pytest.fixture
+def recording(tiny_drive: Path, tmp_path: Path) -> Path:
+    """A plain folder ``D/a`` with its truth in ``poses_tum.txt``."""
+    sequence = open_sequence(tiny_drive)
+    folder = tmp_path / "D" / "a"
+    (folder / "scans").mkdir(parents=True)
+    for k in range(4):
+        np.save(folder / "scans" / f"{k}.npy", sequence[k].scan.points)
+    (folder / "timestamps.txt").write_text("".join(f"{stamp / 1e9:.9f}\n" for stamp in sequence.stamps_ns[:4]))
+    identity = " 0 0 0 0 0 0 1\n"
+    (folder / "poses_tum.txt").write_text("".join(f"{s / 1e9:.9f}{identity}" for s in sequence.stamps_ns[:4]))
+    return folder
+
+
+def test_no_command_writes_to_a_folder_that_is_holds_or_lies_inside_a_recording(recording, finished_run, tmp_path):
+    before = snapshot(tmp_path / "D")
+    for out in (recording, recording / "run", recording.parent):
+        for words in (
+            ("odometry", recording, "-o", out),
+            ("odometry", recording, "-o", out, "--overwrite"),
+            ("batch", recording, "-o", out),
+            ("batch", recording, "-o", out, "--overwrite"),
+            ("compare", recording, "-o", out),
+            ("smooth", finished_run, "-o", out, "--overwrite"),
+            ("georeference", finished_run, "-o", out),
+            ("train", recording, "-o", out, "--overwrite"),
+            ("train", recording, "-o", tmp_path / "training", "--cache", out),
+            ("ablate", recording, "--table", 1, "--test", recording, "-o", out),
+        ):
+            assert "recordings are never written to" in refused(2, *words)
+    for out in (recording, recording / "scans"):
+        assert "recordings are never written to" in refused(2, "simulate", out, "--seconds", 1)
+    assert snapshot(tmp_path / "D") == before
+
+
+def test_a_batch_beside_the_recordings_is_allowed(recording, tmp_path):
+    before = snapshot(recording)
+    ok("batch", recording, "-o", recording.parent / "results", "--residual", "none", "--engine", "threading")
+    assert is_run_folder(recording.parent / "results" / "a")
+    assert snapshot(recording) == before
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("batch.md", ("batch", "DATA", "-o", "OUT")),
+        ("batch.json", ("batch", "DATA", "-o", "OUT", "--overwrite")),
+        ("a/poses_tum.txt", ("batch", "DATA", "-o", "OUT", "--overwrite")),
+        ("compare.md", ("compare", "DATA", "-o", "OUT")),
+        ("checkpoint.pt", ("train", "DATA", "-o", "OUT", "--overwrite")),
+        ("table-1.md", ("ablate", "DATA", "--table", "1", "--test", "DATA", "-o", "OUT")),
+        ("poses_tum.txt", ("odometry", "DATA", "-o", "OUT", "--overwrite")),
+        ("2026_01_01/calib_cam_to_cam.txt", ("simulate", "OUT", "--seconds", "0.3", "--lidar", "16-beam")),
+    ],
+)
+def test_a_file_that_the_program_did_not_write_is_not_replaced(recording, tmp_path, name, words):
+    out = tmp_path / "out"
+    (out / name).parent.mkdir(parents=True)
+    (out / name).write_text("mine")
+    line = refused(2, *({"DATA": recording, "OUT": out}.get(word, word) for word in words))
+    assert str(out) in line
+    assert (out / name).read_text() == "mine"
+
+
+def test_a_simulation_is_not_written_into_a_run(finished_run, tmp_path):
+    folder = shutil.copytree(finished_run, tmp_path / "run")
+    before = snapshot(folder)
+    for out in (folder, folder / "drive"):
+        assert "run folder" in refused(2, "simulate", out, "--seconds", 1)
+    assert snapshot(folder) == before
+
+
+def test_a_second_writer_is_refused(recording, finished_run, tmp_path):
+    folder = shutil.copytree(finished_run, tmp_path / "run")
+    code = "import sys; from pathlib import Path; from hybridlio.runs.whole_folder import held\n"
+    code += "with held(Path(sys.argv[1])), held(Path(sys.argv[1]) / 'smoothed'): print(1, flush=True); sys.stdin.read()"
+    words = [sys.executable, "-c", code, str(folder)]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=Path(__file__).parents[3]) as other:
+        other.stdout.read(1)
+        for command in (("odometry", recording, "-o", folder, "--overwrite"), ("smooth", folder)):
+            assert f"is being written by process {other.pid}" in refused(2, *command)
+        other.stdin.close()
+    ok("smooth", folder)
+    with held(folder):
+        pass
+
+
+def test_a_killed_run_or_smoothing_keeps_the_result_that_stood_there(tiny_drive, finished_run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(finished_run, folder)
+    ok("smooth", folder)
+    before = snapshot(folder)
+    program = [sys.executable, "-m", "hybridlio"]
+    environment = {**os.environ, "MPLBACKEND": "Agg"}
+    odometry = [*program, "odometry", str(tiny_drive), *QUICK, "-o", str(folder), "--overwrite"]
+    smooth = [*program, "smooth", str(folder)]
+    for command, part in ((odometry, tmp_path / ".run.partial"), (smooth, folder / ".smoothed.partial")):
+        for name in ("covariances.npz", "report.html"):
+            with subprocess.Popen(command, cwd=Path(__file__).parents[3], env=environment, stderr=-3, stdout=-3) as run:
+                while not (part / name).exists() and run.poll() is None:
+                    time.sleep(0.002)
+                run.send_signal(signal.SIGKILL)
+            assert run.returncode == -signal.SIGKILL
+            left = {n: h for n, h in snapshot(folder).items() if not n.startswith(".")}
+            assert left == before
+    ok("smooth", folder)
+    ok(*odometry[3:])
+    assert json.loads((folder / "metrics.json").read_text())["frames"] == 4
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+    assert not any(p.name.startswith(".") for p in folder.iterdir())
