@@ -15,9 +15,10 @@ import numpy as np
 
 from hybridlio.cloud.deskew import constant_twist, deskew
 from hybridlio.cloud.ground import find_ground
+from hybridlio.cloud.map_geometry import MAP_GEOMETRIES
 from hybridlio.cloud.normals import estimate_normals
 from hybridlio.cloud.preparation import prepare
-from hybridlio.cloud.projection import MAP_GEOMETRIES, normal_map, remap, vertex_map
+from hybridlio.cloud.projection import normal_map, remap, vertex_map
 from hybridlio.cloud.voxel import voxel_average, voxel_to_count
 from hybridlio.core import se3
 from hybridlio.core.sensors import Scan

@@ -31,7 +31,8 @@ from hybridlio.learned.settings import Recipe
 from hybridlio.learned.training import checkpoints
 from hybridlio.learned.training.driving import drive
 from hybridlio.learned.training.train import RunOptions, TrainingProgress, Watchers, train
-from hybridlio.learned.training.validation import Validation, step_errors
+from hybridlio.learned.training.validation import step_errors
+from hybridlio.learned.training.validation_result import Validation
 
 PHASE_S = 1800.0
 

@@ -19,7 +19,8 @@ from matplotlib.colors import LinearSegmentedColormap
 from scipy.spatial import cKDTree
 
 import hybridlio as hl
-from hybridlio.cloud.projection import map_geometry, vertex_map
+from hybridlio.cloud.map_geometry import map_geometry
+from hybridlio.cloud.projection import vertex_map
 from hybridlio.cloud.voxel import voxel_average
 from hybridlio.core import se3
 

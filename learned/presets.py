@@ -11,7 +11,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
-from hybridlio.cloud.projection import MapGeometry
+from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.core.errors import ConfigError
 from hybridlio.learned.settings import LossSettings, NetworkSettings, OptimiserSettings, Recipe
 

@@ -10,7 +10,7 @@ import typing
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from hybridlio.cloud.projection import MAP_GEOMETRIES, MapGeometry
+from hybridlio.cloud.map_geometry import MAP_GEOMETRIES, MapGeometry
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.setting_checks import (
     SettingError,

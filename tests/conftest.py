@@ -90,7 +90,7 @@ def untrained_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
     import torch
 
-    from hybridlio.cloud.projection import MAP_GEOMETRIES
+    from hybridlio.cloud.map_geometry import MAP_GEOMETRIES
     from hybridlio.learned.networks.odometry_network import OdometryNetwork
     from hybridlio.learned.networks.weights import save_weights
     from hybridlio.learned.settings import NetworkSettings, Recipe

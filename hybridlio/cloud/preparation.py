@@ -13,8 +13,9 @@ import numpy as np
 
 from hybridlio.cloud.deskew import deskew
 from hybridlio.cloud.ground import GroundOptions, GroundPlane, find_ground
+from hybridlio.cloud.map_geometry import MAP_GEOMETRIES, MapGeometry
 from hybridlio.cloud.normals import estimate_normals
-from hybridlio.cloud.projection import MAP_GEOMETRIES, MapGeometry, normal_map, vertex_map
+from hybridlio.cloud.projection import normal_map, vertex_map
 from hybridlio.cloud.voxel import VoxelCloud, voxel_average, voxel_to_count
 from hybridlio.core.arrays import Floats
 from hybridlio.core.errors import ConfigError

@@ -9,82 +9,19 @@ road. Here 23° is the lower limit: the preset's rows cover +3° to −23°, fro
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.core import se3
 from hybridlio.core.arrays import Floats
-from hybridlio.core.errors import ConfigError
-from hybridlio.core.lidar_models import LIDAR_MODELS, LidarModel
 
 _EMPTY = np.iinfo(np.uint64).max
 _CHUNK = 16384  # points at a time, whose temporaries stay in the processor's cache: twice as fast as all at once
 _DEG = np.float32(180.0) / np.float32(np.pi)  # multiplying by it is ten times as fast as np.degrees
 _RANGE_DECAY_PER_M = np.float32(-0.5)  # of a neighbour's weight in a normal, from the paper's "Normal map"
-
-
-@dataclass(frozen=True)
-class MapGeometry:
-    """Division of the sphere of directions into cells.
-
-    Attributes:
-        fov_up_deg: elevation of the upper edge of row 0.
-        fov_down_deg: elevation of the lower edge of the last row.
-        rows, columns: H and W; columns cover the full circle, from azimuth +180° (behind) over +90° (left) to −180°.
-    """
-
-    fov_up_deg: float
-    fov_down_deg: float
-    rows: int
-    columns: int
-
-    def __post_init__(self) -> None:
-        if not -90.0 <= self.fov_down_deg < self.fov_up_deg <= 90.0:
-            raise ConfigError(
-                f"map geometry: need -90 <= fov_down_deg < fov_up_deg <= 90, got {self.fov_down_deg}, {self.fov_up_deg}"
-            )
-        if self.rows < 1 or self.columns < 1:
-            raise ConfigError(f"map geometry: rows and columns must be at least 1, got {self.rows} x {self.columns}")
-
-    @property
-    def row_deg(self) -> float:
-        """η_h, the height of a cell in degrees."""
-        return (self.fov_up_deg - self.fov_down_deg) / self.rows
-
-    @property
-    def column_deg(self) -> float:
-        """η_w, the width of a cell in degrees."""
-        return 360.0 / self.columns
-
-    @classmethod
-    def by_beam(cls, lidar: LidarModel, columns: int = 720) -> MapGeometry:
-        """Return a geometry with one row per beam, beams in the middle of rows, for evenly spaced beams."""
-        top, bottom = max(lidar.elevations_deg), min(lidar.elevations_deg)
-        half = (top - bottom) / (lidar.beams - 1) / 2 if lidar.beams > 1 else 0.5
-        return cls(top + half, bottom - half, lidar.beams, columns)
-
-
-MAP_GEOMETRIES: dict[str, MapGeometry] = {
-    "hdl-64e": MapGeometry(3.0, -23.0, 52, 720),  # the paper's: 0.5° in both directions
-    "32-beam": MapGeometry.by_beam(LIDAR_MODELS["32-beam"]),
-    "16-beam": MapGeometry.by_beam(LIDAR_MODELS["16-beam"]),
-}
-
-
-def map_geometry(lidar: str) -> MapGeometry:
-    """Return the preset of a lidar by name.
-
-    Raises:
-        ConfigError: there is no preset of that name.
-    """
-    if lidar not in MAP_GEOMETRIES:
-        raise ConfigError(
-            f"no map geometry named {lidar!r}; known are {', '.join(MAP_GEOMETRIES)}; or give fov and cells"
-        )
-    return MAP_GEOMETRIES[lidar]
 
 
 def winner_map(points: ArrayLike, geometry: MapGeometry) -> NDArray[np.int32]:

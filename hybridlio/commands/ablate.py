@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
     from hybridlio.learned.paper_tables import TableRow
     from hybridlio.learned.settings import Recipe
-    from hybridlio.learned.training.ablation import RowData, RowResult
+    from hybridlio.learned.training.ablation import RowData
+    from hybridlio.learned.training.ablation_results import RowResult
     from hybridlio.learned.training.comparison import Line
     from hybridlio.runs.training_data import DataOptions
 

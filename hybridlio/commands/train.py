@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from hybridlio.learned.networks.weights import Weights
     from hybridlio.learned.settings import Recipe
     from hybridlio.learned.training.train import TrainingProgress
-    from hybridlio.learned.training.validation import Validation
+    from hybridlio.learned.training.validation_result import Validation
 
 Recordings = Annotated[
     list[Path],

@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hybridlio.cloud.projection import map_geometry
+from hybridlio.cloud.map_geometry import map_geometry
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.files import read_yaml
 from hybridlio.learned.presets import preset

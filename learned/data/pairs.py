@@ -15,7 +15,7 @@ from hybridlio.core import se3
 from hybridlio.core.errors import DataError
 from hybridlio.learned.data.shards import Shard
 from hybridlio.learned.losses.correspondences import Clouds
-from hybridlio.learned.networks.odometry_network import NetworkInput
+from hybridlio.learned.networks.network_types import NetworkInput
 from hybridlio.learned.settings import NetworkSettings
 
 

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlio.cloud.projection import MapGeometry
+from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.core import se3
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import NS_PER_S, Frame, Scan

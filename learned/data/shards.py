@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlio.cloud.projection import MapGeometry
+from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.files import write_atomically
 

@@ -14,7 +14,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from hybridlio.cloud.projection import MapGeometry
+from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.learned.networks import maps
 from hybridlio.learned.networks import torch_se3 as se3
 from hybridlio.learned.settings import LossSettings

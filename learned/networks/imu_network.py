@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from hybridlio.core.motion_limits import GRAVITY_M_S2
 from hybridlio.learned.networks import torch_se3 as se3
+from hybridlio.learned.networks.layers import rotation_matrix
 from hybridlio.learned.settings import NetworkSettings
 
 _RATE_RAD_S = 0.5  # what a road vehicle turns at
@@ -68,11 +69,6 @@ class ImuNetwork(nn.Module):
             mean = ((gyro[:, 1:] + gyro[:, :-1]) / 2).mean(dim=1)
             turned = turned + mean * dt_s[:, None]
         return se3.make(rotation_matrix(turned, self.settings), t)
-
-
-def rotation_matrix(three: Tensor, settings: NetworkSettings) -> Tensor:
-    """Rotations ``(B, 3, 3)`` of a network's three outputs: Euler angles, or a rotation vector."""
-    return se3.so3_exp(three) if settings.rotation == "log" else se3.euler_to_rotation(three)
 
 
 def _lstm(settings: NetworkSettings, inputs: int) -> nn.LSTM:

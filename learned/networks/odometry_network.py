@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor, nn
 
@@ -11,68 +9,10 @@ from hybridlio.core.errors import ConfigError
 from hybridlio.learned.networks import maps
 from hybridlio.learned.networks import torch_se3 as se3
 from hybridlio.learned.networks.imu_network import ImuNetwork
-from hybridlio.learned.networks.projective_steps import ProjectiveSteps, SeenPoints
+from hybridlio.learned.networks.network_types import NetworkInput, NetworkOutput, ScanMaps
+from hybridlio.learned.networks.projective_steps import ProjectiveSteps
 from hybridlio.learned.networks.residual_network import ResidualNetwork
 from hybridlio.learned.settings import NetworkSettings
-
-
-@dataclass(frozen=True, eq=False)
-class NetworkInput:
-    """What the network sees of a batch of pairs.
-
-    Attributes:
-        last, current: vertex maps ``(B, 3, H, W)`` of scan k and k+1, each in its own frame.
-        imu: ``(B, S, 6)`` rows of :func:`hybridlio.learned.data.imu_rows.imu_rows`; zeros where there are none.
-        dt_s: ``(B,)`` time between the scans.
-        velocity_m_s: ``(B, 3)`` at scan k, in its axes; zeros where not known.
-        initial: ``(B, 4, 4)`` initial poses from elsewhere, for ``imu="given"``; else None or not looked at.
-        shake: ``(B, 4, 4)`` by which initial poses are perturbed on the right before they are refined, or None.
-    """
-
-    last: Tensor
-    current: Tensor
-    imu: Tensor
-    dt_s: Tensor
-    velocity_m_s: Tensor
-    initial: Tensor | None = None
-    shake: Tensor | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class NetworkOutput:
-    """What the network says.
-
-    Attributes:
-        initial: ``T̂`` ``(B, 4, 4)``.
-        poses: ``T = δT·T̂`` ``(B, 4, 4)`` after each step; the paper's network has one.
-    """
-
-    initial: Tensor
-    poses: tuple[Tensor, ...]
-
-    @property
-    def pose(self) -> Tensor:
-        """``T_k_k1`` ``(B, 4, 4)``, the last step's."""
-        return self.poses[-1]
-
-    @property
-    def residual(self) -> Tensor:
-        """``δT`` ``(B, 4, 4)``, of all steps together."""
-        return self.pose @ se3.inverse(self.initial)
-
-
-@dataclass(frozen=True, eq=False)
-class SeenScan:
-    """What is computed of a scan alone.
-
-    Attributes:
-        vertices, normals: maps ``(B, 3, H, W)`` in its own frame.
-        points: as the projective steps see it; None in a network without.
-    """
-
-    vertices: Tensor
-    normals: Tensor
-    points: SeenPoints | None
 
 
 class OdometryNetwork(nn.Module):
@@ -117,14 +57,14 @@ class OdometryNetwork(nn.Module):
         """Estimate the residual of any initial poses ``(B, 4, 4)``; ``features`` are those of :meth:`imu_features`."""
         return self.refine_seen(self.look(given.last), self.look(given.current), initial, features)
 
-    def look(self, vertices: Tensor) -> SeenScan:
+    def look(self, vertices: Tensor) -> ScanMaps:
         """What is computed of a scan alone, from its vertex map ``(B, 3, H, W)``: once for both pairs that it is in."""
         normals = maps.normal_map(vertices)
         points = None if self.projective is None else self.projective.look(vertices, normals)
-        return SeenScan(vertices, normals, points)
+        return ScanMaps(vertices, normals, points)
 
     def refine_seen(
-        self, last: SeenScan, current: SeenScan, initial: Tensor, features: tuple[Tensor, Tensor] | None = None
+        self, last: ScanMaps, current: ScanMaps, initial: Tensor, features: tuple[Tensor, Tensor] | None = None
     ) -> NetworkOutput:
         """As :meth:`refine`, for scans that :meth:`look` has seen."""
         pose, poses = initial, []

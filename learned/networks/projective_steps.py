@@ -11,16 +11,17 @@ a robust kernel.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hybridlio.cloud.projection import MapGeometry
+from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.learned.networks import maps
 from hybridlio.learned.networks import torch_se3 as se3
-from hybridlio.learned.networks.residual_network import CircularConv
+from hybridlio.learned.networks.layers import CircularConv
+from hybridlio.learned.networks.network_types import ProjectiveScan
 from hybridlio.learned.settings import NetworkSettings
 
 _KERNELS_M = (0.4, 0.05)  # of the first and the last step, before training
@@ -35,30 +36,6 @@ _DILATION = 3
 _COARSE = 2  # features have a cell for so many rows and columns of the maps
 
 
-@dataclass(frozen=True, eq=False)
-class SeenPoints:
-    """A scan as the steps see it, whether it is the last one or the current one; computed once a scan.
-
-    Attributes:
-        points: ``(B, 3, N)`` the cells of its vertex map, row by row.
-        seen: ``(B, 1, N)`` which cells hold a point.
-        planes: ``(B, 4, N)`` the normal n of each cell and n·v, which is infinite where there is no normal.
-        rough: ``(B, 1, N)`` of :func:`_roughness`; None without weights to be told of it.
-        as_last, as_current: ``(B, n, C)`` what the n coarse cells contribute to the weights of points that fall into
-            them, and of their own points; None without weights. Of a scan that is thinned ``as_current`` is each
-            point's, ``(B, N, C)``.
-        coarse: ``(N,)`` which coarse cell each point's own cell is a part of.
-    """
-
-    points: Tensor
-    seen: Tensor
-    planes: Tensor
-    rough: Tensor | None = None
-    as_last: Tensor | None = None
-    as_current: Tensor | None = None
-    coarse: Tensor | None = None
-
-
 class ProjectiveSteps(nn.Module):
     """From two scans and a pose to better poses, one for each step."""
 
@@ -70,13 +47,13 @@ class ProjectiveSteps(nn.Module):
         self.register_buffer("_start", torch.linspace(first, last, settings.projective_steps), persistent=False)
         self.weights = PointWeights(settings) if settings.weight_channels else None
 
-    def look(self, vertices: Tensor, normals: Tensor) -> SeenPoints:
+    def look(self, vertices: Tensor, normals: Tensor) -> ProjectiveScan:
         """What the steps need of a scan, from its maps ``(B, 3, H, W)`` in its own frame."""
         offset = (normals * vertices).sum(dim=1, keepdim=True)
         offset = torch.where(maps.valid_cells(normals)[:, None], offset, torch.inf)
         planes = torch.cat([normals, offset], dim=1).flatten(2)
         seen = maps.valid_cells(vertices)[:, None]
-        points = SeenPoints(vertices.flatten(2), seen.flatten(2), planes)
+        points = ProjectiveScan(vertices.flatten(2), seen.flatten(2), planes)
         if self.weights is None:
             return points
         rough = _roughness(vertices, normals)
@@ -84,7 +61,7 @@ class ProjectiveSteps(nn.Module):
         coarse = self.weights.coarse
         return replace(points, rough=rough.flatten(2), as_last=as_last, as_current=as_current, coarse=coarse)
 
-    def forward(self, last: SeenPoints, current: SeenPoints, pose: Tensor) -> list[Tensor]:
+    def forward(self, last: ProjectiveScan, current: ProjectiveScan, pose: Tensor) -> list[Tensor]:
         """Poses ``T_k_k1`` ``(B, 4, 4)`` after each step.
 
         A step takes the pose before it as given: gradients go through the weights, not back through earlier steps. The
@@ -100,7 +77,7 @@ class ProjectiveSteps(nn.Module):
             poses.append(pose)
         return poses
 
-    def _step(self, last: SeenPoints, current: SeenPoints, pose: Tensor, kernel_m: Tensor) -> Tensor:
+    def _step(self, last: ProjectiveScan, current: ProjectiveScan, pose: Tensor, kernel_m: Tensor) -> Tensor:
         """``δT`` ``(B, 4, 4)`` of one step."""
         moved = torch.baddbmm(pose[:, :3, 3:], pose[:, :3, :3], current.points)
         cell, inside = maps.cells(moved, self.settings.geometry)
@@ -155,7 +132,7 @@ class PointWeights(nn.Module):
         return as_last.transpose(1, 2).contiguous(), as_current.transpose(1, 2).contiguous()
 
     def forward(
-        self, last: SeenPoints, current: SeenPoints, cell: Tensor, distance: Tensor, kernel_m: Tensor
+        self, last: ProjectiveScan, current: ProjectiveScan, cell: Tensor, distance: Tensor, kernel_m: Tensor
     ) -> Tensor:
         """Weights ``(B, 1, N)`` from 0 to 1 of points by the cells ``(B, N)`` they fall into and their distances."""
         assert last.rough is not None
@@ -184,8 +161,8 @@ def _coarse_cells(geometry: MapGeometry) -> Tensor:
     return (rows[:, None] * (int(columns[-1]) + 1) + columns).flatten()
 
 
-def _thinned(scan: SeenPoints, by: int) -> SeenPoints:
-    """Every so-manieth point, laid out anew, with what it contributes itself; what belongs to cells stays."""
+def _thinned(scan: ProjectiveScan, by: int) -> ProjectiveScan:
+    """Return every ``by``-th point in contiguous memory, with its own contributions; those of cells stay whole."""
     rough, coarse = (None if x is None else x[..., ::by].contiguous() for x in (scan.rough, scan.coarse))
     points, seen = scan.points[..., ::by].contiguous(), scan.seen[..., ::by].contiguous()
     own = scan.as_current
@@ -211,7 +188,7 @@ def _held_against(planes: Tensor, points: Tensor, cell: Tensor, known: Tensor) -
     """Normals ``(B, 3, N)``, signed distances ``(B, 1, N)`` in metres, and where there are such, as 0 and 1.
 
     Args:
-        planes: ``(B, 4, H·W)`` as in :class:`SeenPoints`.
+        planes: ``(B, 4, H·W)`` as in :class:`ProjectiveScan`.
         points: ``(B, 3, N)`` in the planes' frame.
         cell: ``(B, N)`` they fall into.
         known: ``(B, 1, N)`` which of them are points at all.

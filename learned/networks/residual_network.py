@@ -13,7 +13,7 @@ from torch.nn import functional
 from hybridlio.learned.networks import maps
 from hybridlio.learned.networks import torch_se3 as se3
 from hybridlio.learned.networks.attention import make_head
-from hybridlio.learned.networks.imu_network import rotation_matrix
+from hybridlio.learned.networks.layers import CircularConv, rotation_matrix
 from hybridlio.learned.settings import NetworkSettings
 
 _GROUP = 8  # channels that are normalised together
@@ -27,22 +27,6 @@ _KERNEL_M = 0.3
 # many face ahead as lie flat, and 1/4 as many face sideways. The gains make all directions about equal. With them, and
 # an encoder that is not trained, a linear fit of its features follows an error ahead at a correlation of 0.74.
 _GAINS = (20.0, 6.0, 2.0, 2.0, 1.0, 2.0)  # x, y, z, roll, pitch, yaw
-
-
-class CircularConv(nn.Module):
-    """A square convolution whose columns wrap around; rows are padded by zeros. A bias only where no norm follows."""
-
-    def __init__(
-        self, inputs: int, outputs: int, size: int, stride: tuple[int, int], bias: bool = False, dilation: int = 1
-    ) -> None:
-        super().__init__()
-        self.reach = size // 2 * dilation
-        self.conv = nn.Conv2d(inputs, outputs, size, stride, (self.reach, 0), dilation, bias=bias)
-        nn.init.kaiming_normal_(self.conv.weight, nonlinearity="relu")
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Maps ``(B, C, H, W)`` to ``(B, outputs, ⌈H/stride⌉, ⌈W/stride⌉)``."""
-        return self.conv(functional.pad(x, (self.reach, self.reach, 0, 0), mode="circular"))  # type: ignore[no-any-return]
 
 
 class BasicBlock(nn.Module):

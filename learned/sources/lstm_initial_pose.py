@@ -6,7 +6,6 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
@@ -14,11 +13,10 @@ from hybridlio.core.errors import ConfigError
 from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.motion_limits import PREDICTION_FLOOR_SIGMAS, unknown_motion_covariance
 from hybridlio.core.sensors import NS_PER_S, Frame, ImuSamples
-from hybridlio.learned.data.imu_rows import imu_rows
 from hybridlio.learned.networks.devices import at_run_time, pick_device
 from hybridlio.learned.networks.weights import load_weights, weights_path
-from hybridlio.learned.settings import NetworkSettings
 from hybridlio.learned.source_settings import LstmSettings
+from hybridlio.learned.sources.inertial_inputs import inertial
 
 _STEP_S = 0.1  # step of the training data (scans at 10 Hz): the duration is no input of the LSTMs
 _FORGETTING = 0.05  # share of the newest step in the variances: about 20 steps, 2 s, are remembered
@@ -102,24 +100,3 @@ class LstmInitialPose:
             pose = self._network(imu, v, torch.tensor([_STEP_S], device=self._device))[0].double().cpu().numpy()
         # the network predicts the motion of _STEP_S: scale it to the duration of the part
         return se3.exp(se3.log(se3.orthonormalise(pose)) * dt_s / _STEP_S)
-
-
-def inertial(
-    samples: ImuSamples, frame: Frame, settings: NetworkSettings, step: tuple[Array, float] | None
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return IMU rows ``(S, 6)``, zeros without samples, and the velocity ``(3,)`` at the last scan, as in shards.
-
-    Args:
-        samples: between the scans, or a part of them.
-        frame: the current scan's.
-        settings: of the network.
-        step: the last relative pose and its duration in seconds, or None at the start.
-    """
-    T_imu_lidar = None if frame.calibration is None else frame.calibration.T_imu_lidar
-    rows = np.zeros((settings.imu_samples, 6), np.float32)
-    if len(samples):
-        rows = imu_rows(samples, settings.imu_samples, T_imu_lidar)
-    if step is None:
-        return rows, np.zeros(3, np.float32)
-    pose, dt_s = step
-    return rows, (pose[:3, :3].T @ pose[:3, 3] / dt_s).astype(np.float32)

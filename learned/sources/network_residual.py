@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hybridlio.cloud.projection import MapGeometry
+from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError, DataError
@@ -23,11 +23,11 @@ from hybridlio.learned.data.preparing import Mapped
 from hybridlio.learned.losses.loss_evaluator import CHI2_99, EvaluatedPose, LossEvaluator, LossScan
 from hybridlio.learned.networks.devices import at_run_time, on_device, pick_device
 from hybridlio.learned.networks.maps import valid_cells
-from hybridlio.learned.networks.odometry_network import SeenScan
+from hybridlio.learned.networks.network_types import ScanMaps
 from hybridlio.learned.networks.weights import load_weights, weights_path
 from hybridlio.learned.settings import Recipe
 from hybridlio.learned.source_settings import NetworkResidualSettings
-from hybridlio.learned.sources.lstm_initial_pose import inertial
+from hybridlio.learned.sources.inertial_inputs import inertial
 
 _log = logging.getLogger(__name__)
 
@@ -43,7 +43,7 @@ class _Seen:
     """A scan in the form that the network takes, and on demand in the form that the loss takes."""
 
     stamp_ns: int
-    maps: SeenScan
+    maps: ScanMaps
     cells: int
     enough: bool
     threads: int

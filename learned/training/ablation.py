@@ -6,11 +6,11 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from hybridlio.cloud.projection import MapGeometry
+from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.files import write_atomically
 from hybridlio.learned.data.pairs import Pairs
@@ -18,12 +18,11 @@ from hybridlio.learned.data.shards import Shard
 from hybridlio.learned.setting_values import from_dict, to_dict
 from hybridlio.learned.settings import Recipe
 from hybridlio.learned.training import checkpoints
+from hybridlio.learned.training.ablation_results import RowResult
 from hybridlio.learned.training.driving import drive
 from hybridlio.learned.training.train import RunOptions, TrainingProgress, Watchers, train
 
 RESULT = "result.json"
-
-Drift = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -36,35 +35,6 @@ class RowData:
 
     train: Sequence[Shard]
     test: Sequence[Shard]
-
-
-@dataclass(frozen=True)
-class RowResult:
-    """Figures of a trained row.
-
-    Attributes:
-        name: of its recipe.
-        steps, pairs: training steps, and pairs in them.
-        seconds: duration of the training.
-        train, test: t_rel (percent) and r_rel (degrees per 100 m) by recording; None for a recording that is too short.
-    """
-
-    name: str
-    steps: int
-    pairs: int
-    seconds: float
-    train: Mapping[str, Drift | None]
-    test: Mapping[str, Drift | None]
-
-    @property
-    def train_average(self) -> Drift | None:
-        """Mean over the training recordings; None where all are too short."""
-        return _average(self.train)
-
-    @property
-    def test_average(self) -> Drift | None:
-        """Mean over the test recordings; None where all are too short."""
-        return _average(self.test)
 
 
 def run_rows(
@@ -137,13 +107,6 @@ def _finished(path: Path, recipe: Recipe, steps: int) -> RowResult | None:
     for part in ("train", "test"):
         values[part] = {name: None if d is None else (d[0], d[1]) for name, d in values[part].items()}
     return RowResult(**values)
-
-
-def _average(drifts: Mapping[str, Drift | None]) -> Drift | None:
-    known = [drift for drift in drifts.values() if drift is not None]
-    if not known:
-        return None
-    return sum(t for t, _ in known) / len(known), sum(r for _, r in known) / len(known)
 
 
 def reduced(recipe: Recipe, geometry: MapGeometry | None = None, batch: int = 8, rate: float = 1e-3) -> Recipe:

@@ -9,7 +9,7 @@ from pathlib import Path
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
 from hybridlio.learned.networks.weights import load_weights, save_weights
 from hybridlio.learned.settings import Recipe
-from hybridlio.learned.training.validation import Validation
+from hybridlio.learned.training.validation_result import Validation
 
 
 @dataclass(frozen=True)

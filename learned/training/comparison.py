@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from hybridlio.learned.training.ablation import Drift, RowResult
+from hybridlio.learned.training.ablation_results import Drift, RowResult
 from hybridlio.learned.training.published import TEST, TRAIN, PublishedRow
 
 KITTI = tuple(f"{n:02}" for n in range(11))

@@ -5,12 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from hybridlio.cloud.projection import MapGeometry
+from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.learned.data.pairs import PairBatch
 from hybridlio.learned.losses.correspondences import Clouds, Matches, match
 from hybridlio.learned.losses.loss import LossValue, gauss_newton, loss
 from hybridlio.learned.networks import torch_se3 as se3
-from hybridlio.learned.networks.odometry_network import NetworkOutput, OdometryNetwork
+from hybridlio.learned.networks.network_types import NetworkOutput
+from hybridlio.learned.networks.odometry_network import OdometryNetwork
 from hybridlio.learned.settings import LossSettings
 
 _LEVER_M = 10.0  # rotations count as what they move at this distance

@@ -38,7 +38,8 @@ from hybridlio.learned.training.objective import Objective
 from hybridlio.learned.training.processes import Processes, processes
 from hybridlio.learned.training.schedule import learning_rate
 from hybridlio.learned.training.training_log import TrainingLog
-from hybridlio.learned.training.validation import Validation, validate
+from hybridlio.learned.training.validation import validate
+from hybridlio.learned.training.validation_result import Validation
 
 CHECKPOINT = "checkpoint.pt"
 WEIGHTS = "weights.safetensors"

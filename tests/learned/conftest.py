@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from hybridlio.cloud.projection import MapGeometry, vertex_map
+from hybridlio.cloud.map_geometry import MapGeometry
+from hybridlio.cloud.projection import vertex_map
 from hybridlio.core import se3
 from hybridlio.learned.data.shards import ScanRecord, Shard, write_shard
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
@@ -124,7 +125,7 @@ def winding(tmp_path: Path) -> Shard:
 
 
 @dataclass(frozen=True, eq=False)
-class SeenScan:
+class ScanMaps:
     """A scan that is prepared already."""
 
     points: np.ndarray
@@ -136,16 +137,16 @@ class SeenScan:
 
 
 @pytest.fixture
-def seen() -> Callable[..., SeenScan]:
+def seen() -> Callable[..., ScanMaps]:
     """What a spinning sensor at a pose sees of a room of half sizes, with a centimetre of noise."""
     elevations, azimuths = np.deg2rad(np.arange(-39, 40, 2)), np.deg2rad(np.arange(1, 360, 2))
     up, around = (angles.ravel() for angles in np.meshgrid(elevations, azimuths, indexing="ij"))
     rays = np.column_stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
 
-    def see(T_world_lidar: np.ndarray, half: tuple[float, float, float] = (8.0, 6.0, 2.5), seed: int = 0) -> SeenScan:
+    def see(T_world_lidar: np.ndarray, half: tuple[float, float, float] = (8.0, 6.0, 2.5), seed: int = 0) -> ScanMaps:
         rng = np.random.default_rng(seed)
         points, normals = hit_walls(rays, T_world_lidar, np.array(half))
-        return SeenScan((points + normals * rng.normal(size=(len(points), 1)) * 0.01).astype(np.float32))
+        return ScanMaps((points + normals * rng.normal(size=(len(points), 1)) * 0.01).astype(np.float32))
 
     return see
 

@@ -3,8 +3,9 @@ import pytest
 
 from hybridlio.cloud import preparation
 from hybridlio.cloud.deskew import constant_twist
+from hybridlio.cloud.map_geometry import MAP_GEOMETRIES
 from hybridlio.cloud.preparation import PreparationOptions, prepare
-from hybridlio.cloud.projection import MAP_GEOMETRIES, normal_map, vertex_map
+from hybridlio.cloud.projection import normal_map, vertex_map
 from hybridlio.core import se3
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.sensors import Scan

@@ -3,17 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridlio.cloud.projection import (
-    MAP_GEOMETRIES,
-    MapGeometry,
-    gather,
-    map_geometry,
-    normal_map,
-    remap,
-    valid_cells,
-    vertex_map,
-    winner_map,
-)
+from hybridlio.cloud.map_geometry import MAP_GEOMETRIES, MapGeometry, map_geometry
+from hybridlio.cloud.projection import gather, normal_map, remap, valid_cells, vertex_map, winner_map
 from hybridlio.core import se3
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.lidar_models import LIDAR_MODELS

@@ -6,7 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 import hybridlio.learned.training.ablation as ablation
-from hybridlio.cloud.projection import MapGeometry
+from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.commands.app import app
 from hybridlio.core.errors import EstimationError
 

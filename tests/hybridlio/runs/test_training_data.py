@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybridlio.cloud.projection import MAP_GEOMETRIES
+from hybridlio.cloud.map_geometry import MAP_GEOMETRIES
 from hybridlio.core import se3
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.sensors import ImuNoise, Scan

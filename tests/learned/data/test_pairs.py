@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import hybridlio as hl
+from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.cloud.preparation import PreparationOptions, prepare
-from hybridlio.cloud.projection import MapGeometry
 from hybridlio.core import se3
 from hybridlio.core.errors import DataError
 from hybridlio.learned.data.augmentation import perturbed

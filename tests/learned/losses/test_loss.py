@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from hybridlio.cloud.projection import MapGeometry
+from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.core.errors import ConfigError
 from hybridlio.learned.losses import correspondences
 from hybridlio.learned.losses import loss as losses

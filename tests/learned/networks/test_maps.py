@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from hybridlio.cloud import projection
-from hybridlio.cloud.projection import MapGeometry
+from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.core import se3 as reference
 from hybridlio.learned.networks import maps
 from hybridlio.learned.networks import torch_se3 as se3

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from hybridlio.cloud.projection import MapGeometry
+from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.core import se3 as reference
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.sensors import ImuSamples
@@ -12,8 +12,10 @@ from hybridlio.learned.data.imu_rows import imu_rows
 from hybridlio.learned.networks import torch_se3 as se3
 from hybridlio.learned.networks.attention import Attention, Mlp
 from hybridlio.learned.networks.imu_network import ImuNetwork
-from hybridlio.learned.networks.odometry_network import NetworkInput, OdometryNetwork, parameter_count
-from hybridlio.learned.networks.residual_network import CircularConv, Encoder
+from hybridlio.learned.networks.layers import CircularConv
+from hybridlio.learned.networks.network_types import NetworkInput
+from hybridlio.learned.networks.odometry_network import OdometryNetwork, parameter_count
+from hybridlio.learned.networks.residual_network import Encoder
 from hybridlio.learned.settings import NetworkSettings
 
 TINY = NetworkSettings(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from hybridlio.cloud.projection import MapGeometry
+from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.core import se3
 from hybridlio.learned.data.pairs import Pairs
 from hybridlio.learned.networks import maps

@@ -7,8 +7,8 @@ import numpy as np
 from stand_ins import FEW
 
 import hybridlio as hl
+from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.cloud.preparation import PreparationOptions, prepare
-from hybridlio.cloud.projection import MapGeometry
 from hybridlio.core import se3
 from hybridlio.learned.source_settings import LstmSettings
 from hybridlio.learned.sources.lstm_initial_pose import LstmInitialPose

@@ -11,7 +11,8 @@ from hybridlio.learned.data.pairs import Pairs
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
 from hybridlio.learned.paper_tables import TABLES
 from hybridlio.learned.presets import PRESETS
-from hybridlio.learned.training.ablation import RowData, RowResult, reduced, run_rows
+from hybridlio.learned.training.ablation import RowData, reduced, run_rows
+from hybridlio.learned.training.ablation_results import RowResult
 from hybridlio.learned.training.driving import drift_of, drive
 from hybridlio.learned.training.train import RunOptions
 

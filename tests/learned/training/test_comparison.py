@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from hybridlio.learned.training.ablation import RowResult
+from hybridlio.learned.training.ablation_results import RowResult
 from hybridlio.learned.training.comparison import KITTI, Line, tables, to_json_dict, to_markdown
 from hybridlio.learned.training.published import published
 

@@ -6,7 +6,8 @@ import torch
 
 from hybridlio.core import se3
 from hybridlio.learned.data.pairs import Pairs
-from hybridlio.learned.networks.odometry_network import NetworkOutput, OdometryNetwork
+from hybridlio.learned.networks.network_types import NetworkOutput
+from hybridlio.learned.networks.odometry_network import OdometryNetwork
 from hybridlio.learned.settings import LossSettings
 from hybridlio.learned.training.objective import clouds_for, descended, objective
 from hybridlio.learned.training.validation import step_errors
