@@ -3,13 +3,13 @@ import pytest
 import torch
 
 from hybridlio.cloud import projection
-from hybridlio.cloud.map_geometry import MapGeometry
+from hybridlio.cloud.map_geometry import MAP_GEOMETRIES, MapGeometry
 from hybridlio.core import se3 as reference
 from hybridlio.learned.networks import maps
 from hybridlio.learned.networks import torch_se3 as se3
 
 SMALL = MapGeometry(15.0, -25.0, 20, 90)
-PAPER = projection.MAP_GEOMETRIES["hdl-64e"]
+PAPER = MAP_GEOMETRIES["hdl-64e"]
 
 
 def clouds(count: int = 6000, batch: int = 2, seed: int = 0) -> np.ndarray:
