@@ -4,7 +4,7 @@
 
 Copies the checkout to a temporary folder, replaces the value of one constant at a time in its source line, runs the
 tests listed for it, and prints which test caught each change. Exits with 1 if a change goes uncaught, and with 2 if the
-tests fail without any change. A constant that no test holds either needs one or has no effect and can go.
+tests fail without any change.
 
 Only constants whose value is a choice are listed: of registration, degeneracy, covariance, map, gate and scan matching.
 Those that merely save time without changing results, such as the work per thread, are not; nor is the number of
@@ -249,7 +249,7 @@ def copy_checkout(folder: Path) -> None:
 
 def run_tests(folder: Path, tests: tuple[str, ...]) -> tuple[int, str]:
     """Return pytest's exit status, and the first test that failed or the end of its output."""
-    # -B: a module changed within a second, to the same length, would else be taken from its compiled cache
+    # -B: without it a file changed within a second, to the same length, is taken from its compiled cache
     command = [sys.executable, "-B", "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", *tests]
     threads = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
     environment = {**os.environ, **threads, "PYTHONPATH": str(folder)}
@@ -264,11 +264,11 @@ def check(folder: Path, constant: Constant, value: str) -> bool:
     original = file.read_text()
     try:
         file.write_text(replaced(original, constant.name, value))
-        status, told = run_tests(folder, constant.tests)
+        status, report = run_tests(folder, constant.tests)
     finally:
         file.write_text(original)
     caught = status == 1
-    outcome = told if caught else "UNCAUGHT" if status == 0 else f"pytest ended with {status}: {told}"
+    outcome = report if caught else "UNCAUGHT" if status == 0 else f"pytest ended with {status}: {report}"
     print(f"{constant.name} = {value}  [{time.monotonic() - started:.0f} s]  {outcome}", flush=True)
     return caught
 
@@ -280,17 +280,16 @@ def main() -> int:
     options = parser.parse_args()
     chosen = [c for c in TABLE if not options.only or any(w == c.name or w in c.file for w in options.only)]
     if options.list:
-        for constant in chosen:
-            print(constant.file, constant.name, *constant.gross, sep="\t")
+        print(*("\t".join((c.file, c.name, *c.gross)) for c in chosen), sep="\n")
         return CAUGHT
     if not chosen:
         raise SystemExit(f"no constant named {', '.join(options.only)}; --list prints their names")
     with tempfile.TemporaryDirectory(prefix="hybridlio-constants-") as name:
         folder = Path(name)
         copy_checkout(folder)
-        status, told = run_tests(folder, tuple(dict.fromkeys(test for c in chosen for test in c.tests)))
+        status, report = run_tests(folder, tuple(dict.fromkeys(test for c in chosen for test in c.tests)))
         if status:
-            print(f"the tests fail without any change: {told}")
+            print(f"the tests fail without any change: {report}")
             return BROKEN
         uncaught = [f"{c.name} = {v}" for c in chosen for v in c.gross if not check(folder, c, v)]
     total = sum(len(constant.gross) for constant in chosen)
