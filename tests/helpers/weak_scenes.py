@@ -55,6 +55,20 @@ def bend(rng: np.random.Generator, radius_m: float, count: int) -> Cloud:
     return points, np.where(side[:, None] == 0, [0.0, 0.0, 1.0], inward)
 
 
+def into_a_bend(rng: np.random.Generator, count: int) -> Cloud:
+    """A straight corridor, 8 m wide, whose walls and ground turn left with a radius of 10 m from 8 m ahead on."""
+    start_m, radius_m = 8.0, 10.0
+    along, side = rng.uniform(-20, 20, count), rng.choice([-1.0, 0.0, 1.0], count)
+    left = np.where(side == 0, rng.uniform(-4, 4, count), 4 * side)
+    height = np.where(side == 0, -1.7, rng.uniform(-1.7, 2, count))
+    angle = np.maximum(along - start_m, 0) / radius_m
+    inward = np.column_stack([-np.sin(angle), np.cos(angle), np.zeros(count)])
+    middle = np.column_stack(
+        [np.minimum(along, start_m) + radius_m * np.sin(angle), radius_m * (1 - np.cos(angle)), height]
+    )
+    return middle + left[:, None] * inward, np.where(side[:, None] == 0, [0.0, 0.0, 1.0], inward)
+
+
 def joined(*clouds: Cloud) -> Cloud:
     """All points and normals of several clouds."""
     return np.concatenate([c[0] for c in clouds]), np.concatenate([c[1] for c in clouds])
