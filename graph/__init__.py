@@ -5,12 +5,23 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from hybridlio.graph.formats.load_report import LoadReport as LoadReport
     from hybridlio.graph.pose_graph import PoseGraph as PoseGraph
+    from hybridlio.graph.solve.online_solver import OnlineSolver as OnlineSolver
     from hybridlio.graph.solve.solution import Solution as Solution
 
-__all__ = ["PoseGraph", "Solution"]
+__all__ = ["LoadReport", "OnlineSolver", "PoseGraph", "Solution"]
 
-_MODULES = {"PoseGraph": "hybridlio.graph.pose_graph", "Solution": "hybridlio.graph.solve.solution"}
+_MODULES = {
+    "LoadReport": "hybridlio.graph.formats.load_report",
+    "OnlineSolver": "hybridlio.graph.solve.online_solver",
+    "PoseGraph": "hybridlio.graph.pose_graph",
+    "Solution": "hybridlio.graph.solve.solution",
+}
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
 
 
 def __getattr__(name: str) -> Any:

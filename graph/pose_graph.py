@@ -9,16 +9,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hybridlio.core.arrays import Array
-from hybridlio.core.errors import GraphError
-from hybridlio.graph.body_measurements import BodyMeasurements
 from hybridlio.graph.formats.files import read_graph, write_graph
 from hybridlio.graph.formats.load_report import LoadOptions, LoadReport
+from hybridlio.graph.landmark_measurements import LandmarkMeasurements, check_free
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.connectivity import components
 from hybridlio.graph.model.graph_data import PosesByKey
 from hybridlio.graph.model.keys import Key, check_key
 from hybridlio.graph.model.measurements import Factor
-from hybridlio.graph.model.new_factors import between_factor, prior_factor
+from hybridlio.graph.model.new_factors import between_factor, check_vector, prior_factor
 from hybridlio.graph.model.noise import NoiseInput, RobustLike
 from hybridlio.graph.solve.batch import solve_batch
 from hybridlio.graph.solve.initial_values import find_initial_values
@@ -29,7 +28,7 @@ from hybridlio.graph.solve.settings import ONLINE_SOLVERS, InitialMethod, Initia
 from hybridlio.graph.solve.solution import Solution
 
 
-class PoseGraph(BodyMeasurements):
+class PoseGraph(LandmarkMeasurements):
     """Poses and measurements; :meth:`optimize` finds the poses that fit the measurements best.
 
     Keys are integers or ``(robot, index)``. Poses are ``(4, 4)``; covariances are ``(6, 6)`` in rad² and m², rotation
@@ -47,9 +46,10 @@ class PoseGraph(BodyMeasurements):
 
     def __repr__(self) -> str:
         edges, others = len(self._data.edges), len(self._data.other_factors)
+        landmarks = f"{len(self.landmarks)} landmarks, " if self.landmarks else ""
         return (
-            f"<PoseGraph {self.dimension}D: {len(self)} poses, {len(self.fixed)} fixed, {edges} between-factors, "
-            f"{others} other factors>"
+            f"<PoseGraph {self.dimension}D: {len(self)} poses, {landmarks}{len(self.fixed)} fixed, "
+            f"{edges} between-factors, {others} other factors>"
         )
 
     def __len__(self) -> int:
@@ -73,23 +73,28 @@ class PoseGraph(BodyMeasurements):
     def add_pose(self, key: Key, initial: ArrayLike | None = None) -> None:
         """Add a pose, with its initial value if it is known; raise GraphError where the key is in use."""
         key = check_key(key)
-        if key in self._data:
-            raise GraphError(f"pose {key} exists already; use set_initial to change its initial value")
+        check_free(self._data, key, "pose")
         self._data.add_pose(key, None if initial is None else co.from_matrix(initial, self.dimension, f"pose {key}"))
 
-    def set_initial(self, key: Key, pose: ArrayLike | None) -> None:
-        """Replace the initial value of a pose, or remove it (None)."""
-        (key,) = self._data.known_keys(key, what="initial value")
-        self._data.set_initial(key, None if pose is None else co.from_matrix(pose, self.dimension, f"pose {key}"))
+    def set_initial(self, key: Key, value: ArrayLike | None) -> None:
+        """Replace the initial value of a pose or of a landmark, or remove it (None)."""
+        if (key := check_key(key)) in self._data.landmarks:
+            point = None if value is None else check_vector(value, self.dimension, f"landmark {key}")
+            self._data.landmarks.set_initial(key, point)
+            return
+        self._data.known_keys(key, what="initial value")
+        self._data.set_initial(key, None if value is None else co.from_matrix(value, self.dimension, f"pose {key}"))
 
     def initial(self, key: Key) -> Array | None:
-        """Return the initial value ``(4, 4)`` of a pose, or None."""
-        (key,) = self._data.known_keys(key, what="initial value")
+        """Return the initial value of a pose ``(4, 4)`` or of a landmark ``(3,)`` or ``(2,)``, or None."""
+        if (key := check_key(key)) in self._data.landmarks:
+            return self._data.landmarks.initial_value(key)
+        self._data.known_keys(key, what="initial value")
         found = self._data.initial_value(key)
         return None if found is None else np.asarray(co.to_matrices(found[None])[0])
 
     def start_from(self, solution: PosesByKey) -> None:
-        """Take a solution's poses as initial values, for the keys that both have."""
+        """Take a solution's poses and landmarks as initial values, for the keys that both have."""
         self._data.start_from(solution)
 
     @property
@@ -123,6 +128,7 @@ class PoseGraph(BodyMeasurements):
         """Add a measured pose in world; a new pose starts from it. Noise and kernel as in :meth:`add_between`."""
         factor = prior_factor(self._data, key, pose, NoiseInput(covariance, information, sigmas), robust)
         if factor.keys[0] not in self._data:
+            check_free(self._data, factor.keys[0], "pose")
             self._data.add_pose(factor.keys[0], factor.measured)
         return self._data.add_factor(factor)
 
@@ -144,6 +150,7 @@ class PoseGraph(BodyMeasurements):
         """
         factor = between_factor(self._data, (i, j), T_i_j, NoiseInput(covariance, information, sigmas), robust)
         if factor.keys[1] not in self._data:
+            check_free(self._data, factor.keys[1], "pose")
             self._data.add_pose(factor.keys[1])
         return self._data.add_factor(factor)
 

@@ -21,8 +21,9 @@ from hybridlio.core.estimates import RelativePose
 from hybridlio.core.files import write_atomically
 from hybridlio.graph.model import coordinates as co
 
-RowKind: TypeAlias = Literal["vertex", "edge", "prior", "position"]
+RowKind: TypeAlias = Literal["vertex", "landmark", "edge", "prior", "position", "point", "bearing-range"]
 Values: TypeAlias = Literal["quaternion", "rpy", "heading", "point"]
+NoiseIn: TypeAlias = Literal["information", "sigmas", "variances at 10 m"]
 _SIZES = {"quaternion": 7, "rpy": 6, "heading": 3}
 
 
@@ -31,12 +32,15 @@ class RowFormat:
     """What follows the tag in a row of text.
 
     Attributes:
-        kind: vertex, edge, prior of a pose, or prior of a position.
+        kind: vertex of a pose or a landmark; edge between poses; prior of a pose or a position; observation of a
+            landmark as point or as bearing and range.
         dimension: 2 or 3.
         values: what is written: a pose, by how its rotation is written, or a point.
         ids: number of integers at the start.
         triangle: ``(row, column)`` in the information matrix, translation first, of each number at the end.
         optional_information: whether rows may end before the information matrix, which then is the identity.
+        noise: what the numbers at the end are.
+        letter: first letter of GTSAM's symbol of a landmark, where the row has only its number.
     """
 
     kind: RowKind
@@ -45,11 +49,13 @@ class RowFormat:
     ids: int
     triangle: tuple[tuple[int, int], ...] = ()
     optional_information: bool = False
+    noise: NoiseIn = "information"
+    letter: str = ""
 
     @property
     def keys(self) -> int:
         """Number of vertices that a row names; a further integer is the id of a sensor's offset."""
-        return 2 if self.kind == "edge" else 1
+        return 2 if self.kind in ("edge", "point", "bearing-range") else 1
 
     @property
     def head(self) -> int:
@@ -76,6 +82,18 @@ ROW_FORMATS = {
     "EDGE_SE2": RowFormat("edge", 2, "heading", 2, _upper_triangle(3)),
     "EDGE_PRIOR_SE2": RowFormat("prior", 2, "heading", 1, _upper_triangle(3)),
     "EDGE_SE3_PRIORXYZ": RowFormat("position", 3, "point", 1, _upper_triangle(3)),
+    "VERTEX_TRACKXYZ": RowFormat("landmark", 3, "point", 1),
+    "VERTEX_POINTXYZ": RowFormat("landmark", 3, "point", 1),
+    "VERTEX_POINT_XYZ": RowFormat("landmark", 3, "point", 1),
+    "EDGE_SE3_TRACKXYZ": RowFormat("point", 3, "point", 3, _upper_triangle(3)),  # the third id is of an offset
+    "EDGE_SE3_POINT_XYZ": RowFormat("point", 3, "point", 3, _upper_triangle(3)),
+    "VERTEX_XY": RowFormat("landmark", 2, "point", 1),
+    "VERTEX_POINT_XY": RowFormat("landmark", 2, "point", 1),
+    "EDGE_SE2_XY": RowFormat("point", 2, "point", 2, _upper_triangle(2)),
+    "EDGE_BEARING_RANGE_SE2_XY": RowFormat("bearing-range", 2, "point", 2, _upper_triangle(2)),
+    # GTSAM's rows, whose landmarks have a numbering of their own; see gtsam/slam/dataset.cpp
+    "LANDMARK": RowFormat("bearing-range", 2, "point", 2, _upper_triangle(2), noise="variances at 10 m", letter="l"),
+    "BR": RowFormat("bearing-range", 2, "point", 2, ((0, 0), (1, 1)), noise="sigmas", letter="l"),
     "VERTEX3": RowFormat("vertex", 3, "rpy", 1),
     "EDGE3": RowFormat("edge", 3, "rpy", 2, _upper_triangle(6), optional_information=True),
     "VERTEX2": RowFormat("vertex", 2, "heading", 1),
@@ -93,10 +111,6 @@ LEFT_OUT_TAGS = frozenset(
         *("VERTEX_PLANE", "EDGE_SE3_PLANE", "EDGE_PLANE", "EDGE_PLANE_IDENTITY", "EDGE_PLANE_PARALLEL"),
         *("EDGE_PLANE_PERPENDICULAR", "EDGE_PLANE_PRIOR_NORMAL", "EDGE_PLANE_PRIOR_DISTANCE"),
         *("EDGE_SE3_PRIORVEC", "EDGE_SE3_PRIORQUAT"),
-        *("VERTEX_XY", "VERTEX_TRACKXYZ", "VERTEX_POINTXYZ", "VERTEX_CAM", "LANDMARK", "BR", "EQUIV"),
-        *("EDGE_SE2_XY", "EDGE_BEARING_SE2_XY", "EDGE_BEARING_RANGE_SE2_XY", "EDGE_PRIOR_SE2_XY", "EDGE_XY_PRIOR"),
-        *("EDGE_SE3_TRACKXYZ", "EDGE_SE3_XYZ", "EDGE_SE3_XYZ_PRIOR", "EDGE_PROJECT_P2MC"),
-        *("PARAMS_SE2OFFSET", "PARAMS_CAMERACALIB", "PARAMS_CAMERAPARAMETERS"),
     }
 )
 

@@ -22,6 +22,7 @@ from hybridlio.graph.model.new_factors import check_vector
 from hybridlio.graph.model.noise import Noise, NoiseInput, Robust, make_noise, make_robust
 
 _FORMAT = "hybridlio pose graph 1"
+_FORMAT_WITH_LANDMARKS = "hybridlio pose graph 2"  # earlier releases, which would lose the landmarks, refuse it
 _NO_ROBOT = -1  # in the robots' column, of an integer key
 
 
@@ -34,7 +35,7 @@ def write_npz(data: GraphData, path: str | os.PathLike[str]) -> None:
     keys = data.keys
     key_table = _key_table([(key,) for key in keys], 1)
     arrays: dict[str, Any] = {
-        "format": np.array(_FORMAT),
+        "format": np.array(_FORMAT_WITH_LANDMARKS if len(data.landmarks) else _FORMAT),
         "dimension": np.array(data.dimension),
         "next_id": np.array(data.next_id),
         "keys": key_table,
@@ -43,6 +44,9 @@ def write_npz(data: GraphData, path: str | os.PathLike[str]) -> None:
     }
     if data.origin is not None:
         arrays["origin"] = np.array(data.origin)
+    if len(data.landmarks):
+        arrays["landmark_keys"] = _key_table([(key,) for key in data.landmarks.keys], 1)
+        arrays["landmark_initial"] = data.landmarks.initial_values
     if len(data.edges):
         arrays |= {f"between_{name}": column for name, column in _edge_columns(data, key_table[:, 0]).items()}
     for kind in get_args(Kind):
@@ -83,6 +87,9 @@ def _factor_columns(by_id: dict[int, Factor]) -> dict[str, Any]:
         "kernel": np.array([factor.robust.kernel if factor.robust else "" for factor in factors]),
         "width": np.array([factor.robust.width if factor.robust else np.nan for factor in factors]),
     }
+    landmarks: list[tuple[Key, ...]] = [(factor.landmark,) for factor in factors if factor.landmark is not None]
+    if landmarks:
+        columns["landmark"] = _key_table(landmarks, 1)
     noises = [factor.noise for factor in factors if factor.noise is not None]
     if noises:
         columns["noise_form"] = np.array([noise.form for noise in noises])
@@ -106,8 +113,8 @@ def read_npz(path: str | os.PathLike[str]) -> GraphData:
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-        if str(arrays["format"]) != _FORMAT:
-            raise DataError(f"{path}: has format {arrays['format']!s}; this release reads {_FORMAT}")
+        if str(arrays["format"]) not in (_FORMAT, _FORMAT_WITH_LANDMARKS):
+            raise DataError(f"{path}: has format {arrays['format']!s}; this release reads {_FORMAT_WITH_LANDMARKS}")
         return _assemble(arrays)
     except OSError as error:
         raise DataError(f"cannot read {path}: {error}") from error
@@ -121,6 +128,7 @@ def _assemble(arrays: dict[str, Any]) -> GraphData:
         latitude_deg, longitude_deg, height_m = arrays["origin"].tolist()
         data.set_origin(check_geodetic(latitude_deg, longitude_deg, height_m, "origin"))
     _add_poses(data, arrays)
+    _add_landmarks(data, arrays)
     by_id: dict[int, Factor] = {}
     for kind in get_args(Kind):
         prefix = f"{kind}_"
@@ -128,9 +136,12 @@ def _assemble(arrays: dict[str, Any]) -> GraphData:
         if columns:
             by_id |= _factors(kind, columns)
     for factor_id in sorted(by_id):
-        if missing := [key for key in by_id[factor_id].keys if key not in data]:
-            raise DataError(f"{by_id[factor_id].label}: no pose has key {missing[0]}")
-        data.add_factor(by_id[factor_id], factor_id)
+        factor = by_id[factor_id]
+        if missing := [key for key in factor.keys if key not in data]:
+            raise DataError(f"{factor.label}: no pose has key {missing[0]}")
+        if factor.landmark is not None and factor.landmark not in data.landmarks:
+            raise DataError(f"{factor.label}: no landmark has key {factor.landmark}")
+        data.add_factor(factor, factor_id)
     data.next_id = max(data.next_id, int(arrays["next_id"]))
     return data
 
@@ -147,6 +158,17 @@ def _add_poses(data: GraphData, arrays: dict[str, Any]) -> None:
             data.fix(key)
 
 
+def _add_landmarks(data: GraphData, arrays: dict[str, Any]) -> None:
+    if "landmark_keys" not in arrays:
+        return
+    initial = arrays["landmark_initial"].reshape(-1, data.dimension)
+    for (key,), point in zip(_key_rows(arrays["landmark_keys"]), initial, strict=True):
+        if key in data or key in data.landmarks:
+            raise DataError(f"landmark {key} has the key of another pose or landmark")
+        unknown = np.isnan(point).all()
+        data.landmarks.add(key, None if unknown else check_vector(point, data.dimension, f"landmark {key}"))
+
+
 def _key_rows(table: Any) -> list[tuple[Key, ...]]:
     return [
         tuple(check_key(index if robot == _NO_ROBOT else (robot, index)) for robot, index in row)
@@ -157,6 +179,7 @@ def _key_rows(table: Any) -> list[tuple[Key, ...]]:
 def _factors(kind: Kind, columns: dict[str, Any]) -> dict[int, Factor]:
     found = {}
     samples = _samples(columns)
+    landmarks = [key for (key,) in _key_rows(columns["landmark"])] if "landmark" in columns else []
     for row, (factor_id, keys) in enumerate(zip(columns["id"].tolist(), _key_rows(columns["keys"]), strict=True)):
         measured = columns["measured"][row]
         name = f"{kind} {keys}"
@@ -164,7 +187,8 @@ def _factors(kind: Kind, columns: dict[str, Any]) -> dict[int, Factor]:
         kernel = str(columns["kernel"][row])
         robust: Robust | None = make_robust((kernel, float(columns["width"][row])), 1, name) if kernel else None
         measured = check_vector(measured, len(measured), name)
-        found[factor_id] = Factor(kind, keys, measured, noise, robust, samples[row] if samples else None)
+        sample, landmark = samples[row] if samples else None, landmarks[row] if landmarks else None
+        found[factor_id] = Factor(kind, keys, measured, noise, robust, sample, landmark)
     return found
 
 

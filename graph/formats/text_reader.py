@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from itertools import chain
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError, GraphError
 from hybridlio.graph.formats.g2o import ROW_FORMATS
+from hybridlio.graph.formats.landmark_rows import add_observations
 from hybridlio.graph.formats.load_report import LoadOptions, LoadReport
 from hybridlio.graph.formats.text_rows import ParsedRows, parse_rows
 from hybridlio.graph.formats.text_split import read_lines, split_by_tag
@@ -21,7 +23,7 @@ from hybridlio.graph.model.checks import free_motions
 from hybridlio.graph.model.connectivity import components
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, from_integer, to_integer
-from hybridlio.graph.model.measurements import Factor, Kind
+from hybridlio.graph.model.measurements import OBSERVATIONS, Factor, Kind
 from hybridlio.graph.model.noise import Noise
 
 _LOG = logging.getLogger(__name__)
@@ -46,7 +48,9 @@ def read_text(path: str | os.PathLike[str], options: LoadOptions) -> tuple[Graph
     try:
         rows = [parse_rows(path, tag, table, options.repair) for tag, table in content.tables.items()]
         _add_vertices(data, path, [part for part in rows if ROW_FORMATS[part.tag].kind == "vertex"])
-        _add_factors(data, path, [part for part in rows if ROW_FORMATS[part.tag].kind != "vertex"], content.offsets)
+        _add_landmarks(data, path, [part for part in rows if ROW_FORMATS[part.tag].kind == "landmark"])
+        factors = [part for part in rows if ROW_FORMATS[part.tag].kind not in ("vertex", "landmark")]
+        _add_factors(data, path, factors, content.offsets)
         _fix(data, content.fixed)
     except GraphError as error:
         raise DataError(f"{path}: {error}") from error
@@ -68,9 +72,21 @@ def _add_vertices(data: GraphData, path: Path, parts: list[ParsedRows]) -> None:
         data.add_poses(keys, part.coordinates)
 
 
+def _add_landmarks(data: GraphData, path: Path, parts: list[ParsedRows]) -> None:
+    for part in parts:
+        for line, (key,), point in zip(part.lines, part.keys, part.coordinates, strict=True):
+            if key in data or key in data.landmarks:
+                raise DataError(f"{path}, row {line}: vertex {key} exists already")
+            data.landmarks.add(key, point)
+
+
 def _add_factors(data: GraphData, path: Path, parts: list[ParsedRows], offsets: dict[int, Array]) -> None:
     """Add all edges and priors, with ids in the file's order."""
-    rows = sorted((line, keys) for part in parts for line, keys in zip(part.lines, part.keys, strict=True))
+    poses = {part.tag: 1 if ROW_FORMATS[part.tag].kind in OBSERVATIONS else 2 for part in parts}
+    rows = sorted(
+        ((line, keys[: poses[part.tag]]) for part in parts for line, keys in zip(part.lines, part.keys, strict=True)),
+        key=itemgetter(0),
+    )
     ids = {line: factor_id for factor_id, (line, _) in enumerate(rows)}
     _check_keys(data, path, rows)
     edges = [part for part in parts if ROW_FORMATS[part.tag].kind == "edge"]
@@ -79,6 +95,8 @@ def _add_factors(data: GraphData, path: Path, parts: list[ParsedRows], offsets: 
     for part in parts:
         if ROW_FORMATS[part.tag].kind in ("prior", "position"):
             _add_priors(data, part, ids, offsets)
+        elif ROW_FORMATS[part.tag].kind in OBSERVATIONS:
+            add_observations(data, path, part, ids, offsets)
 
 
 def _add_edges(data: GraphData, parts: list[ParsedRows], ids: dict[int, int]) -> None:

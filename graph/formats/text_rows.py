@@ -13,11 +13,12 @@ from hybridlio.core.arrays import Array, Mask
 from hybridlio.core.errors import DataError, GraphError
 from hybridlio.graph.formats.g2o import ROW_BY_ROW, ROW_FORMATS, RowFormat
 from hybridlio.graph.model import coordinates as co
-from hybridlio.graph.model.keys import PLAIN_KEYS, Key, from_integer
+from hybridlio.graph.model.keys import PLAIN_KEYS, Key, from_integer, lettered
 from hybridlio.graph.model.noise import Robust
 
 _UNIT_TOLERANCE = 1e-3  # of a quaternion's norm: files with three digits pass, other numbers do not
 _EXACT_INTEGERS = 2**53  # a double holds all integers below it
+_ROUND_VARIANCE = 1e-4  # m²: GTSAM takes variances of x and y within it as equal
 _LONGEST_ID = 19  # digits of the largest signed 64-bit integer
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _NOT_FINITE = re.compile(r"[+-]?(nan|inf|infinity)", re.ASCII | re.IGNORECASE)
@@ -92,6 +93,8 @@ def parse_rows(path: Path, tag: str, table: TextTable, repair: bool) -> ParsedRo
     ids = _ids(path, tag, table, heads)
     keys = _keys(path, table.lines, [row[: row_format.keys] for row in ids])
     offsets = [row[-1] for row in ids] if row_format.ids > row_format.keys else []
+    if row_format.letter:  # landmarks have a numbering of their own
+        keys = [(pose, lettered(row_format.letter, mark) if isinstance(mark, int) else mark) for pose, mark in keys]
     coordinates = _coordinates(path, table.lines, row_format, heads[:, row_format.ids :])
     return ParsedRows(tag, table.lines, keys, offsets, coordinates, information, table.kernels, repaired)
 
@@ -190,11 +193,13 @@ def _check_information(path: Path, tag: str, lines: list[int], values: Array, re
 
     TORO's planar tags are read in the order that makes all of them positive definite.
     """
-    information = _information(values, ROW_FORMATS[tag])
+    information = _information(_as_information(values, ROW_FORMATS[tag]), ROW_FORMATS[tag])
     wrong = _not_positive_definite(information)
     if wrong.any() and tag in ROW_BY_ROW:
         row_by_row = _information(values, ROW_BY_ROW[tag])
         if not _not_positive_definite(row_by_row).any():
+            if tag == "ODOMETRY":  # of GTSAM's files: the covariance
+                row_by_row = np.asarray(np.linalg.inv(row_by_row), dtype=np.float64)
             return row_by_row, np.zeros_like(wrong)
     if wrong.any() and not repair:
         raise DataError(
@@ -204,6 +209,24 @@ def _check_information(path: Path, tag: str, lines: list[int], values: Array, re
     for k in np.flatnonzero(wrong):
         information[k] = _nearest_positive_definite(information[k])
     return information, wrong
+
+
+def _as_information(values: Array, row_format: RowFormat) -> Array:
+    """Return the numbers of information matrices of bearing and range from what the rows hold.
+
+    GTSAM's ``LANDMARK`` rows hold the variance v of x and y, taken to be that at 10 m: of the bearing v/10, of the
+    range v.
+    """
+    if row_format.noise == "information":
+        return values
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if row_format.noise == "sigmas":
+            numbers = np.where(values > 0, values**-2.0, -1.0)
+        else:
+            x, xy, y = values.T
+            round_ = (xy == 0) & (np.abs(x - y) < _ROUND_VARIANCE) & (x > 0)
+            numbers = np.where(round_, [10 / x, np.zeros(len(x)), 1 / x], -1.0).T
+    return np.where(np.isfinite(numbers), numbers, -1.0)
 
 
 def _information(values: Array, row_format: RowFormat) -> Array:

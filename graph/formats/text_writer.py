@@ -22,12 +22,14 @@ Dialect = Literal["g2o", "toro"]
 
 _TAGS: dict[tuple[str, int], dict[str, str]] = {
     ("g2o", 3): {
-        "vertex": "VERTEX_SE3:QUAT",
-        "between": "EDGE_SE3:QUAT",
-        "prior": "EDGE_SE3_PRIOR",
-        "position": "EDGE_SE3_PRIORXYZ",
+        **{"vertex": "VERTEX_SE3:QUAT", "between": "EDGE_SE3:QUAT"},
+        **{"prior": "EDGE_SE3_PRIOR", "position": "EDGE_SE3_PRIORXYZ"},
+        **{"landmark": "VERTEX_TRACKXYZ", "point": "EDGE_SE3_TRACKXYZ"},
     },
-    ("g2o", 2): {"vertex": "VERTEX_SE2", "between": "EDGE_SE2", "prior": "EDGE_PRIOR_SE2"},
+    ("g2o", 2): {
+        **{"vertex": "VERTEX_SE2", "between": "EDGE_SE2", "prior": "EDGE_PRIOR_SE2"},
+        **{"landmark": "VERTEX_XY", "point": "EDGE_SE2_XY", "bearing-range": "EDGE_BEARING_RANGE_SE2_XY"},
+    },
     ("toro", 3): {"vertex": "VERTEX3", "between": "EDGE3"},
     ("toro", 2): {"vertex": "VERTEX2", "between": "EDGE2"},
 }
@@ -44,14 +46,18 @@ def write_text(data: GraphData, path: str | os.PathLike[str], dialect: Dialect) 
         DataError: the file cannot be written.
     """
     tags = _TAGS[dialect, data.dimension]
-    unsupported = Counter(f.kind for f in data.other_factors.values() if _row_kind(f) not in tags)
+    unsupported: Counter[str] = Counter(f.kind for f in data.other_factors.values() if _row_kind(f) not in tags)
     if data.origin is not None:  # text has no place on Earth to give to measured positions
         unsupported["gps"] = sum(f.kind == "gps" for f in data.other_factors.values())
+    if len(data.landmarks) and "landmark" not in tags:
+        unsupported["landmark"] = len(data.landmarks)
     if unsupported.total():
         kinds = ", ".join(f"{count} × {kind}" for kind, count in unsupported.items())
         raise GraphError(f"{path}: {dialect}'s format cannot hold {kinds}; save as .npz, which holds everything")
-    lines = [*_vertex_lines(data, tags["vertex"]), *_fix_lines(data)]
-    if any(factor.kind == "prior" for factor in data.other_factors.values()) and data.dimension == 3:
+    vertices = list(_vertex_lines(data, tags["vertex"]))
+    landmarks = _landmark_lines(data, tags["landmark"]) if vertices and len(data.landmarks) else ()
+    lines = [*vertices, *landmarks, *_fix_lines(data)]
+    if any(factor.kind in ("prior", "point") for factor in data.other_factors.values()) and data.dimension == 3:
         lines.append(f"PARAMS_SE3OFFSET 0 {format_numbers(co.IDENTITY[3])}")
     for factor in data.factors.values():
         lines += _factor_lines(factor, tags[_row_kind(factor)])
@@ -77,6 +83,14 @@ def _vertex_lines(data: GraphData, tag: str) -> Iterator[str]:
         yield f"{tag} {to_integer(key)} {format_numbers(pose_numbers(pose, ROW_FORMATS[tag].values))}"
 
 
+def _landmark_lines(data: GraphData, tag: str) -> Iterator[str]:
+    missing = [key for key in data.landmarks.keys if data.landmarks.initial_value(key) is None]
+    if missing:
+        raise GraphError(f"landmark {list_keys(missing)} has no initial value to write; give one, or pass a solution")
+    for key, point in zip(data.landmarks.keys, data.landmarks.initial_values, strict=True):
+        yield f"{tag} {to_integer(key)} {format_numbers(point)}"
+
+
 def _is_readers_origin(data: GraphData, given: list[Key]) -> bool:
     """Return whether the poses with initial values are at most one, fixed at the origin."""
     if not given:
@@ -98,7 +112,7 @@ def _fix_lines(data: GraphData) -> list[str]:
 def _factor_lines(factor: Factor, tag: str) -> Iterator[str]:
     assert factor.noise is not None
     row_format = ROW_FORMATS[tag]
-    ids = [to_integer(key) for key in factor.keys]
+    ids = [to_integer(key) for key in (*factor.keys, factor.landmark) if key is not None]
     ids += [0] * (row_format.ids - len(ids))  # the id of a prior's offset in space
     if factor.robust is not None:
         yield f"# robust {factor.robust.kernel} {factor.robust.width!r}"

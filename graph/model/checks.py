@@ -10,7 +10,7 @@ from hybridlio.core.errors import GraphError
 from hybridlio.graph.model.connectivity import components, groups
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, list_keys
-from hybridlio.graph.model.measurements import Factor
+from hybridlio.graph.model.measurements import OBSERVATIONS, Factor
 
 _MOTIONS = ("rotation about x", "rotation about y", "rotation about z", "x", "y", "z")
 _UP = np.array([0.0, 0.0, 1.0])
@@ -38,6 +38,18 @@ def check_determined(data: GraphData) -> None:
     _check_velocities(data)
 
 
+def check_observed(data: GraphData) -> None:
+    """Check that every landmark is observed, which determines it, as its observing pose is determined.
+
+    Raises:
+        GraphError: no factor observes a landmark; names the keys.
+    """
+    observed = {factor.landmark for factor in data.other_factors.values() if factor.kind in OBSERVATIONS}
+    unseen = [key for key in data.landmarks.keys if key not in observed]
+    if unseen:
+        raise GraphError(f"no factor observes landmark {list_keys(unseen)}; add one, or leave the landmark out")
+
+
 def _check_concerned(data: GraphData) -> None:
     concerned = np.zeros(len(data), dtype=bool)
     concerned[data.edges.ends.ravel()] = True
@@ -61,7 +73,7 @@ def free_motions(data: GraphData, part: list[Key]) -> list[str]:
     if inside & data.fixed:
         return []
     names = _MOTIONS if data.dimension == 3 else _MOTIONS[2:5]
-    factors = [f for f in data.other_factors.values() if f.keys[0] in inside and f.kind != "bias"]
+    factors = [f for f in data.other_factors.values() if f.keys[0] in inside and f.kind not in ("bias", *OBSERVATIONS)]
     if any(factor.kind == "prior" for factor in factors):
         return []
     rows = [_motion_jacobian(factor) for factor in factors]

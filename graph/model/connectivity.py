@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from hybridlio.core.sensors import ImuNoise
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key
+from hybridlio.graph.model.measurements import OBSERVATIONS
 
 
 def group_labels(data: GraphData, kinds: Iterable[str]) -> tuple[int, NDArray[np.int32]]:
@@ -39,8 +40,33 @@ def groups(data: GraphData, kinds: Iterable[str]) -> list[list[Key]]:
 
 
 def components(data: GraphData) -> list[list[Key]]:
-    """Return the connected components over between- and IMU factors, largest first."""
-    return groups(data, ("between", "imu"))
+    """Return the connected components over between- and IMU factors, and over shared landmarks, largest first.
+
+    Two parts are joined where they share as many landmarks as determine a rigid transform: two, or three in space.
+    """
+    parts = groups(data, ("between", "imu"))
+    observations = [f for f in data.other_factors.values() if f.kind in OBSERVATIONS]
+    if len(parts) == 1 or not observations:
+        return parts
+    part_of = {key: k for k, part in enumerate(parts) for key in part}
+    seen: list[set[Key]] = [set() for _ in parts]
+    for factor in observations:
+        assert factor.landmark is not None
+        seen[part_of[factor.keys[0]]].add(factor.landmark)
+    order = data.index
+    joined = _join_by_landmarks(list(zip(parts, seen, strict=True)), data.dimension)
+    return sorted((sorted(part, key=order.__getitem__) for part in joined), key=len, reverse=True)
+
+
+def _join_by_landmarks(parts: list[tuple[list[Key], set[Key]]], needed: int) -> list[list[Key]]:
+    """Join parts, of poses and the landmarks they see, that share enough landmarks, until no two do."""
+    while True:
+        pairs = ((a, b) for b in range(len(parts)) for a in range(b))
+        pair = next(((a, b) for a, b in pairs if len(parts[a][1] & parts[b][1]) >= needed), None)
+        if pair is None:
+            return [keys for keys, _ in parts]
+        keys, landmarks = parts.pop(pair[1])
+        parts[pair[0]] = parts[pair[0]][0] + keys, parts[pair[0]][1] | landmarks
 
 
 class InertialChain(NamedTuple):

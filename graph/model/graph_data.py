@@ -14,6 +14,7 @@ from hybridlio.core.geodesy import GeodeticPoint
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.edge_table import FORMS, EdgeTable, GrowingArray
 from hybridlio.graph.model.keys import Key, check_key, list_keys
+from hybridlio.graph.model.landmarks import Landmarks
 from hybridlio.graph.model.measurements import Factor
 from hybridlio.graph.model.noise import Robust
 
@@ -59,6 +60,7 @@ class GraphData:
 
     Attributes:
         dimension: 2 or 3.
+        landmarks: points that poses observe.
         edges: the between-factors.
         other_factors: all other factors by id, in the order they were added.
         next_id: id of the next factor.
@@ -73,6 +75,7 @@ class GraphData:
         self._index: dict[Key, int] = {}
         self._initial = GrowingArray(co.IDENTITY[dimension].shape)  # NaN where there is no initial value
         self._fixed: set[Key] = set()
+        self.landmarks = Landmarks(dimension)
         self.edges = EdgeTable(dimension)
         self._edge_factors: dict[int, Factor] = {}
         self.other_factors: dict[int, Factor] = {}
@@ -135,9 +138,9 @@ class GraphData:
         checked = [check_key(key) for key in keys]
         unknown = [key for key in checked if key not in self._index]
         if unknown:
-            raise GraphError(
-                f"{what}: no pose has key {list_keys(unknown)}; add it by add_pose, add_prior or add_between"
-            )
+            is_landmark = unknown[0] in self.landmarks
+            hint = "it is a landmark" if is_landmark else "add it by add_pose, add_prior or add_between"
+            raise GraphError(f"{what}: no pose has key {list_keys(unknown)}; {hint}")
         return checked
 
     def require_space(self, what: str) -> None:
@@ -173,7 +176,7 @@ class GraphData:
         copy = GraphData(self.dimension)
         copy._keys, copy._index, copy._fixed = self._keys.copy(), self._index.copy(), self._fixed.copy()
         copy._initial, copy.next_id = self._initial.where(slice(None)), self.next_id
-        copy.origin = self.origin
+        copy.origin, copy.landmarks = self.origin, self.landmarks.copy()
         keep = ~np.isin(self.edges.ids, list(without)) if without else slice(None)
         copy.edges = self.edges.where(keep)
         copy.other_factors = {n: factor for n, factor in self.other_factors.items() if n not in without}
@@ -201,10 +204,13 @@ class GraphData:
         self._initial.array[:] = coordinates
 
     def start_from(self, poses: PosesByKey) -> None:
-        """Take initial values from ``poses`` for the keys that both have."""
+        """Take initial values from ``poses`` for the keys that both have; landmarks too, where it has ``points``."""
         for key, coordinates in zip(poses.keys, poses.coordinates, strict=True):
             if key in self._index:
                 self._initial.array[self._index[key]] = coordinates
+        for key, point in getattr(poses, "points", {}).items():
+            if key in self.landmarks:
+                self.landmarks.set_initial(key, point)
 
     def fix(self, key: Key) -> None:
         """Hold a pose at its initial value."""

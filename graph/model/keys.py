@@ -65,6 +65,11 @@ def from_integer(number: int) -> Key:
     return check_key((letter - _FIRST_LETTER, number & ((1 << _INDEX_BITS) - 1)))
 
 
+def lettered(letter: str, index: int) -> Key:
+    """Return the key that GTSAM's symbol of a letter and an index stands for."""
+    return ord(letter) - _FIRST_LETTER, index
+
+
 def list_keys(keys: list[Key]) -> str:
     """Return the keys as text for a message: the first ten, then the count of the rest."""
     text = ", ".join(str(key) for key in keys[:_LISTED_KEYS])

@@ -11,7 +11,8 @@ from hybridlio.core.sensors import ImuSamples
 from hybridlio.graph.model.keys import Key
 from hybridlio.graph.model.noise import Noise, Robust
 
-Kind: TypeAlias = Literal["between", "prior", "gps", "attitude", "velocity", "bias", "imu"]
+Kind: TypeAlias = Literal["between", "prior", "gps", "attitude", "velocity", "bias", "imu", "point", "bearing-range"]
+OBSERVATIONS = ("point", "bearing-range")  # of landmarks
 VECTOR_NOISE_SIZE = {"gps": 3, "attitude": 2, "velocity": 3, "bias": 6}  # a direction has two degrees of freedom
 
 
@@ -25,10 +26,12 @@ class Factor:
         measured: ``between`` and ``prior``: coordinates of a pose (:mod:`hybridlio.graph.model.coordinates`);
             ``gps``: position, lever arm (6); ``attitude``: direction in world, in body (6); ``velocity``: m/s (3);
             ``bias``: accelerometer, gyroscope (6); ``imu``: the fields of
-            :class:`hybridlio.core.sensors.ImuNoise` in their order (6).
+            :class:`hybridlio.core.sensors.ImuNoise` in their order (6); ``point``: a landmark in the frame of the pose
+            (d); ``bearing-range``: angle or unit direction, and range (2, in space 4).
         noise: of the measurement; None for ``imu``, whose noise follows from the samples.
         robust: kernel, or None.
         samples: of an ``imu`` factor.
+        landmark: key of the observed landmark, of ``point`` and ``bearing-range``.
     """
 
     kind: Kind
@@ -37,11 +40,12 @@ class Factor:
     noise: Noise | None = None
     robust: Robust | None = None
     samples: ImuSamples | None = None
+    landmark: Key | None = None
 
     @property
     def label(self) -> str:
         """Kind and keys for messages, such as ``between 3-4``."""
-        return factor_label(self.kind, self.keys)
+        return factor_label(self.kind, self.keys if self.landmark is None else (*self.keys, self.landmark))
 
 
 def factor_label(kind: str, keys: Sequence[object]) -> str:

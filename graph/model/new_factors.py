@@ -95,6 +95,53 @@ def imu_factor(data: GraphData, ends: tuple[Key, Key], samples: ImuSamples, nois
     return Factor("imu", (i, j), densities, samples=samples)
 
 
+def observation_factor(
+    data: GraphData, kind: Kind, ends: tuple[Key, Key], measured: tuple[ArrayLike, ...], noise: NoiseInput,
+    robust: RobustLike,
+) -> Factor:  # fmt: skip
+    """Return an observation of a landmark from a pose; the graph need not have the landmark.
+
+    Args:
+        data: the graph.
+        kind: ``point`` or ``bearing-range``.
+        ends: keys of pose and landmark.
+        measured: the point; or bearing and range.
+        noise: of the measurement; two sigmas of a bearing and a range in space become three.
+        robust: kernel.
+
+    Raises:
+        DataError: malformed numbers, a point at the pose itself, or the noise is not symmetric positive definite.
+        GraphError: unknown pose, malformed key, a pose as landmark, or none or several forms of noise.
+    """
+    name, d = factor_label(kind, ends), data.dimension
+    (pose,) = data.known_keys(ends[0], what=name)
+    landmark = check_key(ends[1])
+    if landmark in data:
+        raise GraphError(f"{name}: {landmark} is a pose, not a landmark")
+    if kind == "point":
+        z = check_vector(measured[0], d, name)
+        if not z.any():
+            raise DataError(f"{name}: the point lies at the pose itself, so that it has no bearing")
+    else:
+        z = _bearing_range(measured, d, name)
+        if noise.sigmas is not None and d == 3 and np.shape(noise.sigmas) == (2,):
+            bearing, distance = np.asarray(noise.sigmas)
+            noise = NoiseInput(sigmas=[bearing, bearing, distance])
+    return Factor(kind, (pose,), z, make_noise(name, d, noise), make_robust(robust, d, name), landmark=landmark)
+
+
+def _bearing_range(measured: tuple[ArrayLike, ...], dimension: int, name: str) -> Array:
+    bearing = np.atleast_1d(np.asarray(measured[0], dtype=np.float64))
+    bearing = check_vector(bearing, 1 if dimension == 2 else 3, name)
+    distance = check_vector(np.atleast_1d(np.asarray(measured[1], dtype=np.float64)), 1, name)
+    if distance[0] <= 0:
+        raise DataError(f"{name}: the range must be positive, got {distance[0]}")
+    if dimension == 3:
+        check_direction(bearing, name)
+        bearing = bearing / np.linalg.norm(bearing)
+    return np.concatenate([bearing, distance])
+
+
 def check_direction(direction: ArrayLike, name: str) -> None:
     """Raise DataError where a vector is zero, and so has no direction."""
     if not np.any(np.asarray(direction)):

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from hybridlio.graph.model.checks import check_determined
+from hybridlio.graph.model.checks import check_determined, check_observed
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.solve.gnc import odometry_start, reject_outliers
+from hybridlio.graph.solve.growing_start import grow_start
 from hybridlio.graph.solve.initial_values import choose_start
 from hybridlio.graph.solve.nonlinear import IterationProgress, NonlinearSolver
 from hybridlio.graph.solve.settings import Settings
@@ -18,11 +19,13 @@ def solve_batch(graph: GraphData, settings: Settings, report: IterationProgress)
         GraphError: the factors do not determine every pose; names the keys.
     """
     check_determined(graph)
+    check_observed(graph)
     data = graph.copy()
     if settings.backend == "gnc":
         return _solve_without_outliers(data, settings, report)
     solver = NonlinearSolver(data, settings.max_iterations, settings.tolerance, report)
-    return Solution(data, solver(choose_start(data, settings.initial)))
+    start = choose_start(data, settings.initial)
+    return Solution(data, solver(grow_start(data, start, report) if settings.initial == "auto" else start))
 
 
 def _solve_without_outliers(data: GraphData, settings: Settings, report: IterationProgress) -> Solution:

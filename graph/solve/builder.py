@@ -1,4 +1,7 @@
-"""A pose graph as GTSAM's factors and values; variables are ``x`` pose, ``v`` velocity, ``b`` biases, by pose index."""
+"""A pose graph as GTSAM's factors and values.
+
+Variables are ``x`` pose, ``v`` velocity and ``b`` biases, by pose index, and ``l`` landmark, by landmark index.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +24,9 @@ from hybridlio.graph.model.connectivity import InertialChain, chains_without_bia
 from hybridlio.graph.model.edge_table import FORMS
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key
-from hybridlio.graph.model.measurements import Factor
+from hybridlio.graph.model.measurements import OBSERVATIONS, Factor
 from hybridlio.graph.model.noise import Robust
+from hybridlio.graph.solve.landmark_factors import initial_landmarks, insert_landmarks, observation
 
 BiasAt: TypeAlias = Callable[[int], gtsam.imuBias.ConstantBias]
 
@@ -79,7 +83,7 @@ class Builder:
         return [*self.data.edges.ids.tolist(), *self.data.other_factors]
 
     def values(self, poses: Array) -> gtsam.Values:
-        """Return initial values: poses at their coordinates, and the velocities and biases that factors concern."""
+        """Return initial values: poses at their coordinates, and what factors concern beside them."""
         values = gtsam.Values()
         insert = values.insert
         for k, pose in enumerate(co.gtsam_poses(poses), _X0):
@@ -88,6 +92,7 @@ class Builder:
             insert(V(k), velocity)
         for k in self.poses_with_bias():
             insert(B(k), self._bias_at(k))
+        insert_landmarks(values, initial_landmarks(self.data, poses))
         return values
 
     def poses_with_bias(self) -> list[int]:
@@ -106,6 +111,8 @@ class Builder:
 
     def factor(self, factor: Factor, robust: bool = True) -> Any:
         """Return any factor but a between-factor."""
+        if factor.kind in OBSERVATIONS:
+            return observation(self.data, factor, robust)
         model = None
         if factor.noise is not None:
             noise = factor.noise

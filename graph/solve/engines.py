@@ -6,11 +6,12 @@ that it held.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any, Protocol
 
 import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import L
 
 from hybridlio.core.errors import GraphError
 from hybridlio.graph.base.isam import gtsam_message, make_isam_params
@@ -31,8 +32,16 @@ class Engine(Protocol):
 
     solver: Any
 
-    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, removed: list[int]) -> list[int]:
+    def update(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, removed: list[int], latest: Mapping[int, int]
+    ) -> list[int]:
         """Add factors and variables, remove factors by slot, and return the slots of the new factors.
+
+        Args:
+            graph: the new factors.
+            values: initial values of the new variables.
+            removed: slots.
+            latest: index of the newest pose that observes a landmark, by the index of each landmark in ``graph``.
 
         Raises:
             GraphError: the graph cannot be solved.
@@ -68,7 +77,9 @@ class Incremental:
         self._removed: dict[int, Any] = {}  # of the last update, by slot
         self._new: Collection[int] = ()  # variables of a failed update
 
-    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, removed: list[int]) -> list[int]:
+    def update(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, removed: list[int], _latest: Mapping[int, int]
+    ) -> list[int]:
         """See :class:`Engine`."""
         held = self.solver.getFactorsUnsafe() if removed else gtsam.NonlinearFactorGraph()
         self._removed = {slot: held.at(slot) for slot in removed}
@@ -109,16 +120,21 @@ class FixedLag:
         self._params, self._lag = _params(dimension, reuse_slots=True), float(lag)
         self.solver = gtsam.IncrementalFixedLagSmoother(self._lag, self._params)
         self._before = gtsam.NonlinearFactorGraph(), gtsam.Values()  # a failed update
+        self._landmark_stamps: dict[Any, float] = {}  # of landmarks, by variable
 
-    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, removed: list[int]) -> list[int]:
+    def update(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, removed: list[int], latest: Mapping[int, int]
+    ) -> list[int]:
         """See :class:`Engine`."""
+        stamps: dict[Any, float] = {L(landmark): float(pose) for landmark, pose in latest.items()}
         before = gtsam.NonlinearFactorGraph(self.solver.getFactors())
         values_before = gtsam.Values(self.solver.getLinearizationPoint())
         try:
-            self.solver.update(graph, values, _stamps(values), removed)
+            self.solver.update(graph, values, _stamps(values) | stamps, removed)
         except RuntimeError as error:
             self._before = before, values_before
             raise GraphError(f"the graph cannot be solved: {gtsam_message(error)}") from error
+        self._landmark_stamps |= stamps
         return list(self.solver.getISAM2Result().getNewFactorsIndices())
 
     def iterate(self) -> bool:
@@ -132,7 +148,8 @@ class FixedLag:
         # all slots, not only the kept ones: some hold marginals of poses that have left the lag
         graph, new_slots = _compact({slot: held.at(slot) for slot in range(held.size()) if held.exists(slot)})
         self.solver = gtsam.IncrementalFixedLagSmoother(self._lag, self._params)
-        self.solver.update(graph, values, _stamps(values), [])
+        stamps = _stamps(values)
+        self.solver.update(graph, values, stamps | {v: self._landmark_stamps[v] for v in stamps if _is_landmark(v)}, [])
         return {slot: new_slots[slot] for slot in kept}
 
     def joint(self, variables: list[int]) -> Any:
@@ -143,7 +160,7 @@ class FixedLag:
 def _params(dimension: int, reuse_slots: bool) -> gtsam.ISAM2Params:
     turn_3, shift_3 = np.full(3, _TURN_RAD), np.full(3, _SHIFT_M)
     pose = np.r_[turn_3, shift_3] if dimension == 3 else np.array([_SHIFT_M, _SHIFT_M, _TURN_RAD])
-    thresholds = {"x": pose, "v": np.full(3, _SPEED_M_S), "b": np.repeat(_BIASES, 3)}
+    thresholds = {"x": pose, "v": np.full(3, _SPEED_M_S), "b": np.repeat(_BIASES, 3), "l": np.full(dimension, _SHIFT_M)}
     params = make_isam_params(thresholds, _WILDFIRE_THRESHOLD)
     if reuse_slots:
         # few variables are in a lag: checking all at each update is cheap
@@ -151,8 +168,12 @@ def _params(dimension: int, reuse_slots: bool) -> gtsam.ISAM2Params:
     return params
 
 
-def _stamps(values: gtsam.Values) -> Any:
-    """Return the time of each variable for GTSAM's smoother: the index of its pose."""
+def _is_landmark(variable: int) -> bool:
+    return bool(gtsam.Symbol(variable).chr() == ord("l"))
+
+
+def _stamps(values: gtsam.Values) -> dict[Any, float]:
+    """Return the time of each variable but landmarks for GTSAM's smoother: the index of its pose."""
     variables = values.keys()
     return {variable: float(gtsam.Symbol(variable).index()) for variable in variables}
 

@@ -13,7 +13,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order
 
 from hybridlio.core import se3
-from hybridlio.core.arrays import Array
+from hybridlio.core.arrays import Array, Index
 from hybridlio.core.errors import GraphError
 from hybridlio.graph.base.isam import gtsam_message
 from hybridlio.graph.model import coordinates as co
@@ -199,9 +199,9 @@ def needs_qr(data: GraphData) -> bool:
 
 def _farthest_pose(data: GraphData, anchored: list[int]) -> int:
     """Return the number of edges between the farthest pose and its nearest anchored one."""
-    count = len(data)
+    count = len(data) + len(data.landmarks)  # nodes: poses, then landmarks
     to_anchored = np.column_stack([np.full(len(anchored), count), anchored])  # from one more node, the root
-    ends = np.vstack([data.edges.ends, to_anchored])
+    ends = np.vstack([data.edges.ends, _observation_ends(data), to_anchored])
     adjacency = coo_matrix((np.ones(len(ends), dtype=np.int8), ends.T), shape=(count + 1, count + 1))
     _, parent = breadth_first_order(adjacency.tocsr(), count, directed=False)
     parent[parent < 0] = count
@@ -210,6 +210,14 @@ def _farthest_pose(data: GraphData, anchored: list[int]) -> int:
     while (ancestor != count).any():
         depth, ancestor = depth + depth[ancestor], ancestor[ancestor]
     return int(depth.max())
+
+
+def _observation_ends(data: GraphData) -> Index:
+    """Return ``(M, 2)`` indices of the pose and the landmark of each observation, landmarks counted after poses."""
+    observations = (f for f in data.other_factors.values() if f.landmark is not None)
+    landmarks = data.landmarks.index
+    ends = [(data.index[f.keys[0]], len(data) + landmarks[f.landmark]) for f in observations if f.landmark is not None]
+    return np.array(ends, dtype=np.int64).reshape(-1, 2)
 
 
 def poses_of(values: gtsam.Values, dimension: int) -> Array:

@@ -21,8 +21,10 @@ from hybridlio.graph.solve.builder import Builder
 from hybridlio.graph.solve.changes import Changes, ChangeTracker
 from hybridlio.graph.solve.engines import Engine, FixedLag, Incremental
 from hybridlio.graph.solve.initial_values import choose_start
+from hybridlio.graph.solve.landmark_factors import insert_landmarks
 from hybridlio.graph.solve.nonlinear import NonlinearSolver, biases_of, poses_of, silent
 from hybridlio.graph.solve.online_factors import NewFactors, new_factors
+from hybridlio.graph.solve.online_landmarks import OnlineLandmarks
 from hybridlio.graph.solve.online_start import OnlineStart, determines_new_poses
 from hybridlio.graph.solve.settings import ONLINE_SOLVERS
 
@@ -53,6 +55,7 @@ class OnlineSolver:
         self._with_velocity: set[int] = set()  # indices of poses in the lag whose velocity is a variable
         self._with_bias: set[int] = set()
         self._bias_marginalised: set[int] = set()  # poses in the lag whose biases a marginal constrains
+        self._landmarks = OnlineLandmarks(data)
         self._count = self._oldest = 0  # poses so far; index of the oldest one in the lag
         self._departed = GrowingArray(co.IDENTITY[data.dimension].shape)  # poses that left the lag, as last estimated
 
@@ -75,14 +78,17 @@ class OnlineSolver:
             return
         self._check(changes)
         if self._count:
-            start = OnlineStart(self._data, changes, self._engine.solver, self._with_velocity, self._with_bias)
+            solver, landmarks = self._engine.solver, self._landmarks.estimated
+            start = OnlineStart(self._data, changes, solver, self._with_velocity, self._with_bias, landmarks)
             builder, values = start.builder, start.values()
         else:
             builder, values = self._solve_first()
         factors = new_factors(builder, changes, self._slots.keys(), self._bias_marginalised)
-        leaving = self._leaving(changes, values)
-        self._update_engine(factors, values, changes.removed)
+        leaving, latest = self._leaving(changes, values), self._landmarks.latest(changes.other_factors.values())
+        leaving_points = self._landmarks.leaving(latest, self._oldest_after(changes), self._engine.solver)
+        self._update_engine(factors, values, changes.removed, latest)
         self._accept(changes, values, leaving)
+        self._landmarks.accept(latest, leaving_points)
         new_edges = self._data.edges.robust.keys() & set(factors.names)
         if new_edges or any(factor.robust for factor in changes.other_factors.values()):
             self._iterate_weights()
@@ -110,11 +116,16 @@ class OnlineSolver:
         return co.to_matrices(np.vstack([self._departed.array, in_lag]))
 
     def values(self) -> gtsam.Values:
-        """Return GTSAM's values: poses ``x`` by index, velocities ``v`` and biases ``b`` of those in the lag."""
+        """Return GTSAM's values: poses ``x``, landmarks ``l``, and velocities ``v`` and biases ``b`` in the lag."""
         values = gtsam.Values(self._engine.solver.calculateEstimate())
         for index, pose in enumerate(co.gtsam_poses(self._departed.array)):
             values.insert(X(index), pose)
+        insert_landmarks(values, self._landmarks.departed)
         return values
+
+    def point(self, key: Key) -> Array:
+        """Return a landmark ``(3,)`` in world, ``(2,)`` in the plane; one that has left the lag as last estimated."""
+        return self._landmarks.point(key, self._engine.solver)
 
     def velocity(self, key: Key) -> Array:
         """Return the body's velocity ``(3,)`` in world, m/s; GraphError where it has none or has left the lag."""
@@ -127,7 +138,10 @@ class OnlineSolver:
         return np.array(bias.accelerometer()), np.array(bias.gyroscope())
 
     def covariance(self, key: Key) -> Array:
-        """Return a pose's covariance, as :class:`~hybridlio.graph.solve.solution.Solution` does; only in the lag."""
+        """Return the covariance of a pose or a landmark, as a solution does; only in the lag."""
+        if key in self._data.landmarks:
+            covariance = self._engine.solver.marginalCovariance(self._landmarks.variable(key))
+            return np.asarray((covariance + covariance.T) / 2)
         index = self._in_lag(key)
         covariance = self._engine.solver.marginalCovariance(X(index))
         return co.our_order((covariance + covariance.T) / 2, self._data.dimension)
@@ -164,6 +178,7 @@ class OnlineSolver:
                 f"factor {marginalised[0]} was removed after its poses had left the lag; its effect remains"
             )
         self._check_lag(changes)
+        self._landmarks.check(changes.other_factors.values(), bool(changes.removed))
         determined = self._count and determines_new_poses(self._data, changes, self._with_velocity)
         if determined and not changes.removed and not changes.unfixed:
             return
@@ -188,11 +203,13 @@ class OnlineSolver:
         """Return the index of the oldest pose in the lag once the changes are in."""
         return 0 if self._lag is None else max(changes.poses.stop - 1 - self._lag, self._oldest)
 
-    def _update_engine(self, factors: NewFactors, values: gtsam.Values, removed_ids: list[int]) -> None:
+    def _update_engine(
+        self, factors: NewFactors, values: gtsam.Values, removed_ids: list[int], latest: dict[int, int]
+    ) -> None:
         """Give the factors to GTSAM; restore it where it fails."""
         outdated = [*removed_ids, *factors.replaced]
         try:
-            slots = self._engine.update(factors.graph, values, [self._slots[name] for name in outdated])
+            slots = self._engine.update(factors.graph, values, [self._slots[name] for name in outdated], latest)
         except GraphError:
             new_slots = self._engine.restore(self._slots.values()) if self._count else {}
             self._slots = {name: new_slots[slot] for name, slot in self._slots.items()}

@@ -8,12 +8,14 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
-from hybridlio.graph.model.measurements import Factor
+from hybridlio.graph.model.measurements import OBSERVATIONS, Factor
 from hybridlio.graph.solve.builder import Builder
 from hybridlio.graph.solve.changes import Changes
+from hybridlio.graph.solve.landmark_factors import insert_landmarks, point_in_pose_frame
 
 
 def determines_new_poses(data: GraphData, changes: Changes, with_velocity: set[int]) -> bool:
@@ -73,16 +75,18 @@ class OnlineStart:
         solver: GTSAM's solver with the estimates so far.
         with_velocity: indices of the poses whose velocity it estimates.
         with_bias: indices of the poses whose biases it estimates.
+        landmarks: indices of the landmarks that it estimates.
 
     Attributes:
         builder: makes factors, with IMU samples preintegrated around :meth:`bias`.
     """
 
     def __init__(
-        self, data: GraphData, changes: Changes, solver: Any, with_velocity: set[int], with_bias: set[int]
-    ) -> None:
+        self, data: GraphData, changes: Changes, solver: Any, with_velocity: set[int], with_bias: set[int],
+        landmarks: set[int],
+    ) -> None:  # fmt: skip
         self._data, self._changes, self._solver = data, changes, solver
-        self._with_velocity, self._with_bias = with_velocity, with_bias
+        self._with_velocity, self._with_bias, self._landmarks = with_velocity, with_bias, landmarks
         self._poses: dict[int, Any] = {}
         self._velocities: dict[int, Any] = {}
         self._biases = {data.index[f.keys[0]]: f.measured for f in changes.of_kind("bias")}
@@ -113,7 +117,19 @@ class OnlineStart:
         for index, pose in sorted(self._poses.items()):
             values.insert(X(index), pose)
         self._insert_motion(values, inertial)
+        insert_landmarks(values, self._new_landmarks())
         return values
+
+    def _new_landmarks(self) -> dict[int, Array]:
+        """Return the points of new landmarks, by index, where their first observation sees them."""
+        found: dict[int, Array] = {}
+        for factor in self._changes.of_kind(*OBSERVATIONS):
+            assert factor.landmark is not None
+            landmark = self._data.landmarks.index[factor.landmark]
+            if landmark not in self._landmarks and landmark not in found:
+                pose = self._pose(self._data.index[factor.keys[0]])
+                found[landmark] = np.array(pose.transformFrom(point_in_pose_frame(factor)))
+        return found
 
     def _pass_biases_on(self, inertial: list[Factor]) -> None:
         """Start the biases of each IMU factor's second pose at those of its first."""

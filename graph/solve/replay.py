@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 
 from hybridlio.core.errors import GraphError
-from hybridlio.graph.model.checks import check_determined
+from hybridlio.graph.model.checks import check_determined, check_observed
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.solve.builder import Builder
 from hybridlio.graph.solve.initial_values import choose_start
@@ -27,6 +27,7 @@ def solve_online(graph: GraphData, settings: Settings, report: IterationProgress
         GraphError: the factors do not determine every pose, or a factor spans more than the lag; names the keys.
     """
     check_determined(graph)
+    check_observed(graph)
     data = graph.copy()
     found, updates = _replay(data, settings, report)
     values = Builder(data).values(poses_of(found, data.dimension))
@@ -51,6 +52,7 @@ def _replay(data: GraphData, settings: Settings, report: IterationProgress) -> t
     if settings.backend == "fixed-lag":
         _check_spans(data, settings.lag)
     grown = GraphData(data.dimension)
+    grown.landmarks = data.landmarks.copy()  # the solver takes each at its first observation
     solver = OnlineSolver(grown, settings.backend, settings.lag, forget=False)
     keys, initial, complete = data.keys, data.initial_values, _ids_by_latest_pose(data)
     updates, needed = 0, 1

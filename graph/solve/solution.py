@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
+from gtsam.symbol_shorthand import B, L, V, X
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
@@ -17,6 +18,7 @@ from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key
 from hybridlio.graph.solve.builder import Builder
+from hybridlio.graph.solve.landmark_factors import landmark_point
 from hybridlio.graph.solve.nonlinear import SolverResult
 
 
@@ -43,9 +45,10 @@ class Solution:
 
     def __repr__(self) -> str:
         state = "converged" if self.converged else "not converged"
+        landmarks = f"{len(self.landmarks)} landmarks, " if self.landmarks else ""
         rejected = f", {len(self.rejected)} factors rejected" if self.rejected else ""
         return (
-            f"<Solution: {len(self._index)} poses, error {self.error_before:.6g} -> {self.error:.6g} "
+            f"<Solution: {len(self._index)} poses, {landmarks}error {self.error_before:.6g} -> {self.error:.6g} "
             f"in {self.iterations} iterations, {state}{rejected}>"
         )
 
@@ -75,6 +78,27 @@ class Solution:
         """
         return np.array(self.poses[self._known(key)])
 
+    @property
+    def landmarks(self) -> list[Key]:
+        """Keys of all landmarks, in the graph's order."""
+        return self._data.landmarks.keys
+
+    @cached_property
+    def points(self) -> Mapping[Key, Array]:
+        """All landmarks ``(3,)`` in world, ``(2,)`` in the plane, by key."""
+        found = self._data.landmarks.index.items()
+        return {key: landmark_point(self._result.values, k, self._data.dimension) for key, k in found}
+
+    def point(self, key: Key) -> Array:
+        """Return a landmark ``(3,)`` in world, ``(2,)`` in the plane.
+
+        Raises:
+            GraphError: no landmark has this key.
+        """
+        if key not in self._data.landmarks:
+            raise GraphError(f"no landmark has key {key}")
+        return self.points[key].copy()
+
     def velocity(self, key: Key) -> Array:
         """Return the body's velocity ``(3,)`` in world, m/s.
 
@@ -95,14 +119,18 @@ class Solution:
         return np.array(bias.accelerometer()), np.array(bias.gyroscope())
 
     def covariance(self, key: Key) -> Array:
-        """Return the marginal covariance of a pose in world, of a right perturbation.
+        """Return the marginal covariance of a pose in world, of a right perturbation, or of a landmark in world.
 
-        It is ``(6, 6)`` in rad² and m², rotation first; in the plane ``(3, 3)`` of heading, x, y. A fixed pose has the
-        covariance of the prior that holds it, 1e-6 rad and m.
+        A pose's is ``(6, 6)`` in rad² and m², rotation first; in the plane ``(3, 3)`` of heading, x, y. A landmark's is
+        ``(3, 3)`` in m², in the plane ``(2, 2)``. A fixed pose has the covariance of the prior that holds it, 1e-6 rad
+        and m.
 
         Raises:
-            GraphError: no pose has this key, or the graph is too ill-conditioned for covariances.
+            GraphError: no pose or landmark has this key, or the graph is too ill-conditioned for covariances.
         """
+        if key in self._data.landmarks:
+            covariance = np.asarray(self._marginals.marginalCovariance(L(self._data.landmarks.index[key])))
+            return np.asarray((covariance + covariance.T) / 2)
         covariance = np.asarray(self._marginals.marginalCovariance(X(self._known(key))))
         return co.our_order((covariance + covariance.T) / 2, self._data.dimension)
 
@@ -125,8 +153,8 @@ class Solution:
     def residual(self, factor_id: int) -> Array:
         """Return the difference of a factor's measurement and the solution, not whitened; of rejected factors too.
 
-        A pose's is a tangent vector, rotation first (rad, m); an inertial factor's holds rotation, position, velocity
-        and biases.
+        A pose's is a tangent vector, rotation first (rad, m); a landmark's is bearing and range (rad, m); an inertial
+        factor's holds rotation, position, velocity and biases.
 
         Raises:
             GraphError: no factor has this id.
@@ -164,7 +192,8 @@ class Solution:
         found = {}
         for slot, factor_id in enumerate(builder.factor_ids()):
             factor: Any = graph.at(slot)
-            residual = np.asarray(factor.unwhitenedError(self._result.values))[order]
+            residual = np.asarray(factor.unwhitenedError(self._result.values))
+            residual = residual[order] if len(residual) > 2 else residual  # a planar observation has two components
             found[factor_id] = residual, 2 * float(factor.error(self._result.values))
         return found
 

@@ -318,8 +318,17 @@ def test_the_public_names_are_exactly_these():
         *("add_pose", "initial", "set_initial", "start_from", "fix", "unfix", "set_origin", "remove"),
         *("add_prior", "add_between", "add_imu", "add_velocity", "add_zero_velocity", "add_bias"),
         *("add_gps", "add_gps_geodetic", "add_attitude", "add_gravity"),
+        *("landmarks", "add_landmark", "add_point_observation", "add_bearing_range"),
         *("initialise", "optimize", "online", "load", "load_report", "save"),
     }
+
+
+def test_the_package_lists_its_names():
+    import hybridlio.graph
+
+    names = {"LoadReport", "OnlineSolver", "PoseGraph", "Solution"}
+    assert names <= set(dir(hybridlio.graph))
+    assert all(getattr(hybridlio.graph, name).__name__ == name for name in names)
 
 
 def test_repr_is_one_informative_line(rng):

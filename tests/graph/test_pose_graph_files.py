@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 import gtsam
@@ -184,13 +183,6 @@ def test_a_file_of_edges_alone_can_be_solved(tmp_path):
     step = se3.exp([0, 0, 0.1, 1, 0, 0])
     step[:2, 3] = 1, 0
     np.testing.assert_allclose(graph.optimize().pose(4), np.linalg.matrix_power(step, 4), atol=1e-6)
-
-
-def test_landmarks_are_skipped_with_a_warning(tmp_path, caplog):
-    (tmp_path / "a.g2o").write_text(PLANE + "VERTEX_XY 5 1 2\nEDGE_SE2_XY 0 5 1 2 1 0 1\n# a comment\n\n")
-    with caplog.at_level(logging.WARNING):
-        assert len(PoseGraph.load(tmp_path / "a.g2o")) == 2
-    assert "1 × VERTEX_XY" in caplog.text
 
 
 E0 = "EDGE_SE2 0 1 1.5 0.25 0.5 1 0 0 2 0 "

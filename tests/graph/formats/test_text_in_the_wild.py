@@ -198,6 +198,7 @@ CASES = {
     "bom.g2o": ({}, 4, 4, {}),
     "hdl_prior.g2o": ({}, 4, 5, {"left_out": {"EDGE_SE3_PRIORVEC": 1}}),
     "offset_other.g2o": ({}, 4, 4, {}),
+    "landmarks_pointxyz.g2o": ({}, 4, 5, {}),
     "plane_glim_hdl.g2o": ({}, 4, 4, {"left_out": {"VERTEX_PLANE": 1, "EDGE_SE3_PLANE": 1}}),
     "indefinite_information.g2o": ({"repair": True}, 2, 1, {"repaired": 1}),
     "toro_without_information.graph": ({}, 2, 1, {"without_information": 1}),
