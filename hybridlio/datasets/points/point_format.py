@@ -57,6 +57,7 @@ class PointFormat:
     times: PointTimes | None = None
     limits_m: tuple[float, float] | None = None
 
+    @np.errstate(invalid="ignore", over="ignore")  # damaged files hold any bits
     def scan(self, columns: Columns, stamp_ns: int) -> Scan:
         """Return the scan of the columns, without points that are not finite, at the origin or no returns.
 
@@ -108,6 +109,7 @@ def sampled(count: int) -> list[int]:
     return sorted({round(k) for k in np.linspace(0, count - 1, SAMPLES)}) if count else []
 
 
+@np.errstate(invalid="ignore", over="ignore")  # damaged files hold any bits
 def find_format(
     samples: Sequence[tuple[int, Columns]], step_ns: int | None, notes: Notes, stated: StatedFormat | None = None
 ) -> PointFormat:
@@ -184,6 +186,6 @@ def _intensity(columns: Columns) -> Floats | None:
     values = next((columns[name] for name in _INTENSITIES if name in columns), None)
     if values is None:
         return None
-    largest = np.max(values, where=np.isfinite(values), initial=0)
+    largest = values[np.isfinite(values)].max(initial=0)
     full_scale = next((scale for scale in _FULL_SCALES if largest <= scale), _FULL_SCALES[-1])
     return np.asarray(values, dtype=np.float32) / np.float32(full_scale)

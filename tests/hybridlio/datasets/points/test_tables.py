@@ -74,6 +74,23 @@ def test_truncated_and_damaged_files_are_refused(tmp_path: Path, suffix: str) ->
             read_scan(path, 0)
 
 
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize("place", [100, 107, "chunks"])
+def test_counts_that_the_file_does_not_hold_are_refused_before_memory_is_taken(
+    tmp_path: Path, suffix: str, place: int | str
+) -> None:
+    path = tmp_path / f"scan{suffix}"
+    write_las(path)
+    data = bytearray(path.read_bytes())
+    if place == "chunks":  # the library aborts the process on these
+        start = int.from_bytes(data[96:100], "little")
+        place = int.from_bytes(data[start : start + 8], "little") + 4 if suffix == ".laz" else 107
+    data[place : place + 4] = b"\xff" * 4
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=r"truncated|announces"):
+        read_scan(path, 0)
+
+
 @pytest.mark.parametrize(("suffix", "module", "extra"), [(".las", "laspy", "las"), (".feather", "pyarrow", "arrow")])
 def test_a_missing_library_is_named_with_the_extra_that_brings_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, module: str, extra: str
