@@ -13,6 +13,7 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
+from hybridlio.core.errors import strip_control
 from hybridlio.core.progress import Progress
 
 _LINE_INTERVAL_S = 1.0  # keeps the log of a short run to a few lines
@@ -21,7 +22,7 @@ _WIDEST_TABLE = 240  # columns; more than any table here needs
 
 def print_result(text: str) -> None:
     """Print a line to stdout without wrapping or markup."""
-    Console().print(text, markup=False, highlight=False, soft_wrap=True)
+    Console().print(strip_control(text), markup=False, highlight=False, soft_wrap=True)
 
 
 def print_table(table: Table) -> None:
@@ -33,7 +34,7 @@ def print_table(table: Table) -> None:
 
 def print_message(text: str, style: str = "red") -> None:
     """Print a line to stderr; red, as an error, unless ``style`` is given."""
-    _stderr().print(Text(text, style=style), soft_wrap=True)
+    _stderr().print(Text(strip_control(text), style=style), soft_wrap=True)
 
 
 def print_warning(text: str) -> None:

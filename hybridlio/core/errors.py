@@ -1,5 +1,17 @@
 """The errors that the library raises. Messages say what is wrong, where (file, row, frame index), and what to do."""
 
+import re
+
+_SEQUENCE = re.compile(
+    r"\x1b\[[0-?]*[ -/]*[@-~]|\x1b\][^\x07\x1b]*(?:\x07|\x1b\\)?"
+)  # colours, titles, cursor (ECMA-48)
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")  # all but tab and newline
+
+
+def strip_control(text: str) -> str:
+    """Return the text without control characters, which a file's name or content could send to the terminal."""
+    return _CONTROL.sub("", _SEQUENCE.sub("", text))
+
 
 class HybridLioError(Exception):
     """Base class of all errors that the library raises on purpose."""

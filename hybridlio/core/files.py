@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import datetime
 import fcntl
 import os
 import uuid
@@ -18,6 +19,33 @@ from hybridlio.core.errors import DataError, HybridLioError
 UNREADABLE_NPZ = (
     OSError, ValueError, KeyError, IndexError, TypeError, EOFError, BadZipFile, zlib.error, HybridLioError
 )  # fmt: skip
+
+_MAX_PATH_BYTES = 4096  # PATH_MAX of Linux; a part of a path has at most 255 (NAME_MAX)
+# Limits of a YAML file. A list of 10,000 recordings with all keys has 2 MiB and 140,000 values; settings are 4 deep.
+_MAX_YAML_BYTES, _MAX_YAML_DEPTH, _MAX_YAML_VALUES = 8 << 20, 50, 500_000
+
+
+def user_path(path: str | os.PathLike[str]) -> Path:
+    """Return the path that somebody gave, with ``~`` expanded.
+
+    Raises:
+        DataError: it is no path on any system: it has a NUL character, is too long, or names an unknown user.
+    """
+    text = os.fspath(path)
+    if "\0" in text:
+        raise DataError(f"{_shortened(text)!r}: a path cannot contain a NUL character")
+    if len(os.fsencode(text)) > _MAX_PATH_BYTES or any(len(os.fsencode(part)) > 255 for part in Path(text).parts):
+        raise DataError(f"{_shortened(text)}: the path is too long")
+    try:
+        return Path(text).expanduser()
+    except RuntimeError:
+        raise DataError(
+            f"{_shortened(text)}: unknown user in this path; write ./~… for a folder of that name"
+        ) from None
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) < 80 else f"{text[:60]}…"
 
 
 def make_folder(path: Path) -> None:
@@ -100,21 +128,85 @@ def write_atomically(path: str | os.PathLike[str], data: bytes | str) -> None:
 def read_yaml(path: str | os.PathLike[str], error: type[HybridLioError] = DataError) -> Any:
     """Return the content of a YAML or JSON file, None for an empty one. Tags cannot execute code.
 
+    The content is limited in size, depth and aliases, so that no file exhausts memory or the stack.
+
     Args:
         path: the file.
         error: the error to raise.
 
     Raises:
-        DataError: or ``error``; the file cannot be read or is not YAML. Names the file and, if known, the line.
+        DataError: or ``error``; the file cannot be read, is not YAML, exceeds a limit, or has a value of an unusable
+            type. Names the file and, if known, the line.
     """
     import yaml  # late: this module is imported by most others
 
     try:
-        return yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        with Path(path).open("rb") as file:
+            content = file.read(_MAX_YAML_BYTES + 1)
+        if len(content) > _MAX_YAML_BYTES:
+            raise error(f"{path}: over {_MAX_YAML_BYTES >> 20} MiB, too large for a YAML file")
+        text = content.decode("utf-8-sig")
+        _check_yaml(text)
+        value = yaml.safe_load(text)
+        _check_values(value)
     except OSError as trouble:
         raise error(f"{path}: cannot be read ({trouble.strerror})") from trouble
     except yaml.MarkedYAMLError as trouble:
         line = "" if trouble.problem_mark is None else f" at line {trouble.problem_mark.line + 1}"
         raise error(f"{path}: not YAML{line}: {trouble.problem or trouble.context}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as trouble:
-        raise error(f"{path}: not YAML: {' '.join(str(trouble).split())}") from None
+    except HybridLioError:
+        raise
+    except Exception as trouble:  # PyYAML lets those of its conversions through, such as of the date 2026-13-45
+        what = f"unknown value {trouble}" if isinstance(trouble, KeyError) else " ".join(str(trouble).split())
+        raise error(f"{path}: not YAML: {what}") from None
+    return value
+
+
+def _check_yaml(text: str) -> None:
+    """Check depth, aliases and size of a YAML text before anything is built from it.
+
+    Raises:
+        ValueError: a limit is exceeded, or an alias refers to a collection that contains it; names the line.
+        yaml.YAMLError: the text is not YAML.
+    """
+    import yaml
+
+    sizes: dict[str, int | None] = {}  # values behind each anchor, aliases expanded; None while it is open
+    counts, anchors = [0], [""]
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        place = "" if event.start_mark is None else f"line {event.start_mark.line + 1}: "
+        if isinstance(event, yaml.AliasEvent):
+            size = sizes.get(str(event.anchor), 0)
+            if size is None:
+                raise ValueError(f"{place}the alias *{event.anchor} contains itself")
+            counts[-1] += size
+        elif isinstance(event, yaml.CollectionStartEvent):
+            sizes |= {event.anchor: None} if event.anchor else {}
+            counts.append(1)
+            anchors.append(event.anchor or "")
+        elif isinstance(event, yaml.CollectionEndEvent):
+            size, anchor = counts.pop(), anchors.pop()
+            counts[-1] += size
+            sizes |= {anchor: size} if anchor else {}
+        elif isinstance(event, yaml.ScalarEvent):
+            counts[-1] += 1
+            sizes |= {event.anchor: 1} if event.anchor else {}
+        if len(counts) > _MAX_YAML_DEPTH:
+            raise ValueError(f"{place}nested more than {_MAX_YAML_DEPTH} deep")
+        if counts[-1] > _MAX_YAML_VALUES:
+            raise ValueError(f"{place}more than {_MAX_YAML_VALUES} values, aliases counted as often as they are used")
+
+
+def _check_values(value: Any) -> None:
+    """Check that a value consists of plain types, and that integers fit 64 bits."""
+    waiting = [value]
+    while waiting:
+        one = waiting.pop()
+        if isinstance(one, dict):
+            waiting += [*one.keys(), *one.values()]
+        elif isinstance(one, list):
+            waiting += one
+        elif isinstance(one, int) and abs(one) >= 2**63:
+            raise ValueError("an integer has more than 64 bits")
+        elif one is not None and not isinstance(one, str | int | float | datetime.date):
+            raise ValueError(f"values of the type {type(one).__name__} are not supported")

@@ -6,6 +6,8 @@ from collections.abc import Container, Mapping
 from collections.abc import Sequence as Items
 from typing import TYPE_CHECKING
 
+from hybridlio.core.errors import strip_control
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -44,7 +46,7 @@ def for_terminal(rows: Items[Row], words: Container[str] = (), title: str = "", 
     from rich.table import Table
     from rich.text import Text  # plain text: in markup "[m]" would be a style
 
-    table = Table(title=Text(title) if title else None, caption=Text(caption) if caption else None)
+    table = Table(title=Text(strip_control(title)) if title else None, caption=Text(caption) if caption else None)
     table.box, table.padding = box.SIMPLE_HEAD, 0
     for name in headings(rows):
         is_word = name in words
@@ -52,5 +54,5 @@ def for_terminal(rows: Items[Row], words: Container[str] = (), title: str = "", 
             Text(name if is_word else "\n".join(name.rsplit(" ", 1))), justify="left" if is_word else "right"
         )
     for row in rows:
-        table.add_row(*(Text(row.get(name, NOTHING)) for name in headings(rows)))
+        table.add_row(*(Text(strip_control(row.get(name, NOTHING))) for name in headings(rows)))
     return table

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from hybridlio.core.errors import ConfigError
+from hybridlio.core.files import user_path
 from hybridlio.datasets import folder as plain_folder
 from hybridlio.datasets.kitti import odometry
 from hybridlio.datasets.rosbag.reader import SUFFIXES
@@ -28,13 +29,13 @@ def check_output(folder: str | os.PathLike[str], *recordings: str | os.PathLike[
     Raises:
         ConfigError: the folder is a recording, lies inside one, or holds one.
     """
-    out = Path(folder).expanduser().resolve()
+    out = user_path(folder).resolve()
     inside = next((above for above in (out, *out.parents) if is_recording(above)), None)
     if inside is not None:
         raise _refusal(folder, "is" if inside == out else "lies inside", inside)
     if may_hold:
         return
-    given = (Path(path).expanduser().resolve() for path in recordings)
+    given = (user_path(path).resolve() for path in recordings)
     held = next((path for path in given if path == out or out in path.parents), None) or next(_below(out), None)
     if held is not None:
         raise _refusal(folder, "is" if held == out else "holds", held)

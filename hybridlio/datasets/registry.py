@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from hybridlio.core.errors import ConfigError, DataError
+from hybridlio.core.files import user_path
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.tables import counted
 from hybridlio.datasets import folder
@@ -104,10 +105,10 @@ def open_sequence(
     """
     if rate_hz is not None and not 0 < rate_hz <= MAX_RATE_HZ:
         raise ConfigError(f"rate_hz: must be above 0 and up to {MAX_RATE_HZ:g} scans per second, got {rate_hz:g}")
-    root = Path(path).expanduser().resolve()
+    root = user_path(path).resolve()
     name, found = _find(root, reader)
     recording = found[_pick(root, found, sequence)]
-    raw = Path(raw_root).expanduser() if raw_root is not None else None
+    raw = user_path(raw_root) if raw_root is not None else None
     options = ReaderOptions(raw, vertical_angle_deg, topics or BagTopics(), rate_hz)
     return _without_spikes(READERS[name].open(recording, options))
 
@@ -133,7 +134,7 @@ def sequence_names(path: str | os.PathLike[str], *, reader: str | None = None) -
         DataError: no such path, or no reader fits.
         ConfigError: unknown ``reader``.
     """
-    return tuple(_find(Path(path).expanduser().resolve(), reader)[1])
+    return tuple(_find(user_path(path).resolve(), reader)[1])
 
 
 def check_options(
@@ -150,7 +151,7 @@ def check_options(
         check_angle(vertical_angle_deg)
     if reader is not None and reader not in READERS:
         raise ConfigError(f"unknown reader {reader!r}; choose one of {', '.join(READERS)}")
-    if raw_root is not None and not Path(raw_root).expanduser().is_dir():
+    if raw_root is not None and not user_path(raw_root).is_dir():
         raise ConfigError(f"raw root {raw_root}: no such folder; give the folder that holds KITTI's date folders")
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hybridlio.core.arrays import Array, Stamps
-from hybridlio.core.errors import ConfigError, DataError
+from hybridlio.core.errors import ConfigError, DataError, HybridLioError, strip_control
 from hybridlio.core.lidar_models import LidarModel
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, GpsFix, ImuNoise, ImuSamples, Scan
 from hybridlio.core.trajectory import Trajectory
@@ -85,7 +85,7 @@ class Sequence:
             DataError: the scan cannot be read. :meth:`without_scan` returns the frame without it.
         """
         k = range(len(self))[index]
-        return self._frame(k, self.load_scan(k))
+        return self._frame(k, self._scan(k))
 
     def without_scan(self, index: int) -> Frame:
         """Return frame ``index`` with an empty scan, to continue after a scan that cannot be read."""
@@ -116,6 +116,16 @@ class Sequence:
             gps=tuple(fix for fix in self.gps if fix.stamp_ns > before),
             forward_speed_m_s=None if self.forward_speed_m_s is None else self.forward_speed_m_s[rows],
         )
+
+    def _scan(self, k: int) -> Scan:
+        """Load scan ``k``. Whatever a library raises about a damaged file becomes a DataError, so a run bridges it."""
+        try:
+            return self.load_scan(k)
+        except HybridLioError:
+            raise
+        except Exception as error:
+            reason = " ".join(strip_control(f"{type(error).__name__}: {error}").split())
+            raise DataError(f"frame {k}: the scan cannot be read ({reason})") from error
 
     def _frame(self, k: int, scan: Scan) -> Frame:
         end = int(self.stamps_ns[k])

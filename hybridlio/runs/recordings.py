@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from hybridlio.core.errors import ConfigError, DataError, HybridLioError
-from hybridlio.core.files import read_yaml
+from hybridlio.core.files import read_yaml, user_path
 from hybridlio.datasets.registry import check_options, open_sequence, sequence_names
 from hybridlio.datasets.rosbag.topics import NO_CHOICE, BagTopics
 from hybridlio.datasets.sequence import Sequence, frame_range, part_of
@@ -118,7 +118,7 @@ def _expand(argument: str | Path | Recording) -> Iterator[Recording]:
     if isinstance(argument, Recording):
         yield argument
         return
-    path = Path(argument).expanduser()
+    path = user_path(argument)
     if path.is_file() and path.suffix in _YAML + _TEXT:
         yield from _read_list(path)
     elif not path.exists() and path.suffix in _YAML + _TEXT:
@@ -138,7 +138,10 @@ def _read_list(file: Path) -> Iterator[Recording]:
         raise DataError(f"{file}: expected a list of recordings, got {type(entries).__name__}")
     for number, entry in enumerate(entries, 1):
         parsed = _parse_entry(entry, f"{file}, entry {number}")
-        absolute = _relative_to(file.parent, parsed)
+        try:
+            absolute = _relative_to(file.parent, parsed)
+        except DataError as error:
+            raise DataError(f"{file}, entry {number}: {error}") from None
         is_list = Path(absolute.path).suffix in _YAML + _TEXT
         found = [absolute] if is_list else list(_expand(absolute.path))  # list files are not nested
         yield from (replace(absolute, path=one.path) for one in found)
@@ -197,8 +200,8 @@ def _parse_topics(value: Any, place: str) -> BagTopics:
 
 def _relative_to(folder: Path, entry: Recording) -> Recording:
     """Return the entry with its relative paths resolved from a folder."""
-    root = entry.raw_root and str(folder / Path(entry.raw_root).expanduser())
-    return replace(entry, path=str(folder / Path(entry.path).expanduser()), raw_root=root)
+    root = entry.raw_root and str(folder / user_path(entry.raw_root))
+    return replace(entry, path=str(folder / user_path(entry.path)), raw_root=root)
 
 
 def _with_defaults(entry: Recording, defaults: Recording) -> Recording:

@@ -137,3 +137,21 @@ def test_a_single_path_as_text_is_one_recording(drives):
 def test_a_missing_list_or_a_pattern_without_match_is_an_error(tmp_path, given, words):
     with pytest.raises(ConfigError, match=words):
         find_recordings([tmp_path / given])
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        ("a\\0b", "cannot contain a NUL"),
+        ("x" * 5000, "too long"),
+        ("d/" * 3000, "too long"),
+        ("~nobody-of-this-name/a", "unknown user"),
+    ],
+)
+def test_an_impossible_path_in_a_list_is_one_clear_line(tmp_path, path, words):
+    file = tmp_path / "list.yaml"
+    file.write_text(f'- path: "{path}"\n')
+    with pytest.raises(DataError, match=words) as raised:
+        find_recordings([file])
+    assert str(raised.value).startswith(f"{file}, entry 1: ")
+    assert len(str(raised.value)) < 300

@@ -86,6 +86,14 @@ def test_a_scan_without_points_is_bridged_by_the_initial_pose(kind, whole, seque
         assert "frame 15: bridged by the initial pose: scans/15.bin: truncated" in caplog.text
 
 
+@pytest.mark.parametrize("error", [ValueError, MemoryError, OverflowError, RuntimeError, TypeError, OSError])
+def test_whatever_a_library_raises_about_a_damaged_scan_is_bridged_with_one_line(error, sequence):
+    bad = {3: error("\x1b[31mbad\nheader\x1b[0m")}
+    run = run_odometry(with_scans(sequence.part(0, 5), bad), Odometry(residual="none"))
+    assert run.stopped is None
+    assert run.unreadable == {3: f"the scan cannot be read ({error.__name__}: bad header)"}
+
+
 def test_the_run_starts_at_the_first_usable_scan(sequence, caplog):
     few = Scan(int(sequence.stamps_ns[1]), np.ones((5, 3), np.float32))
     bad = {0: DataError("scans/0.bin: no such scan"), 1: few, 12: DataError("scans/12.bin: truncated")}

@@ -1,0 +1,34 @@
+"""Control characters in names and files do not reach the terminal."""
+
+from __future__ import annotations
+
+import pytest
+from command_line import refused
+
+from hybridlio.commands.terminal import print_message, print_result, print_table
+from hybridlio.core.errors import strip_control
+from hybridlio.core.tables import for_terminal
+
+HOSTILE = "a\x1b[31mred\x1b]0;title\x07\x9b2J\x08\r\x7f\u202eb"
+
+
+def test_control_characters_are_stripped_and_other_text_is_kept() -> None:
+    assert strip_control(HOSTILE) == "ared2Jb"
+    assert strip_control("σ m²\tü\n→ 中") == "σ m²\tü\n→ 中"
+
+
+def test_results_messages_and_tables_have_no_control_characters(capsys: pytest.CaptureFixture[str]) -> None:
+    print_result(HOSTILE)
+    print_message(HOSTILE)
+    print_table(for_terminal([{"recording": HOSTILE}], ("recording",), HOSTILE))
+    printed = "".join(capsys.readouterr())
+    assert printed.count("ared2Jb") == 4
+    assert not set(printed) & set("\x1b\x9b\x08\r\x7f\u202e\x07")
+
+
+def test_an_error_about_a_path_with_control_characters_is_one_clean_line() -> None:
+    line = refused(2, "odometry", "/gone\x1b[31m\x07/data")
+    assert "/gone/data" in line
+    for path in ("/a\x1b[2J" + "x" * 5000, "~nobody-of-this-name/a"):
+        assert "\x1b" not in refused(2, "odometry", path)
+        assert "\x1b" not in refused(2, "odometry", "/gone", "-o", path)
