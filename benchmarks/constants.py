@@ -285,8 +285,7 @@ def main() -> int:
     if not chosen:
         raise SystemExit(f"no constant named {', '.join(options.only)}; --list prints their names")
     with tempfile.TemporaryDirectory(prefix="hybridlio-constants-") as name:
-        folder = Path(name)
-        copy_checkout(folder)
+        copy_checkout(folder := Path(name))
         status, report = run_tests(folder, tuple(dict.fromkeys(test for c in chosen for test in c.tests)))
         if status:
             print(f"the tests fail without any change: {report}")
