@@ -11,9 +11,12 @@ from hybridlio.runs.recordings import Recording, find_recordings
 
 
 def make_recording(folder: Path) -> Path:
-    """Write a recording of one scan for the folder reader."""
+    """Write a recording of one scan for the folder reader; its first point lies 10 m ahead."""
     (folder / "scans").mkdir(parents=True)
-    np.zeros((1, 4), np.float32).tofile(folder / "scans/000000.bin")
+    rng = np.random.default_rng(0)
+    points = np.c_[rng.uniform(-20.0, 20.0, (500, 3)), rng.uniform(0.0, 1.0, 500)]
+    points[0] = 10.0, 0.0, 0.0, 0.5
+    points.astype(np.float32).tofile(folder / "scans/000000.bin")
     (folder / "timestamps.txt").write_text("0.0\n")
     return folder
 
@@ -71,7 +74,6 @@ def test_the_vertical_angle_of_an_entry_takes_precedence_over_the_option(drives,
     (drives / "list.yaml").write_text("- {path: north, vertical_angle_deg: 0}\n- south\n")
     own, other = find_recordings([drives / "list.yaml"], vertical_angle_deg=1.0)
     assert (own.vertical_angle_deg, other.vertical_angle_deg) == (0, 1.0)
-    np.array([[10.0, 0.0, 0.0, 0.5]], np.float32).tofile(drives / "north/scans/000000.bin")
     for angle_deg in (None, 0.0, 1.0):
         (x, _, z) = replace(own, vertical_angle_deg=angle_deg).open()[0].scan.points[0]
         assert np.rad2deg(np.arctan2(z, x)) == pytest.approx(angle_deg or 0.0, abs=1e-5)
