@@ -28,6 +28,13 @@ SPATIAL = f"""PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1
 EDGE_SE3_PRIOR 0 0 0 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1
 FIX 0
 """
+MARKED = f"""{CHAIN}VERTEX_TRACKXYZ 5 1 2 3
+EDGE_SE3_TRACKXYZ 0 5 0 1 2 3 1 0 0 1 0 1
+"""
+GTSAMS = """ODOMETRY 0 1 1 0 0.1 0.0001 0 0 4e-06 0 9e-06
+LANDMARK 0 1 3 4 0.4 0 0.4
+BR 1 7 0.5 2 0.1 0.2
+"""
 
 
 def load(tmp_path: Path, text: str | bytes, **options) -> PoseGraph:
@@ -181,7 +188,7 @@ ODD = [
 @pytest.mark.parametrize("seed", range(200))
 def test_mutated_files_are_read_or_refused_by_row(tmp_path, seed):
     rng = np.random.default_rng(seed)
-    words = (PLANAR, SPATIAL)[seed % 2].split(" ")
+    words = (PLANAR, SPATIAL, MARKED, GTSAMS)[seed % 4].split(" ")
     for _ in range(int(rng.integers(1, 4))):
         words[rng.integers(len(words))] = ODD[rng.integers(len(ODD))]
     message = "a.g2o"
