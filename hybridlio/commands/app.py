@@ -13,6 +13,7 @@ from hybridlio.commands.compare import compare
 from hybridlio.commands.config import config
 from hybridlio.commands.evaluate import evaluate
 from hybridlio.commands.georeference import georeference
+from hybridlio.commands.info import info
 from hybridlio.commands.odometry import odometry
 from hybridlio.commands.simulate import simulate
 from hybridlio.commands.smooth import smooth
@@ -44,5 +45,5 @@ def main(
     """Lidar-inertial odometry: estimates a trajectory with covariances, a pose graph and a report from a recording."""
 
 
-for _command in (simulate, odometry, smooth, georeference, batch, compare, evaluate, train, ablate, config, view):
+for _command in (simulate, info, odometry, smooth, georeference, batch, compare, evaluate, train, ablate, config, view):
     app.command()(_command)

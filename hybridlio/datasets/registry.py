@@ -127,6 +127,18 @@ def _without_spikes(sequence: Sequence) -> Sequence:
     return replace(sequence, imu=imu, notes=tuple(notes.texts))
 
 
+def locate(path: str | os.PathLike[str], sequence: str | None = None, reader: str | None = None) -> tuple[str, Path]:
+    """Return the reader's name and the path of the recording that :func:`open_sequence` opens with these arguments.
+
+    Raises:
+        DataError: no such path, no reader fits, or several recordings without a ``sequence`` that selects one.
+        ConfigError: unknown ``reader``.
+    """
+    root = Path(path).expanduser().resolve()
+    name, found = _find(root, reader)
+    return name, found[_pick(root, found, sequence)]
+
+
 def sequence_names(path: str | os.PathLike[str], *, reader: str | None = None) -> tuple[str, ...]:
     """Return the names of the recordings at or directly below ``path``, as :func:`open_sequence` takes them.
 
