@@ -118,7 +118,7 @@ def test_files_of_mcap_ros2_support_are_read(tmp_path: Path, compression: str, i
     rows.sort(key=lambda row: row[0])
     with path.open("wb") as file, Writer(file, compression=CompressionType[compression], enable_crcs=True) as writer:
         if not is_chunked:
-            writer._writer._Writer__use_chunking = False  # type: ignore[attr-defined]
+            writer._writer._Writer__chunk_builder = None  # type: ignore[attr-defined]
         schemas = {name: writer.register_msgdef(name, definition(name)) for name in TYPES}
         for t, topic, name, message in rows:
             writer.write_message(topic, schemas[name], message, log_time=t, publish_time=t)
