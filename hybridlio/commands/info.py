@@ -24,6 +24,7 @@ def info(
     sequence: common.SequenceName = None,
     reader: common.ReaderName = None,
     raw_root: common.RawRoot = None,
+    rate: common.Rate = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
     topics: BagTopics = NO_CHOICE,
     _verbosity: common.Verbose = 0,
@@ -36,7 +37,7 @@ def info(
     found = _topics(path) if name == "rosbag" else None
     if found is not None and not as_json:
         _print_topics(path, found)  # before an error on which of them to use
-    recording = common.open_data(data, sequence, reader, raw_root, None, None, topics)
+    recording = common.open_data(data, sequence, reader, raw_root, None, None, topics, rate)
     summary = {"path": str(path), "reader": name, "topics": found, **summarise(recording)}
     if as_json:
         print_result(json.dumps(summary, indent=2, ensure_ascii=False))
