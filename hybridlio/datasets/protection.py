@@ -30,12 +30,13 @@ def check_output(folder: str | os.PathLike[str], *recordings: str | os.PathLike[
         ConfigError: the folder is a recording, lies inside one, or holds one.
     """
     out = user_path(folder).resolve()
-    inside = next((above for above in (out, *out.parents) if is_recording(above)), None)
+    given = [user_path(path).resolve() for path in recordings]
+    without_stamps = [path for path in given if path in plain_folder.find(path).values()]
+    inside = next((above for above in (out, *out.parents) if above in without_stamps or is_recording(above)), None)
     if inside is not None:
         raise _refusal(folder, "is" if inside == out else "lies inside", inside)
     if may_hold:
         return
-    given = (user_path(path).resolve() for path in recordings)
     held = next((path for path in given if path == out or out in path.parents), None) or next(_below(out), None)
     if held is not None:
         raise _refusal(folder, "is" if held == out else "holds", held)

@@ -80,3 +80,10 @@ def test_a_folder_that_cannot_be_listed_does_not_stop_the_check(tmp_path: Path) 
         check_output(tmp_path)
     finally:
         os.chmod(tmp_path / "private", 0o700)
+
+
+def test_scans_without_stamps_are_protected_where_they_are_the_input(tmp_path: Path) -> None:
+    touch(tmp_path, "drive/scans/0.bin")
+    for out in ("drive", "drive/run", "."):
+        with pytest.raises(ConfigError, match="recordings are never written to"):
+            check_output(tmp_path / out, tmp_path / "drive")
