@@ -58,7 +58,7 @@ def observe(graph: PoseGraph, pose: int, key: tuple[int, int], local: np.ndarray
 def test_landmarks_and_poses_are_found_within_their_covariances(dimension, kind):
     poses, points = truth(dimension)
     nees = []
-    for seed in range(10):
+    for seed in range(50):
         solution = measured_graph(dimension, seed, kind).optimize()
         assert solution.converged
         for m in range(LANDMARKS):
