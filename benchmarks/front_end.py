@@ -114,7 +114,7 @@ def stages(network: OdometryNetwork, sequence: Sequence) -> dict[str, Callable[[
     last, current = (prepare(sequence[k].scan).points for k in (0, 1))
     geometry, threads = network.settings.geometry, torch.get_num_threads()
     maps = [torch.from_numpy(vertex_map(points, geometry))[None] for points in (last, current)]
-    seen = [network.look(one) for one in maps]
+    seen = [network.encode(one) for one in maps]
     start = torch.eye(4)[None]
     imu, velocity, dt = torch.zeros(1, network.settings.imu_samples, 6), torch.zeros(1, 3), torch.full((1,), 0.1)
 
@@ -122,7 +122,7 @@ def stages(network: OdometryNetwork, sequence: Sequence) -> dict[str, Callable[[
         vertices = torch.from_numpy(vertex_map(current, geometry))[None]
         assert network.imu_network is not None
         pose = network.imu_network(imu, velocity, dt)
-        network.refine_seen(seen[0], network.look(vertices), pose)
+        network.refine_encoded(seen[0], network.encode(vertices), pose)
 
     def registration() -> None:
         target = small_gicp.preprocess_points(last.astype(np.float64), VOXEL_M, num_threads=threads)
@@ -131,9 +131,9 @@ def stages(network: OdometryNetwork, sequence: Sequence) -> dict[str, Callable[[
 
     return {
         "vertex map": lambda: vertex_map(current, geometry),
-        "normal map, features": lambda: network.look(maps[1]),
+        "normal map, features": lambda: network.encode(maps[1]),
         "LSTMs": lambda: network.imu_network(imu, velocity, dt),  # type: ignore[misc]
-        "residual": lambda: network.refine_seen(seen[0], seen[1], start),
+        "residual": lambda: network.refine_encoded(seen[0], seen[1], start),
         "both maps and network": maps_and_network,
         "small_gicp, both scans": registration,
     }

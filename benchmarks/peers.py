@@ -53,7 +53,7 @@ def accuracy_by_speed(trajectory: Trajectory, sequence: Sequence) -> Figures:
         over_1_s_mm = 1e3 * (error_m[_SCANS_PER_S:] - error_m[:-_SCANS_PER_S])
         return {
             "distance error by speed [%]": 100 * float(error_m[-1] / driven_m),
-            "distance error over 1 s, RMS [mm]": rms(over_1_s_mm),
+            "distance error over 1 s, RMS [mm]": rms(over_1_s_mm) if len(over_1_s_mm) else None,
         }
     from_start_mm = 1e3 * np.linalg.norm(trajectory.poses[:, :3, 3], axis=1)
     return {

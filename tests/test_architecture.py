@@ -1,4 +1,4 @@
-"""What may import what, how quickly the package loads, and how large its parts may grow."""
+"""Limits: imports between rooms, the time that the import takes, sizes of files, functions and folders."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ FLOORS = {
     "runs": 7,
     "commands": 8,
 }
-APART = {"graph", "learned", "simulation"}  # they do not know each other
-JOINING_FLOOR = 6  # nothing below it knows graph or learned
+APART = {"graph", "learned", "simulation"}  # they do not import each other
+JOINING_FLOOR = 6  # nothing below it imports graph or learned
 LOOSE = {"__init__.py", "__main__.py", "cli.py", "py.typed"}
 MAX_ROOMS, MAX_MODULES_IN_FOLDER, MAX_CHAIN = 12, 20, 15
 MAX_PARAMETERS, MAX_COMPLEXITY = 7, 12
@@ -64,7 +64,7 @@ def parsed(path: Path) -> ast.Module:
 
 @functools.cache
 def imports(path: Path) -> frozenset[str]:
-    """Everything a file imports, at its top or inside a function; ``from a import b`` counts as a and as a.b."""
+    """Return all imports of a file, also those inside functions; ``from a import b`` counts as a and as a.b."""
     found = set()
     for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
@@ -75,7 +75,7 @@ def imports(path: Path) -> frozenset[str]:
 
 
 def importing(modules: Iterable[str], *packages: str) -> dict[str, set[str]]:
-    """Those of ``modules`` that import one of ``packages`` or something inside it, and what they import."""
+    """Return the ``modules`` that import one of ``packages`` or something inside it, and the names they import."""
     reached = {
         module: {name for name in imports(FILES[module]) for p in packages if name == p or name.startswith(p + ".")}
         for module in modules
@@ -91,14 +91,14 @@ GRAPH, LEARNED = inside("hybridlio.graph"), inside("hybridlio.learned")
 
 
 def room(module: str) -> str:
-    """The room that a module lies in; empty for the package itself and its entry point."""
+    """Return the room of a module; empty for the package itself and its entry point."""
     parts = module.split(".")
     return parts[1] if len(parts) > 1 and parts[1] in FLOORS else ""
 
 
 @functools.cache
 def module_imports(module: str) -> frozenset[str]:
-    """Modules of hybridlio that a module imports, wherever in the file; names count as the module that holds them."""
+    """Return the modules of hybridlio that a module imports; an imported name counts as its module."""
     found = set()
     for name in imports(MODULES[module]):
         while name and name not in MODULES:
@@ -109,7 +109,7 @@ def module_imports(module: str) -> frozenset[str]:
 
 
 def order() -> list[str]:
-    """Modules so that each stands behind all that it imports; raises CycleError where that cannot be."""
+    """Return the modules, each after all that it imports; raise CycleError if there is a circle."""
     return list(graphlib.TopologicalSorter({module: module_imports(module) for module in MODULES}).static_order())
 
 
@@ -120,12 +120,12 @@ def test_the_three_packages_are_found():
     assert len(set(MODULES.values())) == len(MODULES)
 
 
-def test_gtsam_lives_in_graph_and_nowhere_else():
+def test_only_graph_imports_gtsam():
     assert importing(GRAPH, "gtsam") != {}
     assert importing(set(MODULES) - GRAPH, "gtsam") == {}
 
 
-def test_torch_lives_in_learned_and_nowhere_else():
+def test_only_learned_imports_torch():
     assert importing(set(MODULES) - LEARNED, "torch") == {}
 
 
@@ -144,12 +144,12 @@ def test_a_room_imports_only_rooms_of_lower_floors():
     assert wrong == []
 
 
-def test_graph_learned_and_simulation_do_not_know_each_other():
+def test_graph_learned_and_simulation_do_not_import_each_other():
     pairs = {(room(module), room(other)) for module in MODULES for other in module_imports(module)}
     assert {(a, b) for a, b in pairs if {a, b} <= APART and a != b} == set()
 
 
-def test_nothing_below_the_odometry_knows_graph_or_learned():
+def test_nothing_below_the_odometry_imports_graph_or_learned():
     below = {m for m in MODULES if room(m) and FLOORS[room(m)] < JOINING_FLOOR} - GRAPH - LEARNED
     assert importing(below, "hybridlio.graph", "hybridlio.learned") == {}
 
@@ -188,19 +188,19 @@ def test_imports_are_absolute():
 
 
 def swallows(handler: ast.ExceptHandler) -> bool:
-    """Whether the handler catches everything by a bare ``except``, or does nothing at all."""
+    """Return whether the handler is a bare ``except``, or does nothing."""
     return handler.type is None or all(
         isinstance(line, ast.Pass) or (isinstance(line, ast.Expr) and isinstance(line.value, ast.Constant))
         for line in handler.body
     )
 
 
-def test_no_handler_swallows_an_error_in_silence():
+def test_no_handler_swallows_an_error():
     handlers = [(f, n) for f, p in FILES.items() for n in ast.walk(parsed(p)) if isinstance(n, ast.ExceptHandler)]
     assert [f"{file}:{handler.lineno}" for file, handler in handlers if swallows(handler)] == []
 
 
-def test_every_module_says_what_it_is():
+def test_every_module_has_a_docstring():
     assert [module for module, path in MODULES.items() if not ast.get_docstring(parsed(path))] == []
 
 
@@ -211,7 +211,7 @@ def test_files_stay_short():
 
 
 def lines_of(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
-    """Length in lines, its docstring left out."""
+    """Return the length of a function in lines, without its docstring."""
     first = function.body[0]
     is_text = isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant)
     docstring = (first.end_lineno or 0) - first.lineno + 1 if is_text else 0
@@ -247,7 +247,7 @@ def test_the_configuration_loads_no_pytorch():
     assert done.stdout.split() == ["False"]
 
 
-def test_odometry_without_imu_and_graph_does_without_gtsam():
+def test_odometry_without_imu_and_graph_does_not_load_gtsam():
     code = """
 import sys
 import numpy as np

@@ -115,3 +115,9 @@ def test_the_help_of_training_drives_simulates_nothing(tmp_path, monkeypatch):
     done = run("training_drives.py", "--help")
     assert (done.returncode, list(tmp_path.iterdir())) == (0, [])
     assert "shipped weights" in done.stdout
+
+
+def test_the_table_of_constants_names_constants_that_exist():
+    done = run("constants.py", "--list")
+    assert done.returncode == 0, done.stderr
+    assert len(done.stdout.splitlines()) > 60

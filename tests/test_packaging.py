@@ -1,4 +1,4 @@
-"""The package works from a plain checkout, and as a wheel that knows nothing of the checkout."""
+"""The package works from a plain checkout, and as a wheel without the checkout."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ def build_wheel(sources: Path, target: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def wheel(project_root, tmp_path_factory) -> Path:
-    """The wheel, built from a copy of the sources so that nothing an earlier build left can leak in."""
+    """The wheel, built from a copy of the sources so that files of an earlier build cannot get into it."""
     work = tmp_path_factory.mktemp("wheel")
     return build_wheel(copy_sources(project_root, work / "sources"), work / "out")
 
 
 @pytest.fixture(scope="module")
 def installed(wheel, tmp_path_factory) -> Path:
-    """A folder with the unpacked wheel alone, to be put on the path."""
+    """A folder with the unpacked wheel alone, for PYTHONPATH."""
     target = tmp_path_factory.mktemp("installed")
     options = ["--quiet", "--no-deps", "--no-index", "--target", str(target)]
     run_python("-m", "pip", "install", *options, str(wheel), cwd=target)
@@ -57,7 +57,7 @@ def installed(wheel, tmp_path_factory) -> Path:
 
 
 def shipped_files(root: Path) -> set[str]:
-    """What the wheel must hold, by the names it has there: code, the type marker, page templates and weights."""
+    """Return the names of all files that the wheel must hold: code, type marker, templates, tables and weights."""
     found = set()
     for package in PACKAGES:
         for path in (root / package).rglob("*"):
@@ -82,7 +82,7 @@ def test_the_wheel_does_not_depend_on_the_links_inside_the_checkout(project_root
     assert sorted(zipfile.ZipFile(unlinked).namelist()) == sorted(zipfile.ZipFile(wheel).namelist())
 
 
-def test_the_installed_wheel_is_whole_outside_the_checkout(installed, tmp_path):
+def test_the_installed_wheel_is_complete_outside_the_checkout(installed, tmp_path):
     modules = "hybridlio, hybridlio.graph, hybridlio.learned, hybridlio.datasets, hybridlio.simulation"
     code = f"import {modules}; print(*[m.__file__ for m in ({modules})], sep='\\n')"
     files = run_python("-c", code, cwd=tmp_path, path=installed).splitlines()
@@ -90,7 +90,7 @@ def test_the_installed_wheel_is_whole_outside_the_checkout(installed, tmp_path):
     assert all(Path(file).is_relative_to(installed) for file in files)
 
 
-def test_the_installed_command_line_says_its_version_outside_the_checkout(installed, tmp_path):
+def test_the_installed_command_line_prints_its_version_outside_the_checkout(installed, tmp_path):
     assert hybridlio.__version__ in run_python("-m", "hybridlio", "--version", cwd=tmp_path, path=installed)
     script = installed / "bin/hybridlio"
     assert hybridlio.__version__ in run_python(str(script), "--version", cwd=tmp_path, path=installed)

@@ -27,12 +27,12 @@ IterationProgress: TypeAlias = Callable[[str, int, float], None]  # stage, itera
 # graph.
 _LONGEST_FOR_CHOLESKY = 1000
 TOLERANCE = 1e-6  # of the error: poses then lie within a few thousandths of a standard deviation
-_ABSOLUTE_TOLERANCE = 1e-9  # of an error near zero, as of a chain without loops: one residual of 4e-5 σ
+_ABSOLUTE_TOLERANCE = 1e-9  # of an error near zero, such as in a chain without loops: one residual of 4e-5 σ
 _INERTIAL_ROUNDS = 2  # the second preintegrates the samples around the biases that the first found
 
 
 def silent(stage: str, iteration: int, error: float) -> None:
-    """Report progress to nobody."""
+    """Ignore progress."""
     del stage, iteration, error
 
 

@@ -53,7 +53,7 @@ class GrowingKdTree:
         return self._appended / self._settled
 
     def extended(self, points: Array, threads: int) -> GrowingKdTree:
-        """Return a tree over all ``points`` ``(N, 3)``, which begin with the points of this one; it stays as it is."""
+        """Return a tree over all ``points`` ``(N, 3)``, the first of which are this tree's; this tree is unchanged."""
         return GrowingKdTree(points, threads, base=self)
 
     def nearest(self, queries: Array, threads: int) -> tuple[Index, Array]:

@@ -101,7 +101,7 @@ def voxel_to_count(
     """Average the cloud over voxels of such a side that ``count`` ± ``tolerance`` points are left.
 
     The paper changes the side in steps of 0.01 m; bracketing and interpolation in logarithms need about four passes,
-    which only count voxels. A cloud with fewer points is returned as it is, with a voxel size of 0. If no side is found
+    which only count voxels. A cloud with fewer points is returned unchanged, with voxel size 0. If no side is found
     (few distinct places, or a tolerance below the jumps of the count), the nearest count found is used: check ``len``.
 
     Args:

@@ -142,7 +142,7 @@ def kitti_drift(
 def lengths_for(path_length_m: float) -> tuple[float, ...]:
     """Return eight segment lengths for a path: KITTI's from 100 m on, else multiples of 0.1, 0.2, 0.5, 1 … 10 m.
 
-    A path under 0.8 m, as of a vehicle at rest, has none.
+    A path under 0.8 m, such as that of a vehicle at rest, has none.
     """
     if path_length_m > KITTI_LENGTHS_M[0]:
         return KITTI_LENGTHS_M

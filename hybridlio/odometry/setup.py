@@ -1,4 +1,4 @@
-"""What implementations of the seams are made from: the configuration and what the first frame says of the sensors."""
+"""Arguments of the implementations of the seams: the configuration, and the sensors as the first frame states them."""
 
 from __future__ import annotations
 

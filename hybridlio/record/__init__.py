@@ -1,1 +1,1 @@
-"""The record of a run: everything that smoothing needs, packed while the run goes on."""
+"""The record of a run: everything that smoothing needs, packed during the run."""

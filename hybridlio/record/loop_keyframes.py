@@ -26,7 +26,7 @@ FORMAT_VERSION = 1
 RESOLUTION_M = 0.005  # a quarter of a lidar's range noise; int16 then reaches 164 m
 _LARGEST_RANGE_M = RESOLUTION_M * np.iinfo(np.int16).max
 _AVERAGED_POINTS = 30_000  # more points per scan take longer and move the voxel means only by millimetres
-_MIN_POINTS = 200  # fewer voxels, as of a blocked lidar, cannot be registered
+_MIN_POINTS = 200  # fewer voxels, such as from a blocked lidar, cannot be registered
 _MAX_PACKING_STEP = 256  # a position within a cell must fit a byte
 
 

@@ -46,7 +46,7 @@ class Record:
         start: the prior state at the first scan.
         calibration: the extrinsics.
         imu_noise: the noise densities that the run assumed.
-        keyframes: clouds for loop closure, or None; they are stored in a file of their own.
+        keyframes: clouds for loop closure, or None; they are stored in a separate file.
     """
 
     online: Trajectory

@@ -1,4 +1,4 @@
-"""Collects the record of a run while it goes on; a step takes one or two kilobytes of memory."""
+"""Collects the record of a run step by step; a step takes one or two kilobytes of memory."""
 
 from __future__ import annotations
 

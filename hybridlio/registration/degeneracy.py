@@ -41,9 +41,9 @@ _PROBE_ITERATIONS = 6
 # Of moving to the parabola's minimum. From 0.6 m away in a field, one leaves up to 0.2 m, and three leave millimetres.
 _MAX_ROUNDS = 4
 _SETTLED_M = 0.1  # a fifth of the parabola's step: closer to the minimum, a new parabola gives the same one
-# On the variance of an observed direction. Only few points observe it, they stand on a few trunks and share their
-# errors, like points on one surface: twice the covariance scale of scan matching when it was chosen. Over simulated
-# fields the mean normalised error is then below 1 (tests/hybridlio/registration/test_degeneracy.py).
+# On the variance of an observed direction, whose few points stand on a few trunks and share their errors. It was scan
+# matching's scale, and stayed when that was halved for thin planes. In corridors with bushes the mean squared
+# normalised error is then 2 (tests/hybridlio/registration/test_degeneracy_limits.py).
 _OBSERVED_VARIANCE_SCALE = 6.0
 _OPEN_GROUND_DIRECTIONS = 3  # that are weak on open ground: ahead, sideways and yaw
 _POINT_KERNEL_RATIO = 0.3  # of the settings' kernel: 3 cm by default, the noise of the difference of two points

@@ -88,7 +88,7 @@ def open_scenario(
 
     Args:
         name: one of :data:`SCENARIOS`.
-        out: a folder for the drives of all scenarios, each in a folder of its own.
+        out: a folder for the drives of all scenarios, each in its own folder.
         seed, length_m: of the drive.
         progress: see :func:`hybridlio.simulation.simulate.simulate`.
 

@@ -1,4 +1,4 @@
-"""Where scan matching is: its own path through the map, and what is still to happen to the map."""
+"""The state of scan matching: its own path through the map, and pending changes of the map."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class MatchingState:
             If the IMU is wrong, the next scan is still found from here.
         keyframe: ``(N, 3)`` points of the last scan, lidar frame, that go into the map before the next scan is matched;
             None where the scan is no keyframe. They wait because the scan may be taken back.
-        adrift: whether nothing says how far the last scan is from the map. The next keyframe then starts a new map.
+        adrift: whether the last scan's position relative to the map is unknown. The next keyframe starts a new map.
     """
 
     current: PathPoint

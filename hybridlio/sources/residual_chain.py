@@ -72,7 +72,7 @@ class ResidualChain:
         return replace(fine, details=details)
 
     def take_back(self, initial: RelativePose) -> None:
-        """Tell the sources that can take an answer back to do so."""
+        """Take back the last answer of the sources that support it."""
         for source in (self._first, self._second):
             if isinstance(source, TakesBack):
                 source.take_back(initial)

@@ -39,7 +39,7 @@ def perturbed(batch: PairBatch, settings: OptimiserSettings, seed: int) -> PairB
     draws = np.array([np.random.default_rng([seed, int(index)]).normal(size=9) * sigmas for index in batch.index])
     noise = torch.tensor(draws, dtype=torch.float32, device=batch.reference.device)
     velocity = batch.network.velocity_m_s + noise[:, 6:]
-    return replace(batch, network=replace(batch.network, shake=se3.exp(noise[:, :6]), velocity_m_s=velocity))
+    return replace(batch, network=replace(batch.network, perturbation=se3.exp(noise[:, :6]), velocity_m_s=velocity))
 
 
 def mirrored(batch: PairBatch, rows: Tensor) -> PairBatch:

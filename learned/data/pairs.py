@@ -24,10 +24,10 @@ class PairBatch:
     """A batch of pairs.
 
     Attributes:
-        network: what the network sees.
+        network: inputs of the network.
         last, current: clouds for the loss, each in its own frame.
-        reference: ``(B, 4, 4)`` float32 true relative poses; NaN where not known.
-        index: ``(B,)`` number of each pair in its data set.
+        reference: ``(B, 4, 4)`` float32 true relative poses; NaN where unknown.
+        index: ``(B,)`` index of each pair in its data set.
     """
 
     network: NetworkInput
@@ -40,7 +40,7 @@ class PairBatch:
         return len(self.index)
 
     def to(self, device: torch.device | str) -> PairBatch:
-        """The batch on another device."""
+        """Return the batch on another device."""
         moved: PairBatch = _moved(self, device)
         return moved
 
@@ -57,11 +57,11 @@ class Pairs:
     """Every pair of consecutive usable scans of some shards.
 
     Args:
-        shards: opened shards, of the network's cells and number of inertial rows.
-        settings: of the network that is to see them; decides which pairs have what it needs.
+        shards: opened shards, with the network's map geometry and number of IMU rows.
+        settings: of the network; pairs without the inputs that it needs are left out.
 
     Raises:
-        DataError: a shard does not go with the settings, or there is no pair left; says which and why.
+        DataError: a shard does not fit the settings, or no pair is left; says which and why.
     """
 
     def __init__(self, shards: Sequence[Shard], settings: NetworkSettings) -> None:
@@ -79,13 +79,16 @@ class Pairs:
             self._rows += [(number, int(k) + 1) for k in np.flatnonzero(good)]
         if not self._rows:
             names = ", ".join(shard.info.name for shard in self.shards) or "no shard"
-            raise DataError(f"{names}: no pair of usable scans with what the network needs (imu={settings.imu!r})")
+            raise DataError(
+                f"{names}: no pair of usable scans with the inputs that the network needs (imu={settings.imu!r}, "
+                f"velocity={settings.velocity})"
+            )
 
     def __len__(self) -> int:
         return len(self._rows)
 
     def where(self, index: int) -> tuple[Shard, int]:
-        """The shard of a pair and the number of its current scan there."""
+        """Return the shard of a pair and the index of its current scan there."""
         number, k = self._rows[index]
         return self.shards[number], k
 
@@ -151,7 +154,7 @@ def _backward_step(shard: Shard, k: int) -> _Step:
 
 
 def padded(clouds: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> Clouds:
-    """Points and normals ``(K, 3)`` of several scans as one batch, padded to the largest."""
+    """Return points and normals ``(K, 3)`` of several scans as one batch, padded to the largest."""
     size = max((len(points) for points, _ in clouds), default=0)
     points, normals = np.zeros((2, len(clouds), size, 3), np.float32)
     there = np.zeros((len(clouds), size), bool)

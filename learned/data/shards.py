@@ -1,8 +1,8 @@
 """Prepared scans on disk: a folder of plain arrays for each recording, read by memory mapping. NumPy only.
 
-A shard is prepared once and read in any order by any number of processes. Coordinates are whole multiples of 4 mm
-(int16, ±131 m), normals of 1/127 (int8): far below a lidar's noise, and a third of a megabyte a scan. What belongs to
-the step that leads to a scan (inertial data, reference) stands in the scan's row; row 0 has none.
+A shard is prepared once and read in any order by any number of processes. Coordinates are multiples of 4 mm (int16,
+±131 m), normals of 1/127 (int8): far below a lidar's noise, and 0.35 MB a scan. Data of the step to a scan (IMU rows,
+reference) are in the scan's row; row 0 has none.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.files import write_atomically
 
 FORMAT = 1
-_STEP_M = 0.004
+_STEP_M = 0.004  # a fifth of an HDL-64E's range noise; int16 then reaches 131 m, beyond the range limit of 120 m
 _LIMIT_M = 32767 * _STEP_M
 _STEPS = ("imu", "imu_there", "dt_s", "velocity_m_s", "initial", "reference", "usable")
 
 
 @dataclass(frozen=True, eq=False)
 class ScanRecord:
-    """One scan as it goes into a shard, with the step that leads to it.
+    """One scan of a shard, with the step that leads to it.
 
     Attributes:
         vertex_map: ``(3, H, W)`` metres.
-        loss_points, loss_normals: ``(K, 3)``, ground removed and averaged over voxels.
-        usable: whether there are points enough; pairs with a scan that is not are left out.
+        loss_points, loss_normals: ``(K, 3)``, averaged over voxels; points in metres.
+        usable: whether the scan has enough points; pairs with an unusable scan are left out.
         imu: ``(S, 6)`` rows of :func:`hybridlio.learned.data.imu_rows.imu_rows` since the last scan, or None.
         dt_s: seconds since the last scan.
         velocity_m_s: ``(3,)`` at the last scan, in its axes, or None.
-        initial: ``(4, 4)`` initial pose ``T_k_k1`` from elsewhere, or None.
+        initial: ``(4, 4)`` given initial pose ``T_k_k1``, or None.
         reference: ``(4, 4)`` true ``T_k_k1``, or None.
     """
 
@@ -57,15 +57,15 @@ class ScanRecord:
 
 @dataclass(frozen=True)
 class ShardInfo:
-    """What a shard says of itself, in ``shard.json``.
+    """Description of a shard, in ``shard.json``.
 
     Attributes:
         name: of the recording.
-        scans: how many.
+        scans: number of scans.
         geometry: cells of the maps.
-        imu_samples: S.
-        made_by: how the scans were prepared, in words, for whoever finds the folder.
-        format: of the files.
+        imu_samples: S, the number of IMU rows of a step.
+        made_by: how the scans were prepared, for people who find the folder.
+        format: version of the file format.
     """
 
     name: str
@@ -84,7 +84,7 @@ def write_shard(
     imu_samples: int,
     made_by: str = "",
 ) -> ShardInfo:
-    """Write scans, taken one by one, as a shard that appears when it is complete; one that is there is replaced.
+    """Write scans, one by one, as a shard that appears complete; replace an existing one.
 
     Raises:
         DataError: the folder holds something else than a shard, there are fewer than two scans, or a record's arrays
@@ -109,7 +109,7 @@ def write_shard(
 
 
 def _write_arrays(folder: Path, scans: Iterable[ScanRecord], geometry: MapGeometry, imu_samples: int) -> int:
-    """Clouds go to the disk as they come, since they are large; the rest at the end."""
+    """Write clouds as they come, since they are large, and the rest at the end; return the number of scans."""
     rows: dict[str, list[Any]] = {name: [] for name in _STEPS}
     sizes = [0]
     with (
@@ -154,18 +154,18 @@ def _step_row(scan: ScanRecord, imu_samples: int) -> dict[str, Any]:
 def _check(scan: ScanRecord, k: int, geometry: MapGeometry, imu_samples: int) -> None:
     cells = (3, geometry.rows, geometry.columns)
     if scan.vertex_map.shape != cells:
-        raise DataError(f"scan {k}: vertex map is {scan.vertex_map.shape}, its geometry says {cells}")
+        raise DataError(f"scan {k}: the vertex map has shape {scan.vertex_map.shape}, its geometry {cells}")
     if scan.loss_points.ndim != 2 or scan.loss_points.shape != scan.loss_normals.shape:
         raise DataError(f"scan {k}: {scan.loss_points.shape} points with {scan.loss_normals.shape} normals")
     if scan.imu is not None and scan.imu.shape != (imu_samples, 6):
-        raise DataError(f"scan {k}: inertial rows are {scan.imu.shape}, expected {(imu_samples, 6)}")
+        raise DataError(f"scan {k}: IMU rows have shape {scan.imu.shape}, expected {(imu_samples, 6)}")
 
 
 class Shard:
-    """A shard, opened for reading; arrays are mapped, not loaded.
+    """A shard open for reading; its large arrays are memory-mapped.
 
     Raises:
-        DataError: there is no shard, it is of another format, or a file of it has the wrong size.
+        DataError: there is no shard, its format is another version's, or a file has the wrong size.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -186,11 +186,11 @@ class Shard:
         return self.info.scans
 
     def vertex_map(self, k: int) -> NDArray[np.float32]:
-        """``(3, H, W)`` metres of scan ``k``."""
+        """Return the vertex map ``(3, H, W)`` of scan ``k`` in metres."""
         return np.asarray(self._maps[k] * np.float32(_STEP_M), np.float32)
 
     def loss_cloud(self, k: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Points in metres and unit normals (zero where there is none), ``(K, 3)`` each, of scan ``k``."""
+        """Return points in metres and unit normals (zero without one), ``(K, 3)`` each, of scan ``k``."""
         rows = slice(int(self._offsets[k]), int(self._offsets[k + 1]))
         points = np.asarray(self._points[rows] * np.float32(_STEP_M), np.float32)
         normals = self._normals[rows].astype(np.float32)
@@ -221,11 +221,11 @@ class Shard:
 def _read_info(folder: Path) -> ShardInfo:
     path = folder / "shard.json"
     if not path.is_file():
-        raise DataError(f"{folder}: no shard here (there is no shard.json); prepare the recording first")
+        raise DataError(f"{folder}: no shard (shard.json is missing); prepare the recording first")
     try:
         values = json.loads(path.read_text())
         if values["format"] != FORMAT:
             raise DataError(f"{path}: format {values['format']}, this version reads {FORMAT}; prepare the shard again")
         return ShardInfo(**{**values, "geometry": MapGeometry(**values["geometry"])})
     except (ValueError, KeyError, TypeError, ConfigError) as error:
-        raise DataError(f"{path}: not a shard's description ({error}); prepare the shard again") from error
+        raise DataError(f"{path}: not the description of a shard ({error}); prepare the shard again") from error

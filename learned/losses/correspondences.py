@@ -1,8 +1,8 @@
-"""Which point of the last scan goes with which of the current one.
+"""Matches between points of the last scan and of the current one.
 
 Source: UnDeepLIO, "Loss Function" and table 5: nearest neighbours in the whole cloud (the method), among the points
-that the maps show (Nubert et al.), or the same cell of both maps (Cho et al.). Matches are looked for at a pose and
-then held fixed: no gradient goes through the choice. A KD-tree finds neighbours on a CPU, chunked distances on a GPU.
+that the maps show (Nubert et al.), or the same cell of both maps (Cho et al.). Matches are searched at a pose and then
+fixed: no gradient goes through the search. It uses a k-d tree on a CPU and distances in chunks on a GPU.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hybridlio.learned.networks import maps
 from hybridlio.learned.networks import torch_se3 as se3
 from hybridlio.learned.settings import LossSettings
 
-_CHUNK = 1 << 26  # distances on the device at once: 256 MiB
+_CHUNK = 1 << 26  # distances computed at once: 256 MiB, little beside a GPU's memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class Clouds:
     Attributes:
         points: ``(B, K, 3)`` metres.
         normals: ``(B, K, 3)`` unit vectors; zero where a point has none.
-        there: ``(B, K)`` whether a row is a point, not padding.
+        there: ``(B, K)`` true for points, false for padding.
     """
 
     points: Tensor
@@ -38,20 +38,20 @@ class Clouds:
 
     @classmethod
     def of_maps(cls, vertices: Tensor) -> Clouds:
-        """What vertex maps ``(B, 3, H, W)`` show, with the normals of their normal maps; empty cells are padding."""
+        """Return the points of vertex maps ``(B, 3, H, W)`` with their normals; empty cells are padding."""
         normals = maps.normal_map(vertices)
         return cls(maps.as_points(vertices), maps.as_points(normals), maps.valid_cells(vertices).flatten(1))
 
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Pairs of points, as many for each of the batch; those of no weight count for nothing.
+    """Matched points of a batch, N for each pair of scans; rows without a match have the weight 0.
 
     Attributes:
         source, source_normals: ``(B, N, 3)`` of the current scan, in its own frame.
         target, target_normals: ``(B, N, 3)`` of the last scan, in its own frame.
-        weight: ``(B, N)``, 1 where there is a match whose target has a normal, else 0.
-        candidates: ``(B,)`` how many points might have been matched.
+        weight: ``(B, N)``, 1 for a match whose target has a normal, else 0.
+        candidates: ``(B,)`` number of points that could have been matched.
     """
 
     source: Tensor
@@ -63,7 +63,7 @@ class Matches:
 
     @property
     def share(self) -> Tensor:
-        """``(B,)`` matched of all candidates."""
+        """``(B,)`` matched share of the candidates."""
         return self.weight.sum(1) / self.candidates.clamp(min=1)
 
 
@@ -71,13 +71,13 @@ class Matches:
 def nearest(
     queries: Tensor, targets: Tensor, there: Tensor, max_distance_m: float = float("inf")
 ) -> tuple[Tensor, Tensor]:
-    """Index and distance ``(B, N)`` of the nearest of the targets to each query.
+    """Return index and distance ``(B, N)`` of the nearest target of each query.
 
     Args:
         queries: ``(B, N, 3)`` metres.
         targets: ``(B, M, 3)``.
-        there: ``(B, M)`` which targets count; where none does, distances are infinite.
-        max_distance_m: those farther away may be given as infinitely far, which saves a CPU looking for them.
+        there: ``(B, M)`` which targets are points; without any, distances are infinite.
+        max_distance_m: neighbours farther away may be returned at infinite distance, which shortens a CPU's search.
     """
     if queries.device.type == "cpu":
         pairs = [_by_tree(q, t, h, max_distance_m) for q, t, h in zip(queries, targets, there, strict=True)]
@@ -97,21 +97,21 @@ def _by_tree(queries: Tensor, targets: Tensor, there: Tensor, limit_m: float = f
         np.where(finite[:, None], asked, 0.0), distance_upper_bound=limit_m, workers=torch.get_num_threads()
     )
     distance[~finite] = np.inf
-    index[index == len(rows)] = 0  # none as near
+    index[index == len(rows)] = 0  # no neighbour within the limit; its distance is infinite
     return torch.from_numpy(rows[index]), torch.from_numpy(distance.astype(np.float32))
 
 
 def _by_distances(queries: Tensor, targets: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
     best = []
     for part in torch.split(queries, max(_CHUNK // max(len(targets), 1), 1)):
-        # the exact mode: by matrix products, neighbours at 100 m would be off by centimetres
+        # exact mode: distances by matrix products are off by centimetres at ranges of 100 m
         distance = torch.cdist(part, targets, compute_mode="donot_use_mm_for_euclid_dist")
         best.append(distance.masked_fill_(~there, torch.inf).min(dim=1))
     return torch.cat([b.indices for b in best]), torch.cat([b.values for b in best])
 
 
 def match_nearest(pose: Tensor, last: Clouds, current: Clouds, max_distance_m: float = float("inf")) -> Matches:
-    """Each point of the current clouds, moved by the pose ``(B, 4, 4)``, with the nearest of the last ones."""
+    """Match each point of the current clouds, moved by the pose ``(B, 4, 4)``, with the nearest of the last clouds."""
     moved = se3.transform(pose.detach(), current.points)
     index, distance = nearest(moved, last.points, last.there, max_distance_m)
     rows = index[..., None].expand(-1, -1, 3)
@@ -124,13 +124,13 @@ def match_nearest(pose: Tensor, last: Clouds, current: Clouds, max_distance_m: f
 def match_same_pixel(
     pose: Tensor, last: Clouds, current: Clouds, geometry: MapGeometry, max_distance_m: float = float("inf")
 ) -> Matches:
-    """Each cell of the last maps with what the current maps, moved by the pose, show in it.
+    """Match each cell of the last maps with the point of the current maps, moved by the pose, that falls into it.
 
     Args:
         pose: ``(B, 4, 4)``.
         last, current: of :meth:`Clouds.of_maps`.
         geometry: cells of the maps.
-        max_distance_m: matches farther apart do not count.
+        max_distance_m: matches farther apart are left out.
     """
     moved = se3.transform(pose.detach(), current.points)
     moved = torch.where(current.there[..., None], moved, 0.0)
@@ -144,7 +144,7 @@ def match_same_pixel(
 
 
 def match(pose: Tensor, last: Clouds, current: Clouds, settings: LossSettings, geometry: MapGeometry) -> Matches:
-    """Matches as the settings say. For all but ``nearest`` the clouds are those of the maps."""
+    """Match by the method of the settings. For all but ``nearest``, the clouds must be those of the maps."""
     if settings.matching == "same-pixel":
         return match_same_pixel(pose, last, current, geometry, settings.max_distance_m)
     return match_nearest(pose, last, current, settings.max_distance_m)

@@ -1,8 +1,8 @@
 """The unsupervised loss: point-to-plane plus plane-to-plane, and its Gauss-Newton Hessian.
 
 Source: UnDeepLIO, "Loss Function": ``L = α L_po2pl + λ L_pl2pl``, ``L_po2pl = Σ |n_k · (p̄_{k+1} − p_k)|``,
-``L_pl2pl = Σ ‖n̄_{k+1} − n_k‖²``. The paper's overall formula prints po2pl twice, a slip; it calls the product
-element-wise, which is an option, while the default is the dot product that its name means.
+``L_pl2pl = Σ ‖n̄_{k+1} − n_k‖²``. The paper's overall formula prints po2pl twice, which is a slip. It calls the product
+element-wise, which is an option; the default is the dot product, which is the distance to a plane.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from hybridlio.learned.settings import LossSettings
 
 @dataclass(frozen=True, eq=False)
 class LossValue:
-    """The loss of each of a batch.
+    """The loss of each pair of a batch.
 
     Attributes:
-        total: ``(B,)`` what is minimised; carries the gradient.
+        total: ``(B,)`` the minimised value, with its gradient.
         po2pl_m: ``(B,)`` mean distance to the matched planes, after the kernel, in metres.
         pl2pl: ``(B,)`` mean squared difference of normals.
         matched: ``(B,)`` share of points with a match.
@@ -36,13 +36,13 @@ class LossValue:
 
 @dataclass(frozen=True, eq=False)
 class GaussNewton:
-    """The loss near a pose, for a right perturbation ``T·Exp(ξ)``, rotation first.
+    """Quadratic approximation of the loss for a right perturbation ``T·Exp(ξ)``, rotation first.
 
     Attributes:
         gradient: ``(B, 6)``.
-        hessian: ``(B, 6, 6)``, positive semi-definite: second derivatives of residuals are left out.
-        information: ``(B, 6, 6)``, the Hessian with the kernel's scale taken out: a match without residual weighs 1.
-            Divided by the residuals' variance it is the inverse of a covariance.
+        hessian: ``(B, 6, 6)``, positive semi-definite, because second derivatives of residuals are left out.
+        information: ``(B, 6, 6)``, the Hessian scaled so that a match without residual has the weight 1. Divided by the
+            variance of the residuals it is the inverse of a covariance.
         sigma_m: ``(B,)`` robust standard deviation of the distances to the planes.
     """
 
@@ -53,7 +53,7 @@ class GaussNewton:
 
 
 def loss(matches: Matches, pose: Tensor, settings: LossSettings) -> LossValue:
-    """The loss of poses ``T_k_k1`` ``(B, 4, 4)`` for fixed matches."""
+    """Return the loss of poses ``T_k_k1`` ``(B, 4, 4)`` for fixed matches."""
     weight = matches.weight
     distances = _distances(matches, se3.transform(pose, matches.source), settings)
     po2pl = (weight * _kernel(distances, settings).sum(-1)).sum(1)
@@ -69,9 +69,9 @@ def loss(matches: Matches, pose: Tensor, settings: LossSettings) -> LossValue:
 
 
 def gauss_newton(matches: Matches, pose: Tensor, settings: LossSettings) -> GaussNewton:
-    """Gradient and Gauss-Newton Hessian of the summed loss for fixed matches.
+    """Return gradient and Gauss-Newton Hessian of the summed loss for fixed matches.
 
-    An absolute value has no second derivative at 0: within ``kernel_m`` of a plane, ``l1`` is taken as ``huber``.
+    Within ``kernel_m`` of a plane ``l1`` counts as ``huber``, since an absolute value has no second derivative at 0.
     """
     with torch.no_grad():
         R = pose[:, :3, :3]
@@ -96,13 +96,13 @@ def gauss_newton(matches: Matches, pose: Tensor, settings: LossSettings) -> Gaus
 
 
 def _distances(matches: Matches, moved: Tensor, settings: LossSettings) -> Tensor:
-    """``(B, N, 1)`` signed distances to the planes, or ``(B, N, 3)`` their parts by axis."""
+    """Return signed distances to the planes ``(B, N, 1)``, or their components by axis ``(B, N, 3)``."""
     product = matches.target_normals * (moved - matches.target)
     return product.sum(-1, keepdim=True) if settings.product == "dot" else product
 
 
 def _jacobians(matches: Matches, R: Tensor, settings: LossSettings) -> tuple[Tensor, Tensor]:
-    """Derivatives ``(B, N, 1 or 3, 3)`` of the distances by rotation and translation of a right perturbation."""
+    """Return derivatives ``(B, N, 1 or 3, 3)`` of the distances by rotation and translation of a right perturbation."""
     in_source = matches.target_normals @ R  # rows n·R
     if settings.product == "dot":
         # n·R(ω × p + v) = (p × nR)·ω + nR·v
@@ -116,7 +116,7 @@ def _with_both_normals(matches: Matches) -> Tensor:
 
 
 def _kernel(distances: Tensor, settings: LossSettings) -> Tensor:
-    """The cost of distances, in metres."""
+    """Return the cost of distances, in metres."""
     k, size = settings.kernel_m, distances.abs()
     if settings.kernel == "l1":
         return size
@@ -127,7 +127,7 @@ def _kernel(distances: Tensor, settings: LossSettings) -> Tensor:
 
 
 def _curvature(distances: Tensor, settings: LossSettings) -> Tensor:
-    """``ρ'(r)/r``: the weight of iteratively reweighted least squares."""
+    """Return ``ρ'(r)/r``, the weight of iteratively reweighted least squares."""
     k = settings.kernel_m
     if settings.kernel == "geman-mcclure":
         return 2 * k**3 / (k * k + distances.square()).square()

@@ -1,4 +1,4 @@
-"""Inputs and outputs of the networks, and what is computed once per scan."""
+"""Inputs and outputs of the networks, and everything that is computed once per scan."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from hybridlio.learned.networks import torch_se3 as se3
 
 @dataclass(frozen=True, eq=False)
 class NetworkInput:
-    """What the network sees of a batch of pairs.
+    """The network's inputs of a batch of pairs.
 
     Attributes:
         last, current: vertex maps ``(B, 3, H, W)`` of scan k and k+1, each in its own frame.
-        imu: ``(B, S, 6)`` rows of :func:`hybridlio.learned.data.imu_rows.imu_rows`; zeros where there are none.
+        imu: ``(B, S, 6)`` rows of :func:`hybridlio.learned.data.imu_rows.imu_rows`; zeros without an IMU.
         dt_s: ``(B,)`` time between the scans.
-        velocity_m_s: ``(B, 3)`` at scan k, in its axes; zeros where not known.
-        initial: ``(B, 4, 4)`` initial poses from elsewhere, for ``imu="given"``; else None or not looked at.
-        shake: ``(B, 4, 4)`` by which initial poses are perturbed on the right before they are refined, or None.
+        velocity_m_s: ``(B, 3)`` at scan k, in its axes; zeros where it is not known.
+        initial: ``(B, 4, 4)`` given initial poses, for ``imu="given"``; ignored otherwise.
+        perturbation: ``(B, 4, 4)`` right perturbations of the initial poses before they are refined, or None.
     """
 
     last: Tensor
@@ -28,12 +28,12 @@ class NetworkInput:
     dt_s: Tensor
     velocity_m_s: Tensor
     initial: Tensor | None = None
-    shake: Tensor | None = None
+    perturbation: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class NetworkOutput:
-    """What the network says.
+    """The network's estimate.
 
     Attributes:
         initial: ``T̂`` ``(B, 4, 4)``.
@@ -45,28 +45,28 @@ class NetworkOutput:
 
     @property
     def pose(self) -> Tensor:
-        """``T_k_k1`` ``(B, 4, 4)``, the last step's."""
+        """``T_k_k1`` ``(B, 4, 4)`` after the last step."""
         return self.poses[-1]
 
     @property
     def residual(self) -> Tensor:
-        """``δT`` ``(B, 4, 4)``, of all steps together."""
+        """``δT`` ``(B, 4, 4)`` of all steps together."""
         return self.pose @ se3.inverse(self.initial)
 
 
 @dataclass(frozen=True, eq=False)
 class ProjectiveScan:
-    """A scan as the steps see it, whether it is the last one or the current one; computed once a scan.
+    """Inputs of the projective steps from one scan, for its use as the last scan and as the current one.
 
     Attributes:
         points: ``(B, 3, N)`` the cells of its vertex map, row by row.
-        seen: ``(B, 1, N)`` which cells hold a point.
-        planes: ``(B, 4, N)`` the normal n of each cell and n·v, which is infinite where there is no normal.
-        rough: ``(B, 1, N)`` of :func:`_roughness`; None without weights to be told of it.
-        as_last, as_current: ``(B, n, C)`` what the n coarse cells contribute to the weights of points that fall into
-            them, and of their own points; None without weights. Of a scan that is thinned ``as_current`` is each
-            point's, ``(B, N, C)``.
-        coarse: ``(N,)`` which coarse cell each point's own cell is a part of.
+        seen: ``(B, 1, N)`` true where a cell holds a point.
+        planes: ``(B, 4, N)`` the normal n of each cell and n·v, which is infinite without a normal.
+        rough: ``(B, 1, N)`` of :func:`hybridlio.learned.networks.projective_steps._roughness`; None without weights.
+        as_last, as_current: ``(B, n, C)`` contribution of the n coarse cells to the weights of points that fall into
+            them, and of their own points; None without weights. In a thinned scan ``as_current`` is that of each point,
+            ``(B, N, C)``.
+        coarse: ``(N,)`` index of the coarse cell that contains each cell.
     """
 
     points: Tensor
@@ -80,11 +80,11 @@ class ProjectiveScan:
 
 @dataclass(frozen=True, eq=False)
 class ScanMaps:
-    """What is computed of a scan alone.
+    """Everything that depends on one scan only, computed once for the two pairs that contain it.
 
     Attributes:
         vertices, normals: maps ``(B, 3, H, W)`` in its own frame.
-        points: as the projective steps see it; None in a network without.
+        points: inputs of the projective steps; None in a network without them.
     """
 
     vertices: Tensor

@@ -16,7 +16,7 @@ from hybridlio.learned.settings import NetworkSettings
 
 
 class OdometryNetwork(nn.Module):
-    """UnDeepLIO: from two vertex maps and the inertial data between them to the relative pose ``T_k_k1``.
+    """UnDeepLIO: from two vertex maps and the IMU samples between them to the relative pose ``T_k_k1``.
 
     Args:
         settings: its structure.
@@ -37,7 +37,7 @@ class OdometryNetwork(nn.Module):
         """Estimate the relative poses of a batch.
 
         Raises:
-            ConfigError: the maps have other cells than the network, or an initial pose is to be given and is not.
+            ConfigError: the maps have another geometry than the network's, or a required initial pose is missing.
         """
         geometry = self.settings.geometry
         if given.last.shape[-2:] != (geometry.rows, geometry.columns):
@@ -46,27 +46,27 @@ class OdometryNetwork(nn.Module):
                 f"the network takes maps of {geometry.rows} x {geometry.columns} cells, got {rows} x {columns}"
             )
         initial, features = self._from_imu(given)
-        start = initial if given.shake is None else initial @ given.shake
+        start = initial if given.perturbation is None else initial @ given.perturbation
         refined = self.refine(given, start, features)
-        # what the IMU network says is judged as it says it; a given initial pose counts with what shook it
+        # The loss sees the IMU network's own pose, without the perturbation; a given initial pose includes it.
         return refined if self.settings.imu == "given" else NetworkOutput(initial, refined.poses)
 
     def refine(
         self, given: NetworkInput, initial: Tensor, features: tuple[Tensor, Tensor] | None = None
     ) -> NetworkOutput:
-        """Estimate the residual of any initial poses ``(B, 4, 4)``; ``features`` are those of :meth:`imu_features`."""
-        return self.refine_seen(self.look(given.last), self.look(given.current), initial, features)
+        """Refine initial poses ``(B, 4, 4)`` from any source; ``features`` are those of :meth:`imu_features`."""
+        return self.refine_encoded(self.encode(given.last), self.encode(given.current), initial, features)
 
-    def look(self, vertices: Tensor) -> ScanMaps:
-        """What is computed of a scan alone, from its vertex map ``(B, 3, H, W)``: once for both pairs that it is in."""
+    def encode(self, vertices: Tensor) -> ScanMaps:
+        """Compute everything that depends on one scan only from its vertex map ``(B, 3, H, W)``."""
         normals = maps.normal_map(vertices)
-        points = None if self.projective is None else self.projective.look(vertices, normals)
+        points = None if self.projective is None else self.projective.encode(vertices, normals)
         return ScanMaps(vertices, normals, points)
 
-    def refine_seen(
+    def refine_encoded(
         self, last: ScanMaps, current: ScanMaps, initial: Tensor, features: tuple[Tensor, Tensor] | None = None
     ) -> NetworkOutput:
-        """As :meth:`refine`, for scans that :meth:`look` has seen."""
+        """Refine as :meth:`refine` does, from scans that :meth:`encode` returned."""
         pose, poses = initial, []
         for _ in range(self.settings.iterations):
             if self.projective is not None and last.points is not None and current.points is not None:
@@ -82,7 +82,7 @@ class OdometryNetwork(nn.Module):
         return NetworkOutput(initial, tuple(poses))
 
     def imu_features(self, imu: Tensor, velocity_m_s: Tensor) -> tuple[Tensor, Tensor] | None:
-        """What the residual network is told of the IMU; None but with ``imu="feature"``. See :class:`NetworkInput`."""
+        """Return IMU features for the residual network, None unless ``imu="feature"``. See :class:`NetworkInput`."""
         if self.imu_network is None or self.settings.imu != "feature":
             return None
         return self.imu_network.features(imu, velocity_m_s)
@@ -90,7 +90,7 @@ class OdometryNetwork(nn.Module):
     def _from_imu(self, given: NetworkInput) -> tuple[Tensor, tuple[Tensor, Tensor] | None]:
         if self.settings.imu == "given":
             if given.initial is None:
-                raise ConfigError("this network takes its initial pose from elsewhere, and none was given")
+                raise ConfigError("this network (imu='given') needs an initial pose; set NetworkInput.initial")
             return given.initial, None
         nothing = se3.identity(len(given.last), given.last)
         if self.imu_network is None:
@@ -101,5 +101,5 @@ class OdometryNetwork(nn.Module):
 
 
 def parameter_count(network: nn.Module) -> int:
-    """How many numbers training adjusts; shared ones count once."""
+    """Return the number of trained parameters; shared ones count once."""
     return sum(parameter.numel() for parameter in network.parameters())

@@ -1,11 +1,10 @@
-"""Steps of point-to-plane registration between two maps, with weights that a small network gives.
+"""Point-to-plane registration steps between two maps, with point weights from a small network.
 
-Not in the paper. Cells are the matches: each point of the current scan, moved by the pose so far, is held against the
-plane of the last scan in the cell that it falls into, and one weighted Gauss-Newton step of the point-to-plane loss is
-solved in closed form. The steps are differentiable, so the unsupervised loss teaches the weights which points to trust
-(moving cars, edges, leaves): both scans go through the same convolutions once, and a point's weight is a small network
-of the features of both its cells, of how rough they are and of its distance. Untrained, all points count alike but for
-a robust kernel.
+Not in the paper. Each point of the current scan, moved by the pose so far, is matched to the plane of the last scan in
+the cell that it falls into (projective association). One weighted Gauss-Newton step of the point-to-plane cost follows,
+in closed form. The steps are differentiable, so the unsupervised loss trains the weights to reject moving cars, edges
+and leaves. Both scans pass the same convolutions once; a small network computes a point's weight from the features and
+roughness of both cells and from its distance. Before training, all points have the weight of the robust kernel only.
 """
 
 from __future__ import annotations
@@ -24,20 +23,22 @@ from hybridlio.learned.networks.layers import CircularConv
 from hybridlio.learned.networks.network_types import ProjectiveScan
 from hybridlio.learned.settings import NetworkSettings
 
-_KERNELS_M = (0.4, 0.05)  # of the first and the last step, before training
-_KERNEL_GAIN = 10.0  # Adam's steps are as large for one number as for a layer's weights
-_LEVER_M = 10.0  # rotations are measured at this lever, so that the system is well scaled
-_DAMPING = 1e-4  # of the normal equations a point: directions that hardly any cell constrains stay as they are
-_LIMIT_M = 1.0
-_DISTANCE_M = 0.1  # what is left after an initial pose, so that networks see numbers around 1
-_FEWEST = 9000  # so many points are not thinned any more
-_ONE_OF = (4, 2)  # so many points are taken in the first half of the steps, and in the others
-_DILATION = 3
-_COARSE = 2  # features have a cell for so many rows and columns of the maps
+# Widths of the robust kernel in the first and the last step, before training: above the error of an initial pose
+# (0.15 m), and twice a lidar's range noise.
+_KERNELS_M = (0.4, 0.05)
+_KERNEL_GAIN = 10.0  # Adam moves this one parameter as slowly as a layer's weights; the gain lets widths follow
+_LEVER_M = 10.0  # lever arm for rotations, so that the normal equations are well scaled; the median range on a road
+_DAMPING = 1e-4  # of the normal equations, divided by the weight: keeps directions that hardly any cell constrains
+_LIMIT_M = 1.0  # farther from its plane a point belongs to another surface; several times an initial pose's error
+_DISTANCE_M = 0.1  # unit of distances: about the error of an initial pose, so that inputs are about 1
+_FEWEST = 9000  # maps with fewer points are not thinned: a quarter of a map of 52 x 720
+_ONE_OF = (4, 2)  # in the first half of the steps every fourth point, later every second: more do not gain accuracy
+_DILATION = 3  # of the last convolution, so that features see about 10° around
+_COARSE = 2  # rows and columns of the maps in a cell of the features, for a quarter of the time
 
 
 class ProjectiveSteps(nn.Module):
-    """From two scans and a pose to better poses, one for each step."""
+    """Refines a pose between two scans, step by step."""
 
     def __init__(self, settings: NetworkSettings) -> None:
         super().__init__()
@@ -47,8 +48,8 @@ class ProjectiveSteps(nn.Module):
         self.register_buffer("_start", torch.linspace(first, last, settings.projective_steps), persistent=False)
         self.weights = PointWeights(settings) if settings.weight_channels else None
 
-    def look(self, vertices: Tensor, normals: Tensor) -> ProjectiveScan:
-        """What the steps need of a scan, from its maps ``(B, 3, H, W)`` in its own frame."""
+    def encode(self, vertices: Tensor, normals: Tensor) -> ProjectiveScan:
+        """Return the inputs of the steps from a scan's maps ``(B, 3, H, W)`` in its own frame."""
         offset = (normals * vertices).sum(dim=1, keepdim=True)
         offset = torch.where(maps.valid_cells(normals)[:, None], offset, torch.inf)
         planes = torch.cat([normals, offset], dim=1).flatten(2)
@@ -57,16 +58,14 @@ class ProjectiveSteps(nn.Module):
         if self.weights is None:
             return points
         rough = _roughness(vertices, normals)
-        as_last, as_current = self.weights.look(vertices, normals, rough, seen)
+        as_last, as_current = self.weights.encode(vertices, normals, rough, seen)
         coarse = self.weights.coarse
         return replace(points, rough=rough.flatten(2), as_last=as_last, as_current=as_current, coarse=coarse)
 
     def forward(self, last: ProjectiveScan, current: ProjectiveScan, pose: Tensor) -> list[Tensor]:
-        """Poses ``T_k_k1`` ``(B, 4, 4)`` after each step.
+        """Return poses ``T_k_k1`` ``(B, 4, 4)`` after each step.
 
-        A step takes the pose before it as given: gradients go through the weights, not back through earlier steps. The
-        first half of the steps takes every fourth point, the others every second, of large maps: more do not make
-        them better.
+        No gradient goes back through earlier steps: each step is differentiable by its weights only.
         """
         most = max(current.points.shape[-1] // _FEWEST, 1)
         few, more = (_thinned(current, min(by, most)) for by in _ONE_OF)
@@ -78,10 +77,10 @@ class ProjectiveSteps(nn.Module):
         return poses
 
     def _step(self, last: ProjectiveScan, current: ProjectiveScan, pose: Tensor, kernel_m: Tensor) -> Tensor:
-        """``δT`` ``(B, 4, 4)`` of one step."""
+        """Return ``δT`` ``(B, 4, 4)`` of one step."""
         moved = torch.baddbmm(pose[:, :3, 3:], pose[:, :3, :3], current.points)
         cell, inside = maps.cells(moved, self.settings.geometry)
-        normals, distance, there = _held_against(last.planes, moved, cell, inside[:, None] & current.seen)
+        normals, distance, there = _point_to_plane(last.planes, moved, cell, inside[:, None] & current.seen)
         weights = there * (kernel_m**2 / (kernel_m**2 + distance.square())).square()
         if self.weights is not None:
             weights = weights * self.weights(last, current, cell, distance, kernel_m)
@@ -95,7 +94,7 @@ class ProjectiveSteps(nn.Module):
 
 
 class PointWeights(nn.Module):
-    """What each point of the current scan counts, by the features of its cell in both maps and its distance."""
+    """Computes the weight of each point of the current scan from the features of both its cells and its distance."""
 
     def __init__(self, settings: NetworkSettings) -> None:
         super().__init__()
@@ -106,7 +105,7 @@ class PointWeights(nn.Module):
             nn.ReLU(),
             CircularConv(channels, channels, 3, (1, 1), bias=True),
             nn.ReLU(),
-            CircularConv(channels, channels, 3, (1, 1), bias=True, dilation=_DILATION),  # sees about 10° around
+            CircularConv(channels, channels, 3, (1, 1), bias=True, dilation=_DILATION),
             nn.ReLU(),
         )
         self.of_last = nn.Linear(channels, channels)
@@ -119,14 +118,14 @@ class PointWeights(nn.Module):
 
     @property
     def coarse(self) -> Tensor:
-        """``(H·W,)`` the coarse cell that each cell of a map is a part of."""
+        """``(H·W,)`` index of the coarse cell that contains each cell of a map."""
         return self.get_buffer("_coarse")
 
-    def look(self, vertices: Tensor, normals: Tensor, rough: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-        """What a scan's coarse cells contribute ``(B, n, C)``, as the last scan's and as the current one's."""
+    def encode(self, vertices: Tensor, normals: Tensor, rough: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the contributions of a scan's coarse cells ``(B, n, C)``, as the last scan and as the current one."""
         inputs = torch.cat([vertices / self.scale_m, normals, rough, seen.to(vertices.dtype)], dim=1)
         features = self.features(inputs).flatten(2)
-        # as convolutions and copied: several times as fast as linear layers of channels last
+        # as convolutions with a copy: several times as fast as linear layers on the transposed features
         as_last = functional.conv1d(features, self.of_last.weight[..., None], self.of_last.bias)
         as_current = functional.conv1d(features, self.of_current.weight[..., None])
         return as_last.transpose(1, 2).contiguous(), as_current.transpose(1, 2).contiguous()
@@ -134,7 +133,7 @@ class PointWeights(nn.Module):
     def forward(
         self, last: ProjectiveScan, current: ProjectiveScan, cell: Tensor, distance: Tensor, kernel_m: Tensor
     ) -> Tensor:
-        """Weights ``(B, 1, N)`` from 0 to 1 of points by the cells ``(B, N)`` they fall into and their distances."""
+        """Return weights ``(B, 1, N)`` from 0 to 1, from the cells ``(B, N)`` that points fall into and distances."""
         assert last.rough is not None
         assert last.as_last is not None
         assert current.rough is not None
@@ -144,25 +143,25 @@ class PointWeights(nn.Module):
         rough = last.rough.gather(2, cell[:, None])
         point = torch.cat([size / _DISTANCE_M, compared, rough, current.rough], dim=1)
         batch, cells, channels = last.as_last.shape
-        # rows of a table are fetched, and worked on, faster than channels one by one
+        # gathering rows of a table is faster than gathering from each channel
         first = torch.arange(0, batch * cells, cells, device=cell.device)[:, None]
         fallen_into = (self.coarse.index_select(0, cell.flatten()).reshape(cell.shape) + first).flatten()
         there = last.as_last.reshape(-1, channels).index_select(0, fallen_into).reshape(batch, -1, channels)
         of_point = torch.bmm(self.of_point.weight.expand(batch, -1, -1), point).transpose(1, 2)
-        # in place, since fetching memory is what takes time
+        # in place, since memory traffic dominates
         hidden = there.add_(current.as_current).add_(of_point).relu_()
         weights: Tensor = self.logit(hidden)
         return weights.sigmoid_().transpose(1, 2)
 
 
 def _coarse_cells(geometry: MapGeometry) -> Tensor:
-    """``(H·W,)`` the coarse cell that each cell is a part of, both counted row by row."""
+    """Return the index ``(H·W,)`` of the coarse cell that contains each cell, both counted row by row."""
     rows, columns = (torch.arange(n) // _COARSE for n in (geometry.rows, geometry.columns))
     return (rows[:, None] * (int(columns[-1]) + 1) + columns).flatten()
 
 
 def _thinned(scan: ProjectiveScan, by: int) -> ProjectiveScan:
-    """Return every ``by``-th point in contiguous memory, with its own contributions; those of cells stay whole."""
+    """Return the scan with every ``by``-th point; data by cell stay whole."""
     rough, coarse = (None if x is None else x[..., ::by].contiguous() for x in (scan.rough, scan.coarse))
     points, seen = scan.points[..., ::by].contiguous(), scan.seen[..., ::by].contiguous()
     own = scan.as_current
@@ -172,9 +171,10 @@ def _thinned(scan: ProjectiveScan, by: int) -> ProjectiveScan:
 
 
 def _roughness(vertices: Tensor, normals: Tensor) -> Tensor:
-    """``(B, 1, H, W)`` how far cells lie from between their neighbours along their normals, in units of 0.1 m, up to 5.
+    """Return the distance ``(B, 1, H, W)`` of cells from the mean of their neighbours along the normal.
 
-    0 where there is no normal. On a plane it is the noise of the range.
+    It is the larger one of both directions, in units of 0.1 m, at most 5, and 0 without a normal. On a plane it is the
+    range noise.
     """
     around = functional.pad(vertices, (1, 1, 0, 0), mode="circular")
     beside = (around[..., 2:] + around[..., :-2]) / 2 - vertices
@@ -184,14 +184,14 @@ def _roughness(vertices: Tensor, normals: Tensor) -> Tensor:
     return (torch.maximum(*off) / _DISTANCE_M).clamp(max=5.0)
 
 
-def _held_against(planes: Tensor, points: Tensor, cell: Tensor, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Normals ``(B, 3, N)``, signed distances ``(B, 1, N)`` in metres, and where there are such, as 0 and 1.
+def _point_to_plane(planes: Tensor, points: Tensor, cell: Tensor, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return normals ``(B, 3, N)``, signed distances ``(B, 1, N)`` in metres, and a mask of valid ones (0 or 1).
 
     Args:
         planes: ``(B, 4, H·W)`` as in :class:`ProjectiveScan`.
         points: ``(B, 3, N)`` in the planes' frame.
-        cell: ``(B, N)`` they fall into.
-        known: ``(B, 1, N)`` which of them are points at all.
+        cell: ``(B, N)`` the cell that each point falls into.
+        known: ``(B, 1, N)`` true for points inside the map.
     """
     chosen = planes.gather(2, cell[:, None].expand(-1, 4, -1))
     normals = chosen[:, :3]
@@ -201,7 +201,7 @@ def _held_against(planes: Tensor, points: Tensor, cell: Tensor, known: Tensor) -
 
 
 def weighted_step(normals: Tensor, points: Tensor, distance: Tensor, weights: Tensor) -> Tensor:
-    """``δT`` ``(B, 4, 4)`` of one Gauss-Newton step of ``Σ w d²``, for points and the planes that they belong to.
+    """Return ``δT`` ``(B, 4, 4)`` of one Gauss-Newton step of ``Σ w d²`` for points matched to planes.
 
     Args:
         normals, points: ``(B, 3, N)`` in one frame.

@@ -1,4 +1,4 @@
-"""Weights in safetensors files, with what they are in the metadata: recipe, data, version, commit."""
+"""Weights in safetensors files; their metadata hold recipe, training data, version and commit."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from hybridlio.learned.setting_values import from_dict, to_dict
 from hybridlio.learned.settings import NetworkSettings, Recipe
 from hybridlio.learned.source_settings import SHIPPED
 
-_LISTED = 6  # mismatches that a message names
+_LISTED = 6  # mismatches in a message: a network of another structure differs in all tensors
 
 
 def shipped(name: str = "default") -> Path:
-    """Path of the weights of a name that come with the package, ``learned/NAME.safetensors``.
+    """Return the path of weights that come with the package, ``learned/NAME.safetensors``.
 
     Raises:
-        ConfigError: there are none; lists those there are.
+        ConfigError: there are none of that name; lists those that are shipped.
     """
     folder = Path(__file__).resolve().parents[1]
     path = folder / f"{name}.safetensors"
     if not path.is_file():
         known = ", ".join(sorted(file.stem for file in folder.glob("*.safetensors"))) or "none"
-        raise ConfigError(f"no shipped weights named {name!r}; there are {known}, or give a file's path")
+        raise ConfigError(f"no weights named {name!r} are shipped; choose one of {known}, or give the path of a file")
     return path
 
 
@@ -44,10 +44,10 @@ class Weights:
     """A file of weights.
 
     Attributes:
-        recipe: how they were trained; its network settings are the structure that they fit.
-        about: data, steps, version and commit, as text.
-        tensors: by name.
-        where: the file, for messages.
+        recipe: settings of their training; its network settings are the structure that they fit.
+        about: training data, steps, version and commit, as text.
+        tensors: weights and buffers by name.
+        where: path of the file, for messages.
     """
 
     recipe: Recipe
@@ -56,20 +56,20 @@ class Weights:
     where: str = "weights"
 
     def fitting(self, network: NetworkSettings) -> Mapping[str, Tensor]:
-        """Those tensors that a network of these settings starts from: where initial poses are given, no LSTMs'."""
+        """Return the tensors that a network of these settings needs: without those of LSTMs for ``imu="given"``."""
         if self.recipe.network.imu == "initial-pose" and network.imu == "given":
             return {name: tensor for name, tensor in self.tensors.items() if not name.startswith("imu_network.")}
         return self.tensors
 
     def network(self, device: torch.device | str = "cpu") -> OdometryNetwork:
-        """The trained network, ready for inference."""
+        """Return the trained network in evaluation mode."""
         network = OdometryNetwork(self.recipe.network)
         put_weights(network, self.tensors, self.where)
         return network.to(device).eval()
 
 
 def own_tensors(network: nn.Module) -> dict[str, Tensor]:
-    """A network's weights and buffers by name; what two of its parts share stands once."""
+    """Return a network's weights and buffers by name; a tensor that two parts share appears once."""
     found: dict[str, Tensor] = {}
     seen: set[int] = set()
     for name, tensor in network.state_dict(keep_vars=True).items():
@@ -83,7 +83,7 @@ def put_weights(network: nn.Module, tensors: Mapping[str, Tensor], where: str) -
     """Copy weights into a network.
 
     Raises:
-        ConfigError: they do not fit; names what is missing, unknown or of another shape.
+        ConfigError: they do not fit; lists tensors that are missing, unknown or of another shape.
     """
     own = own_tensors(network)
     wrong = [f"{name} is missing" for name in own if name not in tensors]
@@ -95,7 +95,9 @@ def put_weights(network: nn.Module, tensors: Mapping[str, Tensor], where: str) -
     ]
     if wrong:
         more = f" and {len(wrong) - _LISTED} more" if len(wrong) > _LISTED else ""
-        raise ConfigError(f"{where} do not fit the network: {'; '.join(wrong[:_LISTED])}{more}; use their own recipe")
+        raise ConfigError(
+            f"{where}: do not fit the network ({'; '.join(wrong[:_LISTED])}{more}); use the recipe in their file"
+        )
     with torch.no_grad():
         for name, tensor in own.items():
             tensor.copy_(tensors[name])
@@ -104,7 +106,7 @@ def put_weights(network: nn.Module, tensors: Mapping[str, Tensor], where: str) -
 def save_weights(
     path: str | os.PathLike[str], network: OdometryNetwork, recipe: Recipe, about: Mapping[str, str]
 ) -> None:
-    """Write a network's weights with the recipe and whatever text says where they come from, whole or not at all."""
+    """Write a network's weights with their recipe and ``about`` as metadata; the file appears complete."""
     metadata = {
         "recipe": json.dumps(to_dict(recipe)),
         "hybridlio": __version__,
@@ -148,13 +150,15 @@ def load_weights(path: str | os.PathLike[str]) -> Weights:
     try:
         recipe = from_dict(Recipe, json.loads(metadata.pop("recipe")), "recipe")
     except (KeyError, ValueError, ConfigError) as error:
-        raise DataError(f"{path}: carries no recipe of this version ({error}); train again") from error
+        raise DataError(
+            f"{path}: the metadata hold no recipe that this version reads ({error}); train the weights again"
+        ) from error
     return Weights(recipe, metadata, tensors, str(path))
 
 
 def _commit() -> str:
-    """The checkout's commit, or nothing where the package is installed."""
-    root = Path(__file__).resolve().parents[1]
+    """Return the commit of the checkout, empty for an installed package."""
+    root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return ""
     try:

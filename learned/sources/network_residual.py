@@ -202,7 +202,7 @@ class NetworkResidual:
         if vertices.shape[1:] != cells:
             raise ConfigError(f"the network takes maps of {cells} cells, scans are prepared with {vertices.shape[1:]}")
         with at_run_time():
-            seen = self._network.look(on_device(vertices, self._device))
+            seen = self._network.encode(on_device(vertices, self._device))
             there = int(valid_cells(seen.normals).sum()) if prepared.usable else 0
         return _Seen(scan.stamp_ns, seen, there, there >= self._settings.min_cells, self._threads)
 
@@ -225,7 +225,7 @@ class NetworkResidual:
     def _run(self, pair: _Pair, start: Array) -> Array:
         with at_run_time():
             pose = on_device(start, self._device)
-            found = self._network.refine_seen(pair.last.maps, pair.current.maps, pose, pair.features)
+            found = self._network.refine_encoded(pair.last.maps, pair.current.maps, pose, pair.features)
             return se3.orthonormalise(found.pose[0].double().cpu().numpy())
 
     def _starts(self, initial: RelativePose, dt_s: float) -> list[Array]:

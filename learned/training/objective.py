@@ -1,4 +1,4 @@
-"""What a batch costs: the loss of what the network says, with matches looked for at its answer."""
+"""The loss of a batch: that of the network's poses, with matches searched at its answer."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from hybridlio.learned.networks.network_types import NetworkOutput
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
 from hybridlio.learned.settings import LossSettings
 
-_LEVER_M = 10.0  # rotations count as what they move at this distance
-_DAMPING = 1e-4
+_LEVER_M = 10.0  # converts rotations to metres; about the median range of a road scan
+_DAMPING = 1e-4  # of a match's curvature: unconstrained directions stay, others hardly change
 
 
 def clouds_for(batch: PairBatch, settings: LossSettings) -> tuple[Clouds, Clouds]:
-    """Last and current clouds that the matching is about: the whole averaged clouds, or what the maps show."""
+    """Return the last and current clouds to match: the whole averaged clouds, or the points of the maps."""
     if settings.matching == "nearest":
         return batch.last, batch.current
     return Clouds.of_maps(batch.network.last), Clouds.of_maps(batch.network.current)
 
 
 def pose_loss(pose: Tensor, clouds: tuple[Clouds, Clouds], settings: LossSettings, geometry: MapGeometry) -> LossValue:
-    """The loss of poses ``(B, 4, 4)`` with matches looked for at them."""
+    """Return the loss of poses ``(B, 4, 4)`` with matches searched there."""
     return loss(match(pose, *clouds, settings, geometry), pose, settings)
 
 
 def objective(output: NetworkOutput, batch: PairBatch, settings: LossSettings, geometry: MapGeometry) -> LossValue:
-    """The loss of a batch, averaged over the network's steps, with the initial pose's where it is given a weight."""
+    """Return the loss of a batch: the mean over the network's poses, and the initial pose's times its weight."""
     clouds = clouds_for(batch, settings)
     poses = [*output.poses, output.initial] if settings.initial_weight else list(output.poses)
     shares = [1 / len(output.poses)] * len(output.poses) + [settings.initial_weight] * bool(settings.initial_weight)
@@ -59,15 +59,15 @@ def descended(
     geometry: MapGeometry,
     matches: Matches | None = None,
 ) -> Tensor:
-    """Poses ``(B, 4, 4)`` after ``target_steps`` Gauss-Newton steps down the loss; ``matches`` are those at the start.
+    """Return poses ``(B, 4, 4)`` after ``target_steps`` Gauss-Newton steps on the loss.
 
-    Directions that hardly any point constrains stay as they are.
+    ``matches`` are those at the start; None searches them. The damping keeps directions that few points constrain.
     """
     lever = torch.tensor([_LEVER_M] * 3 + [1.0] * 3, dtype=pose.dtype, device=pose.device)
     for _ in range(settings.target_steps):
         matches = matches or match(pose, *clouds, settings, geometry)
         near = gauss_newton(matches, pose, settings)
-        # the curvature of a match without residual, times how many there are
+        # curvature of a match without residual, times the number of matches
         scale = _DAMPING * matches.weight.sum(1).clamp(min=1) * settings.alpha / settings.kernel_m
         H = near.hessian + torch.diag(lever.square()) * scale[:, None, None]
         pose = pose @ se3.exp(-torch.linalg.solve(H, near.gradient[..., None])[..., 0])
@@ -76,19 +76,19 @@ def descended(
 
 
 def _apart_m(target: Tensor, pose: Tensor) -> Tensor:
-    """How far poses are apart ``(B,)``: translation, and rotation at a lever of 10 m."""
+    """Return the distance of poses ``(B,)`` in metres: translation, and rotation at a lever of 10 m."""
     xi = se3.log(se3.inverse(target) @ pose)
     squared = xi[:, 3:].square().sum(1) + (_LEVER_M * xi[:, :3]).square().sum(1)
-    return (squared + 1e-8).sqrt()  # smooth within a tenth of a millimetre
+    return (squared + 1e-8).sqrt()  # smooth at 0, on a scale of a tenth of a millimetre
 
 
 class Objective(nn.Module):
-    """A network with its loss: from batches to their :func:`objective`, which is all that training asks of it."""
+    """A network with its loss as one module, so that ``DistributedDataParallel`` covers both."""
 
     def __init__(self, network: OdometryNetwork, settings: LossSettings) -> None:
         super().__init__()
         self.network, self.settings = network, settings
 
     def forward(self, batch: PairBatch) -> LossValue:
-        """The loss of a batch."""
+        """Return the loss of a batch."""
         return objective(self.network(batch.network), batch, self.settings, self.network.settings.geometry)

@@ -174,7 +174,7 @@ class _Run:
             checkpoints.restore(found, self.network, self.optimiser)
             self.step = found.step
         elif start is not None:
-            put_weights(self.network, start, "the weights to start from")
+            put_weights(self.network, start, "initial weights")
         self.place.wait()  # before the first process writes where the others look
         if self.place.leads:
             write_atomically(self.out / "recipe.json", json.dumps(to_dict(self.recipe), indent=2) + "\n")

@@ -104,7 +104,7 @@ def last_scan_only(drive: Any) -> Any:
 
 
 def claiming(drive: Any, share: float | None) -> Any:
-    """The same measurements with another claimed share of noise that is the scans'; None claims independence."""
+    """Return the drive with another stated share of scan noise in the covariance; None states independent errors."""
 
     def claim(relative: RelativePose) -> RelativePose:
         own = relative.covariance * (1.0 if share is None else 1 - share)

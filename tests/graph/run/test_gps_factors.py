@@ -53,7 +53,7 @@ def with_fixes(drive: Any, seed: int, rate_hz: float = 2.0, sigma_m: float = SIG
 
 
 def rmse_m(smoothed: Any, drive: Any) -> float:
-    """Of positions after alignment of the whole path, so that the first pose's heading error does not dominate."""
+    """Return the RMS error after alignment of the whole path, so that the first heading does not dominate."""
     return ate(Trajectory(smoothed.trajectory.stamps_ns, drive.lidar_poses), smoothed.trajectory, lever_m=0.0).rmse_m
 
 

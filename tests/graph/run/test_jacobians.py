@@ -195,7 +195,7 @@ def test_the_jacobian_of_every_factor_agrees_with_differences(cases, case, where
 
 
 def test_the_error_is_half_the_squared_whitened_residual(cases):
-    """So the differences are taken of what the solver minimises."""
+    """Central differences must be of the error that the solver minimises."""
     for made, values in cases.values():
         here = moved(values, np.random.default_rng(10))
         for factor in made:

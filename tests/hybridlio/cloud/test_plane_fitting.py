@@ -58,6 +58,6 @@ def ring(elevation_deg: float, jitter_deg: float = 0.0, count: int = 10) -> np.n
     ],
     ids=["jitter of a beam", "beams 0.4° apart", "one stray point", "three of ten"],
 )
-def test_rings_are_told_apart_by_their_elevation(rings: list[np.ndarray], several: bool):
+def test_rings_are_distinguished_by_their_elevation(rings: list[np.ndarray], several: bool):
     points = np.concatenate(rings)
     assert span_several_rings(points, np.arange(10, dtype=np.uint64)[None])[0] == several

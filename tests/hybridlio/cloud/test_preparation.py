@@ -51,7 +51,7 @@ def test_ground_stays_in_the_loss_cloud_on_request(town):
 
 def test_parts_are_computed_only_when_read(town, monkeypatch):
     def never(*args):
-        raise AssertionError("computed though nobody asked")
+        raise AssertionError("computed although not requested")
 
     for name in ("vertex_map", "normal_map", "estimate_normals", "find_ground", "voxel_to_count"):
         monkeypatch.setattr(preparation, name, never)

@@ -71,10 +71,10 @@ def test_sorting_keeps_the_first_row_of_each_stamp(values: list[int]) -> None:
 
 
 def test_scans_many_seconds_apart_are_noted_as_a_wrong_unit() -> None:
-    for step_s, told in ((100, 1), (0.1, 0)):
+    for step_s, count in ((100, 1), (0.1, 0)):
         notes = Notes("ride")
         note_gaps((np.arange(5) * step_s * 1e9).astype(np.int64), "scans", notes, factor=1.5)
-        assert len([text for text in notes.texts if "are in seconds" in text]) == told
+        assert len([text for text in notes.texts if "are in seconds" in text]) == count
 
 
 def test_of_equal_stamps_the_first_is_kept() -> None:

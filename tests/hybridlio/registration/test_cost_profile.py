@@ -67,7 +67,7 @@ def test_a_normal_likelihood_gives_its_mean_and_twice_its_variance(at_m: float):
     assert sigma_m == pytest.approx(np.sqrt(2) * 0.5, rel=0.25)
 
 
-def test_costs_that_say_little_are_used_and_those_that_say_nothing_are_not():
+def test_a_wide_minimum_is_used_unless_it_is_wider_than_the_search():
     offset_m, sigma_m = weigh_offsets(valley(0.5, 1.5), EVERYWHERE)
     assert 0.1 < offset_m < 1.5
     assert 1.0 < sigma_m < 5.0

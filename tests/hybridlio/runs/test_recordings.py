@@ -127,8 +127,8 @@ def test_recordings_with_equal_names_get_unique_names_independent_of_their_order
 
 
 def test_names_are_valid_folder_names():
-    (odd,) = find_recordings([Recording("/nowhere/../a b:c")])
-    assert odd.name == "a_b_c"
+    (recording,) = find_recordings([Recording("/nowhere/../a b:c")])
+    assert recording.name == "a_b_c"
 
 
 def test_a_single_path_as_text_is_one_recording(drives):

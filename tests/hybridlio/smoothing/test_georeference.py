@@ -79,7 +79,7 @@ def test_a_shift_is_found_within_any_bound(record: Record, most_s: float, shift_
 
 
 @pytest.mark.parametrize("apart_s", [18.0, -18.0])
-def test_a_shift_of_18_s_as_of_gps_time_is_found_if_the_bound_allows_it(record: Record, apart_s: float):
+def test_a_shift_of_18_s_between_gps_time_and_utc_is_found_if_the_bound_allows_it(record: Record, apart_s: float):
     fixes = tuple(replace(fix, stamp_ns=fix.stamp_ns + round(apart_s * 1e9)) for fix in record.gps)
     fit = georeference(replace(record, gps=fixes), max_shift_s=20.0).alignment
     assert fit.shift_s == pytest.approx(SHIFT_S - apart_s, abs=0.005)

@@ -39,9 +39,9 @@ def test_the_verdict_follows_the_number_of_sigmas(sigmas: float, verdict: str):
 
 
 def test_rejections_in_a_row_end_within_a_second():
-    """At 10 Hz; a few are needed to outlast a passing lorry, and the IMU bridges a second to some decimetres."""
+    """At 10 Hz. A few rejections are needed while a lorry passes; the IMU bridges a second with decimetres of error."""
     gate = InnovationGate()
     verdicts(0.0, 25, gate)
-    told = verdicts(50.0, 60, gate)
-    assert 3 <= told.count("rejected") <= 10
-    assert told[-1] == "trusted again"
+    found = verdicts(50.0, 60, gate)
+    assert 3 <= found.count("rejected") <= 10
+    assert found[-1] == "trusted again"

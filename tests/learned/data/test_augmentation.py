@@ -91,6 +91,6 @@ def test_how_a_pair_is_varied_depends_on_the_pair_and_the_seed_alone(pairs):
     whole, part = training_batch(pairs, [0, 1, 2, 3], settings, 7), training_batch(pairs, [2], settings, 7)
     assert torch.equal(whole.network.last[2], part.network.last[0])
     assert torch.equal(whole.current.points[2], part.current.points[0])
-    assert torch.equal(whole.network.shake[2], part.network.shake[0])
+    assert torch.equal(whole.network.perturbation[2], part.network.perturbation[0])
     seeds = [training_batch(pairs, [2], settings, seed).network.last for seed in range(8)]
     assert any(not torch.equal(seeds[0], other) for other in seeds)

@@ -119,7 +119,7 @@ def test_a_damaged_shard_names_the_file(tmp_path, file):
 
 
 def test_shards_of_another_format_and_folders_without_one_are_refused(tmp_path):
-    with pytest.raises(DataError, match=r"no shard\.json"):
+    with pytest.raises(DataError, match=r"shard\.json is missing"):
         Shard(tmp_path)
     shard_of(tmp_path, [record(k) for k in range(2)])
     path = tmp_path / "shard" / "shard.json"
@@ -139,10 +139,10 @@ def test_noise_of_initial_pose_and_velocity_depends_on_the_pair_and_the_seed_alo
     noise = OptimiserSettings(initial_noise_rad=0.01, initial_noise_m=0.1, velocity_noise_m_s=0.2)
     whole, part = perturbed(pairs.batch([0, 1, 2, 3]), noise, seed=7), perturbed(pairs.batch([2]), noise, seed=7)
     other = perturbed(pairs.batch([2]), noise, seed=8)
-    for name in ("shake", "velocity_m_s"):
+    for name in ("perturbation", "velocity_m_s"):
         assert torch.equal(getattr(whole.network, name)[2], getattr(part.network, name)[0])
         assert not torch.allclose(getattr(other.network, name), getattr(part.network, name))
-    assert perturbed(pairs.batch([2]), OptimiserSettings(), seed=7).network.shake is None
+    assert perturbed(pairs.batch([2]), OptimiserSettings(), seed=7).network.perturbation is None
 
 
 def test_clouds_are_padded_to_the_largest():

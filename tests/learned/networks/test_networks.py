@@ -116,7 +116,7 @@ def test_a_constant_rate_turns_the_initial_pose_by_as_much_as_it_gives_in_the_ti
 def test_an_initial_pose_is_shaken_before_it_is_refined_and_is_judged_as_it_was():
     net, x = network().eval(), given()
     shake = se3.exp(torch.tensor([[0.0, 0.0, 0.01, 0.1, 0.0, 0.0]])).expand(3, 4, 4)
-    plain, shaken = net(x), net(replace(x, shake=shake))
+    plain, shaken = net(x), net(replace(x, perturbation=shake))
     assert torch.equal(shaken.initial, plain.initial)
     assert torch.allclose(shaken.pose, net.refine(x, plain.initial @ shake).pose, atol=1e-6)
 
@@ -146,7 +146,7 @@ def test_evaluation_gives_the_features_of_training(siamese, normalisation):
 
 
 def _branch_features(residual, net, x):
-    last, current = net.look(x.last), net.look(x.current)
+    last, current = net.encode(x.last), net.encode(x.current)
     pairs = [torch.cat(both, dim=1) for both in ((last.vertices, current.vertices), (last.normals, current.normals))]
     return residual.vertex_encoder(pairs[0]), residual.normal_encoder(pairs[1])
 

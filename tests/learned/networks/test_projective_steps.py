@@ -36,7 +36,7 @@ def steps(recipe, count, **changes):
 
 def test_steps_between_the_maps_find_the_pose_without_any_training(tiny_recipe):
     net = steps(tiny_recipe, 4)
-    poses = net(net.look(*room_maps(np.eye(4))), net.look(*room_maps(STEP)), torch.eye(4)[None])
+    poses = net(net.encode(*room_maps(np.eye(4))), net.encode(*room_maps(STEP)), torch.eye(4)[None])
     assert len(poses) == 4
     rotation_deg, translation_m = step_errors(poses[-1].detach().double().numpy(), STEP[None])
     assert rotation_deg < 0.05
@@ -46,7 +46,7 @@ def test_steps_between_the_maps_find_the_pose_without_any_training(tiny_recipe):
 def test_untrained_weights_leave_the_kernel_alone(tiny_recipe):
     nets = steps(tiny_recipe, 2), steps(tiny_recipe, 2, weight_channels=0)
     at = torch.eye(4)[None]
-    found = [net(net.look(*room_maps(np.eye(4))), net.look(*room_maps(STEP)), at)[-1] for net in nets]
+    found = [net(net.encode(*room_maps(np.eye(4))), net.encode(*room_maps(STEP)), at)[-1] for net in nets]
     assert torch.allclose(*found, atol=1e-5)
 
 
@@ -55,11 +55,11 @@ def test_weights_follow_the_points_and_not_their_order_in_the_batch(tiny_recipe)
     torch.nn.init.normal_(net.weights.logit.weight)
     one, other, at = room_maps(np.eye(4)), room_maps(STEP), torch.eye(4)[None]
     last, current = (tuple(map(torch.cat, zip(*pair, strict=True))) for pair in ((one, other), (other, one)))
-    both = net(net.look(*last), net.look(*current), at.expand(2, 4, 4))[-1]
-    assert torch.allclose(both[:1], net(net.look(*one), net.look(*other), at)[-1], atol=1e-5)
-    assert torch.allclose(both[1:], net(net.look(*other), net.look(*one), at)[-1], atol=1e-5)
+    both = net(net.encode(*last), net.encode(*current), at.expand(2, 4, 4))[-1]
+    assert torch.allclose(both[:1], net(net.encode(*one), net.encode(*other), at)[-1], atol=1e-5)
+    assert torch.allclose(both[1:], net(net.encode(*other), net.encode(*one), at)[-1], atol=1e-5)
     fresh = steps(tiny_recipe, 2)
-    assert not torch.allclose(both[:1], fresh(fresh.look(*one), fresh.look(*other), at)[-1], atol=1e-5)
+    assert not torch.allclose(both[:1], fresh(fresh.encode(*one), fresh.encode(*other), at)[-1], atol=1e-5)
 
 
 def test_one_step_solves_a_small_motion_of_planes():

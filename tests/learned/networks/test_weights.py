@@ -94,7 +94,7 @@ def test_the_shipped_weights_load_and_are_small():
 def test_weights_are_chosen_by_path_by_the_name_of_shipped_ones_or_as_shipped(tmp_path, monkeypatch):
     assert weights_path("shipped") == weights_path("default") == shipped()
     assert weights_path(tmp_path / "mine.safetensors") == tmp_path / "mine.safetensors"
-    with pytest.raises(ConfigError, match="there are default"):
+    with pytest.raises(ConfigError, match="choose one of default"):
         weights_path("nothing")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "default").write_bytes(b"")

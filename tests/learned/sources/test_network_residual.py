@@ -60,7 +60,7 @@ def test_along_a_corridor_the_covariance_is_large_and_the_direction_listed_as_de
 def answering(residual, pose, monkeypatch):
     """The network's answer from now on."""
     answer = type("Answer", (), {"pose": torch.tensor(pose, dtype=torch.float32)[None]})
-    monkeypatch.setattr(residual._network, "refine_seen", lambda *_: answer)
+    monkeypatch.setattr(residual._network, "refine_encoded", lambda *_: answer)
 
 
 def test_an_answer_of_higher_loss_is_rejected_and_the_reason_logged(weights, seen, monkeypatch, caplog):
@@ -128,7 +128,7 @@ def test_a_proposal_is_the_networks_own_answer_and_can_be_assessed_afterwards(we
 def test_after_a_long_correction_the_network_runs_again(weights, seen, monkeypatch, ahead_m, looks):
     residual, starts = source(weights(), [seen(np.eye(4), seed=0), seen(STEP, seed=1)]), []
     answer = type("Answer", (), {"pose": torch.tensor(STEP, dtype=torch.float32)[None]})
-    monkeypatch.setattr(residual._network, "refine_seen", lambda *given: (starts.append(given[2]), answer)[1])
+    monkeypatch.setattr(residual._network, "refine_encoded", lambda *given: (starts.append(given[2]), answer)[1])
     residual.propose(frame(1), initial(np.array([0, 0, 0, ahead_m, 0, 0])))
     assert len(starts) == looks
     assert np.allclose(starts[-1][0], STEP, atol=1e-6) == (looks == 2)
@@ -139,7 +139,7 @@ def test_imu_features_are_computed_once_a_scan_with_the_velocity_before_it(weigh
     residual = source(weights(imu="feature", velocity=True), scans, replace(FEW, refine_steps=0))
     told, velocities = [], []
     answer = type("Answer", (), {"pose": torch.tensor(STEP, dtype=torch.float32)[None]})
-    monkeypatch.setattr(residual._network, "refine_seen", lambda *given: (told.append(given[3]), answer)[1])
+    monkeypatch.setattr(residual._network, "refine_encoded", lambda *given: (told.append(given[3]), answer)[1])
     features = residual._network.imu_network.features
     monkeypatch.setattr(
         residual._network.imu_network,
@@ -163,9 +163,9 @@ def test_a_scan_with_too_few_cells_gets_no_proposal(weights, seen):
 def test_the_network_runs_on_one_thread_and_restores_the_number_of_threads(weights, seen, monkeypatch):
     torch.set_num_threads(2)
     residual, threads = source(weights(), [seen(np.eye(4), seed=0), seen(STEP, seed=1)]), []
-    refine = residual._network.refine_seen
+    refine = residual._network.refine_encoded
     monkeypatch.setattr(
-        residual._network, "refine_seen", lambda *given: (threads.append(torch.get_num_threads()), refine(*given))[1]
+        residual._network, "refine_encoded", lambda *given: (threads.append(torch.get_num_threads()), refine(*given))[1]
     )
     residual.refine(frame(1), initial(OFF))
     assert (threads, torch.get_num_threads()) == ([1], 2)

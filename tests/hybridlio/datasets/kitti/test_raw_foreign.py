@@ -89,7 +89,7 @@ class TestRows:
         assert sequence.reference is None
         np.testing.assert_allclose(sequence.forward_speed_m_s, 8.0)
 
-    def test_a_vehicle_that_stands_has_a_reference(self, recordings: Any, drive: Path) -> None:
+    def test_a_standing_vehicle_has_a_reference(self, recordings: Any, drive: Path) -> None:
         for k, row in enumerate(recordings.ride.oxts_rows(np.full(12, recordings.ride.start_ns))):
             row[8] = 0.0
             recordings.put(drive / f"oxts/data/{k:010d}.txt", " ".join(f"{v:.14g}" for v in row))

@@ -113,7 +113,7 @@ def test_the_user_is_asked_where_two_readings_are_possible() -> None:
 
 
 @pytest.mark.parametrize("span", [1e-5, 3e10, 700.0])
-def test_a_span_that_is_no_sweep_in_any_unit_is_refused_with_the_way_out(span: float) -> None:
+def test_a_span_that_fits_no_unit_is_refused_with_advice(span: float) -> None:
     times = np.linspace(0, span, 500)
     with pytest.raises(DataError, match=r"its unit can be none of.*'point_times: none'"):
         find([times] * SCANS)

@@ -58,7 +58,7 @@ def test_the_ground_mesh_has_the_grounds_heights():
     assert normal[:, 2].sum() / 2 == pytest.approx(16.0**2)
 
 
-def test_nothing_stands_on_the_lane(town: Drive):
+def test_no_object_is_on_the_lane(town: Drive):
     poses = town.path.poses(town.scan_times_s[::4]) @ T_IMU_LIDAR
     directions = np.column_stack([np.cos(a := np.linspace(0, 2 * np.pi, 90)), np.sin(a), 0 * a])
     for pose in poses:
