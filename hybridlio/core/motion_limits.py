@@ -12,7 +12,7 @@ import numpy as np
 
 from hybridlio.core.arrays import Array
 
-GRAVITY_M_S2 = 9.81
+GRAVITY_M_S2 = 9.81  # standard gravity, 9.80665, rounded; the value of a place varies by the sigma below
 GRAVITY_MAGNITUDE_SIGMA_M_S2 = 0.03  # 9.78 at the equator, 9.83 at the poles
 
 ACCELERATION_SIGMA_M_S2 = 2.0  # change of velocity between two scans; covers ordinary traffic

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 
-_EYE, _LAST = np.eye(3), [0.0, 0.0, 0.0, 1.0]
+_EYE, _LAST = np.eye(3), [0.0, 0.0, 0.0, 1.0]  # the identity rotation; the last row of every pose
 _SMALL_ANGLE_RAD = 1e-4  # below it the closed forms lose digits, while the series' next terms are below 1e-17
 
 

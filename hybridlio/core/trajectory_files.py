@@ -25,6 +25,7 @@ from hybridlio.core.trajectory import Trajectory
 PathLike = str | os.PathLike[str]
 
 KITTI_PERIOD_NS = NS_PER_S // 10  # nominal: the HDL-64E turns at 10 Hz
+# formats by the number of columns in a row
 _COLUMNS = {8: "TUM (stamp x y z qx qy qz qw)", 12: "KITTI (three rows of a pose)"}
 _ROTATION_TOLERANCE = 1e-2  # passes files with two or more decimals, rejects anything that is no rotation
 

@@ -20,7 +20,7 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.trajectory import Trajectory
 
-KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)  # of segments, as in KITTI's program
 KITTI_STEP = 10  # frames between the starts of segments, as in KITTI's program
 _SPEED_BIN_M_S = 2.0  # as in KITTI's program
 

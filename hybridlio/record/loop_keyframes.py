@@ -22,7 +22,7 @@ from hybridlio.core.packed_arrays import PackedCloud
 from hybridlio.core.sensors import Scan
 from hybridlio.core.setting_checks import check_positive, check_setting
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 1  # stored in the file; other versions are rejected
 RESOLUTION_M = 0.005  # a quarter of a lidar's range noise; int16 then reaches 164 m
 _LARGEST_RANGE_M = RESOLUTION_M * np.iinfo(np.int16).max
 _AVERAGED_POINTS = 30_000  # more points per scan take longer and move the voxel means only by millimetres

@@ -27,7 +27,7 @@ from hybridlio.record.loop_keyframes import LoopKeyframes
 from hybridlio.record.odometry_noise import odometry_noise
 from hybridlio.record.step_arrays import earlier_scan_arrays, relative_arrays, relative_poses, with_earlier_scans
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 2  # stored in the file
 _READABLE = (1, 2)  # version 1 has no poses relative to earlier scans
 _SOURCE = "odometry"  # `source` of the steps of an odometry that is not ours
 _FIRST_POSE_VARIANCE = 1e-12  # rad², m²; the first pose is the origin, but a covariance must be positive definite

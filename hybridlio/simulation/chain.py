@@ -29,7 +29,7 @@ NOISE = ImuNoise()
 STEP_SIGMAS = np.r_[np.full(3, 1e-3), np.full(3, 0.02)]  # rad, m: a relative pose of lidar odometry
 # a mount with rotation and lever arm on all axes, so that an error in the use of a transform shows
 T_IMU_LIDAR = se3.make(Rotation.from_euler("xyz", (1.0, -0.5, 3.0), degrees=True).as_matrix(), (0.8, -0.3, 0.9))
-_STEP_S = 1 / SCAN_RATE_HZ
+_STEP_S = 1 / SCAN_RATE_HZ  # between scans
 _KNOT_S = 0.05  # of the path's spline, far below the periods of its motion
 _PATH_MARGIN_S = 0.5  # of the path beyond the drive, away from the spline's ends
 

@@ -19,6 +19,7 @@ from hybridlio.simulation.drive.path import Motion
 from hybridlio.simulation.rig import T_CAMERA_LIDAR, T_LIDAR_IMU
 
 DATE = "2026_01_01"  # of all simulated drives; none of KITTI's dates
+# noon of that date
 START_NS = int(datetime.datetime(2026, 1, 1, 12, tzinfo=datetime.UTC).timestamp()) * NS_PER_S
 FIRST_PLACE = GeodeticPoint(49.0, 8.4, 110.0)  # of the first navigation row: Karlsruhe, where KITTI was recorded
 # Status columns of the navigation rows, constant: position and velocity accuracy, navigation status, satellites, and

@@ -23,7 +23,7 @@ from hybridlio.simulation.world.layout import lay_out
 from hybridlio.simulation.world.roads import LANE_OFFSET_M, MANNERS, STEP_M, Road, drive, generate_centreline
 from hybridlio.simulation.world.world import World
 
-DEFAULT_SECONDS = 60.0
+DEFAULT_SECONDS = 60.0  # time for several bends and stops, and for two round trips
 _MARGIN_S = 1.0  # of the path before and after the scans, for the IMU's lead and the spline's ends
 _BEHIND_M, _AHEAD_M = 70.0, 130.0  # road and town before the start and after the end: as far as the lidar sees them
 _LENGTH_RESERVE = 1.1  # of the road over the distance at cruising speed

@@ -29,6 +29,7 @@ def _mount(translation_m: tuple[float, float, float], euler_xyz_deg: tuple[float
 
 # vehicle frame: on the ground below the middle of the rear axle, x forward, y left, z up
 T_VEHICLE_LIDAR: Final = _mount((0.80, 0.0, 1.73), (0.0, 0.0, 0.0))
+# Lever arms near those of KITTI's car; the small tilts reveal rotations that are left out or used the wrong way round.
 T_LIDAR_IMU: Final = _mount((-0.80, 0.32, -0.80), (0.7, -0.15, 0.05))
 T_CAMERA_LIDAR: Final = se3.make(
     np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])

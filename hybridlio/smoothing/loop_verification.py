@@ -108,7 +108,7 @@ _SPARSE = 4  # every fourth point; enough to compare starts metres apart
 _SEARCH = CoarseSearch(kernel_m=2.0, iterations=8, refined=3)
 _AHEAD_M, _LEFT_M = (0.0, -3.0, 3.0), (0.0, -2.0, 2.0)
 _SURFACES_KEPT = 64  # a second pass over a place needs the same surfaces repeatedly; 64 keyframes span 250 m
-_UNKNOWN = np.full((6, 6), np.nan)
+_UNKNOWN = np.full((6, 6), np.nan)  # the covariance of a rejected candidate
 
 
 class Verifier:

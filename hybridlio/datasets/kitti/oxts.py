@@ -22,8 +22,8 @@ from hybridlio.datasets.kitti.gyro_lag import SLOW_ROWS_S, gyro_lag_ns
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.stamps import IMU_GAP_FACTOR, MISSING_STAMP, note_gaps, read_stamps, sorted_unique
 
-COLUMNS = 30
-_LAT, _LON, _ALT, _FORWARD = 0, 1, 2, 8
+COLUMNS = 30  # of a navigation row, as KITTI's dataformat.txt lists them
+_LAT, _LON, _ALT, _FORWARD = 0, 1, 2, 8  # latitude and longitude (degrees), altitude (m), forward speed (m/s)
 _ATTITUDE, _ACCEL, _GYRO = slice(3, 6), slice(11, 14), slice(17, 20)  # roll pitch yaw; forward left up
 _STANDING_M_S = 0.5  # below it a constant position is plausible: a vehicle that stands, with a noisy speed
 

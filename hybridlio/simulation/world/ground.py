@@ -19,9 +19,9 @@ from hybridlio.simulation.world.shapes import Mesh
 Height = Callable[[Array], Array]
 
 CURB_OFFSET_M = 5.5  # from the centreline, as all offsets
-CURB_HEIGHT_M = 0.12
+CURB_HEIGHT_M = 0.12  # usual are 0.10 to 0.15 m
 CAMBER = 0.02  # slope of the road to either side, for drainage
-SIDEWALK_END_M = 7.5
+SIDEWALK_END_M = 7.5  # from the centreline: the sidewalk is 2 m wide
 _VERGE_M = 1.5  # width over which paved ground turns into unpaved, and the sidewalk's height ends
 _ASPHALT, _PAVING, _GRASS = 0.22, 0.32, 0.42  # reflectances, plausible at 905 nm; only their order matters
 

@@ -113,6 +113,7 @@ class _HouseStyle:
     heights: tuple[float, float]
 
 
+# Plausible for a town: rows of two to four storeys, whose gaps are often closed; houses with gardens are lower.
 _ROW_HOUSES = _HouseStyle(detached=False, gaps=(0.0, 3.0), widths=(8.0, 17.0), heights=(6.0, 14.0))
 _DETACHED_HOUSES = _HouseStyle(detached=True, gaps=(4.0, 12.0), widths=(8.0, 13.0), heights=(4.0, 8.5))
 
