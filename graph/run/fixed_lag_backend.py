@@ -38,6 +38,7 @@ class FixedLagBackend(IncrementalBackend):
         if lag_scans < WARM_UP_STEPS:
             raise ConfigError(f"fixed-lag: a lag of {lag_scans} scans is too short, take {WARM_UP_STEPS} or more")
         self._lag = lag_scans
+        self._oldest = 0
 
     def start(self, state: State) -> None:
         """As :meth:`IncrementalBackend.start`."""

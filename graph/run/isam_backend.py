@@ -39,12 +39,22 @@ class IncrementalBackend:
         self._T_imu_lidar = steps.T_imu_lidar
         self._T_lidar_imu = se3.inverse(steps.T_imu_lidar)
         self._k = 0
+        self._scans = ScanNumbers(0)
+        self._newest: State | None = None
+        self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self._isam = incremental_solver(self._removes_factors)
+
+    @property
+    def _state(self) -> State:
+        """The newest scan's state."""
+        assert self._newest is not None, "call start first"
+        return self._newest
 
     def start(self, state: State) -> None:
         """Put the first scan's pose at the origin, the other variables at ``state`` with its covariance."""
         self._k = 0
         self._scans = ScanNumbers(state.stamp_ns)
-        self._state = state
+        self._newest = state
         self._graph, self._values = factors.start_factors(state)
         self._isam = incremental_solver(self._removes_factors)
         self._isam.update(self._graph, self._values)
@@ -67,8 +77,8 @@ class IncrementalBackend:
             raise GraphError(f"frame {frame.index}: the graph cannot be solved: {gtsam_message(error)}") from error
         self._k += 1
         self._scans.add(stamp_ns, on_map_path=relative.drift is not None)
-        self._state = self._read(stamp_ns)
-        return self._state
+        self._newest = self._read(stamp_ns)
+        return self._newest
 
     def last_step(self) -> RelativePose:
         """Return the step to the current scan, lidar frames, with its covariance from all factors together."""
