@@ -41,7 +41,7 @@ class BodyMeasurements:
         vectors, noise = (position_m, lever_arm_m), NoiseInput(covariance, sigmas=sigmas)
         return self._add_vectors("gps", key, vectors, noise, robust)
 
-    def add_gps_geodetic(
+    def add_gps_geodetic(  # noqa: PLR0913  (the three coordinates of a place, as GPS receivers give them)
         self, key: Key, latitude_deg: float, longitude_deg: float, altitude_m: float, sigmas: ArrayLike | None = None,
         lever_arm_m: ArrayLike = (0, 0, 0), *, covariance: ArrayLike | None = None, robust: RobustLike = None,
     ) -> int:  # fmt: skip
