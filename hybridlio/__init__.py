@@ -9,19 +9,19 @@ Estimate the trajectory of a recording (KITTI, or a folder of scans):
 Recordings:
     open_sequence      open a recording; find_recordings finds those below a folder
     Sequence           a recording: one Frame per scan, with its Scan, ImuSamples and GpsFix objects
-    simulate           simulate a drive as KITTI raw data, as SimulationConfig says
+    simulate           simulate a drive as KITTI raw data; SimulationConfig has its settings
 
 Estimation:
     Odometry           estimates frame by frame; Config has its settings, load_config reads them from a YAML file
-    Estimate           the result of a step: pose, covariance and how they came about
+    Estimate           the result of a step: pose, covariance and what they were computed from
     smooth             smooth a finished run (odometry.record()) over its whole length, with loops and GPS
-    run_batch          run many recordings in parallel, as BatchOptions says; each is a Recording, the result a Batch
+    run_batch          run many Recordings in parallel; BatchOptions has the settings, Batch the results
 
 Results:
     Trajectory         stamped lidar poses with covariances
     evaluate           drift, ATE, RPE and consistency against a reference
 
-Sources of your own:
+Your own sources:
     RelativePose       what a source returns; hybridlio.core.estimates has the protocols
     State              what the backend returns
     Calibration        extrinsics; ImuNoise has the IMU's noise densities

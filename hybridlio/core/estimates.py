@@ -108,7 +108,7 @@ class RelativePose:
 
         Args:
             times: factor on every covariance.
-            added: ``(6, 6)`` to add to the step's covariance afterwards. It is no drift. It is added to
+            added: ``(6, 6)`` to add to the step's covariance afterwards, but not to its drift. It is added to
                 ``earlier_scans`` too, unless their covariances exclude the scatter of the step.
         """
         extra: Array = np.zeros((6, 6)) if added is None else added

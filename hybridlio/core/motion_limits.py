@@ -43,7 +43,7 @@ VAGUE_TRANSLATION_SIGMA_M = 0.1
 
 
 def unknown_motion_covariance(dt_s: float) -> Array:
-    """Return the covariance ``(6, 6)`` of a step of ``dt_s`` seconds of which nothing is known but the vehicle."""
+    """Return the covariance ``(6, 6)`` of a step of ``dt_s`` seconds of which only the vehicle's limits are known."""
     sigmas = np.r_[np.full(3, UNKNOWN_RATE_SIGMA_RAD_S), np.full(3, UNKNOWN_SPEED_SIGMA_M_S)] * dt_s
     return np.diag(sigmas**2 + PREDICTION_FLOOR_SIGMAS**2)
 

@@ -1,7 +1,7 @@
 """Start-up: the first frame, the first step, and an IMU whose samples start after the scans.
 
 The first scan comes without a speed. It is compensated for rotation only at first, and once more when the first step
-has been found. The backend starts at the second frame, because the samples up to it say where down is.
+has been found. The backend starts at the second frame, because the samples up to it give the direction of gravity.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 # How often the first step is repeated without an IMU. The first answer comes from a coarse search over rotations too;
 # after three repetitions, each from the answer before, it no longer changes.
 _REPETITIONS_WITHOUT_IMU = 3
-_LEVELLING_NS = NS_PER_S  # samples this long before the first scan help to find where down is
+_LEVELLING_NS = NS_PER_S  # samples this long before the first scan help to find the direction of gravity
 
 
 def start_residual(pipeline: Pipeline) -> None:
@@ -87,8 +87,8 @@ def repeat_first_step(
 def take_up_imu(pipeline: Pipeline, record: Record, frame: Frame) -> State:
     """Restart the backend when the first IMU samples come after some steps, and return the state at the last scan.
 
-    The samples say where down is, which the backend needs at its start. It then gets all steps of the run so far
-    again; to the graph, the run is one with a gap in its inertial data at the beginning.
+    The samples give the direction of gravity, which the backend needs at its start. It then gets all steps of the run
+    so far again; to the graph, the run is one with a gap in its inertial data at the beginning.
 
     Args:
         pipeline: its state is at the last scan, without IMU.

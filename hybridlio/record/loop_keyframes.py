@@ -139,7 +139,7 @@ class LoopKeyframes:
 
 
 class LoopKeyframeSelector:
-    """Selects loop keyframes: is offered the scans of a run in order, and keeps one every few metres."""
+    """Selects loop keyframes: takes the scans of a run in order and keeps one every few metres."""
 
     def __init__(self, settings: LoopKeyframeSettings) -> None:
         self._settings = settings

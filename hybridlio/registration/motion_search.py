@@ -22,7 +22,7 @@ from hybridlio.registration.surface import Surface
 # Candidates' speeds are 2.5 m/s apart: 0.25 m at 10 Hz and 0.5 m at 5 Hz. A kernel of that size reaches from one to the
 # next.
 COARSE_KERNEL_M = 0.5
-_JUDGED_STRIDE = 8  # every eighth point, some hundreds, is enough to compare places a kernel apart
+_JUDGED_STRIDE = 8  # every eighth point, some hundreds, are enough to compare candidates one kernel width apart
 _COARSE_ITERATIONS = 6  # three while the kernel is halved from 0.5 to 0.1 m, and three under the narrow one
 _REFINED_CANDIDATES = 12  # of 18 speeds and 5 rates of turn by default: the best one and those beside it in both
 _MIN_MATCHED_RATIO = 0.8  # to the most matches of any candidate; with few matches a low cost is easy to have

@@ -148,7 +148,7 @@ class CandidateFinder:
         return earlier[near], bool(sure)
 
     def _nearest_keys(self, k: int, possible: Index) -> Index:
-        """Those of the possible keyframes whose ring keys are nearest, in order."""
+        """Return the possible keyframes with the nearest ring keys, in order of their indices."""
         if len(possible) <= self._settings.compared:
             return possible
         difference = np.linalg.norm(self._keys[possible] - self._keys[k], axis=1)

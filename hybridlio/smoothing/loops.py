@@ -1,4 +1,4 @@
-"""Loop closures as plain data: what a search finds, and which of it the smoothed graph keeps."""
+"""Loop closures as plain data: those that a search finds, and those that the smoothed graph keeps."""
 
 from __future__ import annotations
 

@@ -90,10 +90,10 @@ def _nis(innovation: Array, covariance: Array) -> float:
 class InnovationGate:
     """Tests each step's relative pose against the IMU's prediction and counts rejections in a row.
 
-    After :data:`MAX_REJECTIONS` rejections the map may be lost rather than the scan be wrong: the next scan's
-    place in the map is then a jump and no motion, and the scans after it agree with the IMU again. If they do not, the
-    IMU may be wrong, and relative poses pass until one is within the gate, so that the graph can correct the IMU's
-    biases or the speed.
+    After :data:`MAX_REJECTIONS` rejections, the position in the map may be lost. The next relative pose is then a jump
+    in the map, not a motion, and is rejected too; those after it agree with the IMU again. If they do not, the IMU may
+    be wrong: relative poses then pass until one is within the gate, so that the graph can correct the IMU's biases or
+    the speed.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Two residual sources in a row, where the second starts from the first one's answer; and the one that does nothing."""
+"""A chain of two residual sources, where the second starts from the first one's result; a source that does nothing."""
 
 from __future__ import annotations
 
@@ -72,18 +72,18 @@ class ResidualChain:
         return replace(fine, details=details)
 
     def take_back(self, initial: RelativePose) -> None:
-        """Take back the last answer of the sources that support it."""
+        """Have each source that can do so take back its last result."""
         for source in (self._first, self._second):
             if isinstance(source, TakesBack):
                 source.take_back(initial)
 
     def _refine_in_turn(self, frame: Frame, initial: RelativePose) -> tuple[RelativePose, RelativePose]:
-        """Return both answers, the second one's from the first one's."""
+        """Return the results of both sources; the second starts from the first one's result."""
         coarse = self._first.refine(frame, initial)
         return coarse, self._second.refine(frame, coarse if coarse.ok and not len(coarse.degenerate) else initial)
 
     def _propose(self, frame: Frame, initial: RelativePose) -> tuple[RelativePose | None, RelativePose]:
-        """Return the second one's answer with the first one's proposal, and the first one's if the second fails."""
+        """Return the first source's result where the second fails; and the second's, from the first's proposal."""
         fine = self._second.refine(frame, replace(initial, proposed=self._first.propose(frame, initial)))
         return None if fine.ok else self._first.assess(frame, initial), fine
 

@@ -54,7 +54,7 @@ from hybridlio.datasets.stamps import (
 
 LAYOUT = "a drive folder with velodyne_points/data/NNNNNNNNNN.bin, or the date or root folder above it"
 
-_MIN_ROW_STEP_NS = 30_000_000  # rows closer than this are of the 100 Hz recording, not one per scan
+_MIN_ROW_STEP_NS = 30_000_000  # rows closer in time come from the 100 Hz recording, not one per scan
 _MIN_COMPARED_M = 5.0  # directions of paths that leave the start by less are not compared
 _MIN_COSINE = 0.7  # of the angle between paths: 45°; the axes of a camera frame are 90° off
 
