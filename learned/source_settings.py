@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from hybridlio.core.setting_checks import check_fraction, check_not_negative, check_positive, check_setting
 
 SHIPPED = "shipped"
-"""In place of a path: the weights that come with the package."""
+"""Value of ``weights`` that selects the weights shipped with the package."""
 
 
 @dataclass(frozen=True)
 class LstmSettings:
-    """How the LSTMs' initial poses are made.
+    """Settings of the LSTM initial pose.
 
     Attributes:
         weights: path of a weights file whose network has ``imu="initial-pose"``, or ``shipped``.
-        device: where it computes, as PyTorch names it; ``auto`` is a GPU where there is one.
+        device: PyTorch device name; ``auto`` is a GPU if available, else the CPU.
     """
 
     __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
@@ -27,18 +27,18 @@ class LstmSettings:
 
 @dataclass(frozen=True)
 class NetworkResidualSettings:
-    """How the residual network's answer is made and weighed.
+    """Settings of the residual network and of its covariance.
 
     Attributes:
         weights: path of a weights file, or ``shipped``.
-        device: where it computes, as PyTorch names it; ``auto`` is a GPU where there is one.
-        min_cells: with fewer cells that have a normal in either map a scan is bridged by the initial pose.
-        min_matched: with a smaller share of points matched, too.
-        covariance_scale: how much larger the covariance is than independent residuals would make it.
-        refine_steps: at most so many Gauss-Newton steps down the loss where its minimum is farther from the network's
-            answer than noise explains; 0 always leaves the answer.
-        kernel_m, max_distance_m: of the robust loss that weighs the answer.
-        start_speeds_m_s: forward speeds tried, by the loss, where the initial pose is unsure of the translation.
+        device: PyTorch device name; ``auto`` is a GPU if available, else the CPU.
+        min_cells: a scan with fewer cells with normals in either map is bridged by the initial pose.
+        min_matched: a scan with a smaller share (0 to 1) of matched points is bridged, too.
+        covariance_scale: factor on the covariance, because residuals are correlated.
+        refine_steps: maximum number of Gauss-Newton steps on the loss, taken if its minimum is farther from the
+            network's answer than noise explains; 0 never changes the answer.
+        kernel_m, max_distance_m: kernel width and matching limit of the robust loss that evaluates the answer.
+        start_speeds_m_s: candidate forward speeds, compared by the loss, if the initial translation is uncertain.
 
     Raises:
         SettingError: a value is out of range.

@@ -1,4 +1,4 @@
-"""Inertial samples between two scans as a fixed number of rows, in the lidar's axes. NumPy only."""
+"""Resampling of the IMU samples between two scans to a fixed number of rows, in the lidar's axes. NumPy only."""
 
 from __future__ import annotations
 
@@ -11,19 +11,18 @@ from hybridlio.core.sensors import NS_PER_S, ImuSamples
 
 
 def imu_rows(samples: ImuSamples, count: int, T_imu_lidar: ArrayLike | None = None) -> Floats:
-    """``(count, 6)`` float32: angular velocity (rad/s), then specific force (m/s²), evenly spaced in time.
+    """Return ``(count, 6)`` float32: angular velocity (rad/s), then specific force (m/s²), evenly spaced in time.
 
-    Runs of any length are resampled linearly from their first stamp to their last; a single sample is repeated. The
-    values are turned into the lidar's axes, so that what a network learns does not depend on how the IMU is mounted;
-    the lever arm is left out.
+    Samples are interpolated linearly from the first stamp to the last; a single sample is repeated. Values are rotated
+    into the lidar's axes, so that trained weights do not depend on the IMU's mounting; the lever arm is ignored.
 
     Args:
         samples: from the last scan's stamp to the current one's, as in :class:`hybridlio.core.sensors.Frame`.
         count: S, the paper's 15.
-        T_imu_lidar: ``(4, 4)``; the identity where not given.
+        T_imu_lidar: ``(4, 4)``; None is the identity.
 
     Raises:
-        DataError: there is no sample.
+        DataError: ``samples`` is empty.
     """
     if not len(samples):
         raise DataError("no IMU samples between two scans; the network needs at least one")

@@ -66,7 +66,7 @@ class Prepared(Mapped, Protocol):
 
 @dataclass(frozen=True, eq=False)
 class KnownMotion:
-    """What is known of a recording's motion beside its reference.
+    """Sources of a recording's motion other than its reference.
 
     Attributes:
         initial: returns the initial pose of a frame, for a network whose initial poses are given.

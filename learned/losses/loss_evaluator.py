@@ -29,16 +29,16 @@ from hybridlio.registration.surface import Neighbours, Surface
 Map = NDArray[np.float32]
 
 CHI2_99, _CHI2_90 = 16.8, 10.6  # quantiles of χ² with six degrees of freedom
-_VOXEL_M = 0.4  # a few thousand points a scan: 4 ms for means and tree, where all cells would take several times that
-_LONGEST_STEP_M = 0.5  # half of max_distance_m: farther away the matches of this pose no longer hold
-_UNKNOWN_SIGMA_M = 10.0  # beyond any error of a step that another source leaves, so that directions count as unknown
+_VOXEL_M = 0.4  # leaves a few thousand points a scan: means and tree take 4 ms, several times less than for all cells
+_LONGEST_STEP_M = 0.5  # half of max_distance_m: after a longer step the matches at the old pose are invalid
+_UNKNOWN_SIGMA_M = 10.0  # marks a direction as unknown: larger than the error of a step by any other source
 # Share of information that noisy normals add along a plane (rad²). Smooth walls showed a seventh of it, an open field
 # up to all of it.
 _NORMAL_NOISE = 3e-3
 # Covariance of the minimum's systematic error: the clouds are means of scan rings, which lie elsewhere in each scan.
 # Rings on the road determine roll, pitch and height. Rad and m, for a lidar that spins about z.
 _SYSTEMATIC = np.diag(np.array([1.5e-4, 1.5e-4, 3e-5, 1.5e-3, 1.5e-3, 6e-4]) ** 2)
-# Poses closer together than this (0.02°, 1.5 mm) have the same loss to within its systematic error.
+# Poses closer together than this (0.02°, 1.5 mm) have equal loss within its systematic error; compare _SYSTEMATIC.
 _INDISTINCT = np.diag(np.r_[np.full(3, 3e-4), np.full(3, 1.5e-3)] ** 2)
 # Lower limits of the standard deviations (rad, m). Height has a larger one than simulated scans would need: elevations
 # of real beams are off, and a too certain height makes the graph trust the IMU's few samples of heave.

@@ -1,4 +1,4 @@
-"""From features to what a pose is read off: the paper's gate, and what its table 4 compares it with."""
+"""Network heads between features and pose: the paper's attention gate, and the MLP of its table 4."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 class Attention(nn.Module):
     """``i = σ(W_i x + b_i)``, ``g = tanh(W_g x + b_g)``, ``o = σ(W_o x + b_o)``, ``out = o ∘ tanh(i ∘ g)``.
 
-    UnDeepLIO, formula (6): an LSTM's cell without its past. Features ``(B, F)`` to ``(B, F)``, each within ±1.
+    UnDeepLIO, formula (6): an LSTM cell without recurrence. Features ``(B, F)`` to ``(B, F)``, each within ±1.
     """
 
     def __init__(self, features: int) -> None:
@@ -21,7 +21,7 @@ class Attention(nn.Module):
         self.output_gate = nn.Linear(features, features)
 
     def forward(self, x: Tensor) -> Tensor:
-        """The gated features."""
+        """Return the gated features."""
         i = torch.sigmoid(self.input_gate(x))
         g = torch.tanh(self.candidate(x))
         o = torch.sigmoid(self.output_gate(x))
@@ -37,10 +37,10 @@ class Mlp(nn.Module):
         self.second = nn.Linear(features, features)
 
     def forward(self, x: Tensor) -> Tensor:
-        """The transformed features."""
+        """Return the transformed features."""
         return torch.tanh(self.second(torch.tanh(self.first(x))))
 
 
 def make_head(kind: Literal["attention", "mlp"], features: int) -> nn.Module:
-    """The module of a :class:`hybridlio.learned.settings.NetworkSettings` ``head``."""
+    """Return the module for ``head`` of :class:`hybridlio.learned.settings.NetworkSettings`."""
     return Attention(features) if kind == "attention" else Mlp(features)

@@ -14,16 +14,16 @@ from hybridlio.learned.networks import torch_se3 as se3
 from hybridlio.learned.networks.layers import rotation_matrix
 from hybridlio.learned.settings import NetworkSettings
 
-_RATE_RAD_S = 0.5  # what a road vehicle turns at
+_RATE_RAD_S = 0.5  # input scale: about 29°/s, a road vehicle in a sharp turn; part of the trained weights
 
 
 class ImuNetwork(nn.Module):
-    """Two LSTMs over ``S`` rows, of the same structure; with ``siamese="shared"`` of the same weights too.
+    """Two LSTMs of the same structure over ``S`` rows; with ``siamese="shared"`` they share their weights.
 
-    Rows are divided by 9.81 m/s² and 0.5 rad/s, so that both kinds are about 1. With ``velocity`` the translation LSTM
-    also sees the last velocity (in units of 10 m/s) in every row, and its output is added to that velocity times the
-    time between the scans: acceleration alone does not determine a constant speed. A shared LSTM sees the velocity for
-    both kinds. With ``mean_rate`` the orientation LSTM's output is added to the rotation at the mean angular velocity.
+    Rows are divided by 9.81 m/s² and 0.5 rad/s, so that inputs are of order 1. With ``velocity`` the translation LSTM
+    also takes the last velocity (in units of 10 m/s) in every row, and its output is added to that velocity times the
+    time between the scans: acceleration alone does not determine a constant speed. A shared LSTM takes the velocity for
+    both inputs. With ``mean_rate`` the orientation LSTM's output is added to the rotation at the mean angular velocity.
     The last layers start small and without bias, so that training starts near the identity or near that first guess.
     """
 
@@ -42,22 +42,22 @@ class ImuNetwork(nn.Module):
                     layer.bias.zero_()
 
     def features(self, imu: Tensor, velocity_m_s: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """What the LSTMs end with, ``(B, hidden)`` of accelerations and of angular velocities.
+        """Return the LSTMs' last outputs ``(B, hidden)``, for accelerations and for angular velocities.
 
         Args:
             imu: ``(B, S, 6)``, angular velocity (rad/s) and specific force (m/s²).
-            velocity_m_s: ``(B, 3)`` at the last scan, in its axes; only looked at with ``velocity``.
+            velocity_m_s: ``(B, 3)`` at the last scan, in its axes; ignored unless ``settings.velocity``.
         """
         accel, gyro = imu[..., 3:] / GRAVITY_M_S2, imu[..., :3] / _RATE_RAD_S
         if self.settings.velocity and velocity_m_s is not None:
             velocity = (velocity_m_s / 10.0)[:, None].expand_as(accel)
             accel = torch.cat([accel, velocity], dim=-1)
-            if self.shared:  # one LSTM takes the same number of columns for either kind
+            if self.shared:  # a shared LSTM needs the same number of columns for both inputs
                 gyro = torch.cat([gyro, velocity], dim=-1)
         return self.accel_lstm(accel)[0][:, -1], self.gyro_lstm(gyro)[0][:, -1]
 
     def forward(self, imu: Tensor, velocity_m_s: Tensor | None = None, dt_s: Tensor | None = None) -> Tensor:
-        """Initial poses ``T_k_k1`` ``(B, 4, 4)``; arguments as :meth:`features`, ``dt_s`` ``(B,)`` between scans."""
+        """Return initial poses ``T_k_k1`` ``(B, 4, 4)``; arguments as :meth:`features`, and ``dt_s`` ``(B,)``."""
         of_accel, of_gyro = self.features(imu, velocity_m_s)
         scale = self.settings.output_scale
         t = scale * self.translation(of_accel)

@@ -10,7 +10,7 @@ from hybridlio.learned.settings import NetworkSettings
 
 
 class CircularConv(nn.Module):
-    """A square convolution whose columns wrap around; rows are padded by zeros. A bias only where no norm follows."""
+    """A square convolution, circular along columns and zero-padded along rows. Use a bias only if no norm follows."""
 
     def __init__(
         self, inputs: int, outputs: int, size: int, stride: tuple[int, int], bias: bool = False, dilation: int = 1
@@ -21,10 +21,10 @@ class CircularConv(nn.Module):
         nn.init.kaiming_normal_(self.conv.weight, nonlinearity="relu")
 
     def forward(self, x: Tensor) -> Tensor:
-        """Maps ``(B, C, H, W)`` to ``(B, outputs, ⌈H/stride⌉, ⌈W/stride⌉)``."""
+        """Map ``(B, C, H, W)`` to ``(B, outputs, ⌈H/stride⌉, ⌈W/stride⌉)``."""
         return self.conv(functional.pad(x, (self.reach, self.reach, 0, 0), mode="circular"))  # type: ignore[no-any-return]
 
 
 def rotation_matrix(three: Tensor, settings: NetworkSettings) -> Tensor:
-    """Rotations ``(B, 3, 3)`` of a network's three outputs: Euler angles, or a rotation vector."""
+    """Return rotations ``(B, 3, 3)`` from three network outputs: Euler angles or a rotation vector (rad)."""
     return se3.so3_exp(three) if settings.rotation == "log" else se3.euler_to_rotation(three)

@@ -16,8 +16,8 @@ from torch.nn import functional
 from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.learned.networks import torch_se3 as se3
 
-_FAR = (1 << 63) - 1
-_INDEX_BITS = 32
+_FAR = (1 << 63) - 1  # largest int64: the key of an empty cell
+_INDEX_BITS = 32  # low half of an int64 key; the high half holds the bits of a float32 depth
 _DEG = 180.0 / math.pi
 
 

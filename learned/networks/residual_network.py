@@ -16,10 +16,10 @@ from hybridlio.learned.networks.attention import make_head
 from hybridlio.learned.networks.layers import CircularConv, rotation_matrix
 from hybridlio.learned.settings import NetworkSettings
 
-_GROUP = 8  # channels that are normalised together
-_MORE_CHANNELS = {"none": 0, "distance": 1, "gradient": 7}
-_DISTANCE_M = 0.1  # what is left after an initial pose, so that networks see numbers around 1
-_LEVER_M = 10.0  # makes gradients by rotation as large as those by translation
+_GROUP = 8  # channels per normalisation group: divides the channel counts of the default network
+_MORE_CHANNELS = {"none": 0, "distance": 1, "gradient": 7}  # d; or d and the six columns of its gradient
+_DISTANCE_M = 0.1  # input scale: typical error after an initial pose, so that inputs are of order 1
+_LEVER_M = 10.0  # typical range of a point: scales gradients by rotation to those by translation
 # Twice the error of perturbed initial poses. The pooled d·n then correlates with an error ahead at 0.93; without a
 # kernel at 0.72 (240 validation pairs of benchmarks/published_data.py).
 _KERNEL_M = 0.3

@@ -1,4 +1,4 @@
-"""The LSTMs at run time: a source of initial poses."""
+"""Source of initial poses that runs the trained LSTMs."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from hybridlio.learned.networks.weights import load_weights, weights_path
 from hybridlio.learned.source_settings import LstmSettings
 from hybridlio.learned.sources.inertial_inputs import inertial
 
-_STEP_S = 0.1  # step of the training data (scans at 10 Hz): the duration is no input of the LSTMs
-_FORGETTING = 0.05  # share of the newest step in the variances: about 20 steps, 2 s, are remembered
-_FIRST_SIGMAS = np.r_[np.full(3, 0.01), np.full(3, 0.3)]  # rad, m of a step; several times the errors in training
+_STEP_S = 0.1  # scan period of the training data (10 Hz); the LSTMs do not take the duration as input
+_FORGETTING = 0.05  # weight of the newest step in the variances: averages over about 20 steps (2 s); a choice
+_FIRST_SIGMAS = np.r_[np.full(3, 0.01), np.full(3, 0.3)]  # rad, m a step: several times the training errors
 
 
 class LstmInitialPose:
-    """Initial poses by the LSTMs of a trained network.
+    """Predict initial poses by the LSTMs of a trained network.
 
     The covariance starts at 0.6° and 0.3 m and follows the errors of the predictions so far, with exponential
     forgetting. While the last velocity is an input but unknown, as at the start, the covariance of the translation is
-    that of an unknown motion. Longer steps, over missing scans, are predicted in parts of a tenth of a second.
+    that of an unknown motion. Steps longer than 0.1 s, over missing scans, are split into parts of about 0.1 s.
 
     Args:
         settings: weights and device.
@@ -47,8 +47,8 @@ class LstmInitialPose:
         network = load_weights(path).network(self._device)
         if network.imu_network is None or network.settings.imu != "initial-pose":
             raise ConfigError(
-                f"{path}: of a network with imu={network.settings.imu!r}, which predicts no initial pose; choose other "
-                "weights (lstm.weights) or another initial pose"
+                f"{path}: weights of a network with imu={network.settings.imu!r}, which predicts no initial pose; "
+                "choose other weights (lstm.weights) or another initial pose"
             )
         self._network, self._settings = network.imu_network, network.settings
         self._variances = _FIRST_SIGMAS**2  # of a step of _STEP_S

@@ -1,4 +1,4 @@
-"""Train and evaluate the rows of a comparison, each with the same budget; finished rows are not repeated."""
+"""Train and evaluate the rows of a comparison with equal budgets; finished rows are reused."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def run_rows(
         progress: called after every training step.
 
     Raises:
-        ConfigError: two rows have one name, or a row's folder holds a run with other settings.
+        ConfigError: two rows have the same name, or a row's folder holds a run with other settings.
     """
     if len({recipe.name for recipe in recipes}) != len(recipes):
         raise ConfigError("two rows of a comparison have the same name; rename one recipe")
@@ -103,21 +103,23 @@ def _finished(path: Path, recipe: Recipe, steps: int) -> RowResult | None:
     if values["steps"] != steps:
         differing.append(f"steps: {values['steps']} → {steps}")
     if differing:
-        raise ConfigError(f"{path}: of another comparison ({'; '.join(differing)}); give another folder, or delete it")
+        raise ConfigError(
+            f"{path}: result of another comparison ({'; '.join(differing)}); choose another folder or delete it"
+        )
     for part in ("train", "test"):
         values[part] = {name: None if d is None else (d[0], d[1]) for name, d in values[part].items()}
     return RowResult(**values)
 
 
 def reduced(recipe: Recipe, geometry: MapGeometry | None = None, batch: int = 8, rate: float = 1e-3) -> Recipe:
-    """Return a recipe that a CPU trains in minutes: coarser maps, a quarter of the channels, one block in a stage.
+    """Return a recipe that trains on a CPU in minutes: coarser maps, a quarter of the channels, one block per stage.
 
-    Settings in which the rows of a comparison differ stay. Figures are worse than at full size.
+    Settings that distinguish rows of a comparison are kept. Results are worse than at full size.
 
     Args:
-        recipe: at full size.
+        recipe: full-size recipe.
         geometry: cells of the maps; None takes half of the rows and a quarter of the columns.
-        batch: pairs in a step.
+        batch: pairs per step.
         rate: constant learning rate.
     """
     network, cells = recipe.network, recipe.network.geometry

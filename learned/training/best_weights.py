@@ -1,4 +1,4 @@
-"""The weights of a run that did best on the validation drives, kept beside the last ones."""
+"""The weights of a run with the best validation score, stored beside the latest ones."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class BestWeights:
     """A file of weights that is replaced only by better ones.
 
     Attributes:
-        path: of the file; its metadata says the score and the step.
+        path: path of the file; its metadata holds score and step.
     """
 
     path: Path

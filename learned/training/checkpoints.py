@@ -1,4 +1,4 @@
-"""Checkpoints: the full state of a training run, in one file that appears complete."""
+"""Checkpoints: the full state of a training run in one file, written atomically."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from hybridlio.core.files import write_atomically
 from hybridlio.learned.setting_values import from_dict, to_dict
 from hybridlio.learned.settings import Recipe
 
-FORMAT = 1
+FORMAT = 1  # raise by 1 when the fields of a checkpoint change
 
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """A point in a training run.
+    """State of a training run.
 
     Attributes:
         recipe: settings of the run.
@@ -60,7 +60,7 @@ def restore(checkpoint: Checkpoint, network: nn.Module, optimiser: Optimizer) ->
 
 
 def save(path: str | os.PathLike[str], checkpoint: Checkpoint) -> None:
-    """Write a checkpoint; the file appears complete."""
+    """Write a checkpoint atomically."""
     buffer = io.BytesIO()
     values = {
         "format": FORMAT,
@@ -85,7 +85,7 @@ def load(path: str | os.PathLike[str]) -> Checkpoint:
     try:
         values = torch.load(path, map_location="cpu", weights_only=True)
         if values["format"] != FORMAT:
-            raise DataError(f"{path}: format {values['format']}, this version reads {FORMAT}")
+            raise DataError(f"{path}: format {values['format']}; this version reads format {FORMAT}")
         return Checkpoint(
             from_dict(Recipe, values["recipe"], "recipe"),
             values["data"],
@@ -99,7 +99,7 @@ def load(path: str | os.PathLike[str]) -> Checkpoint:
 
 
 def differences(wanted: Recipe, found: Recipe) -> list[str]:
-    """Return the settings in which two recipes differ, as ``section.key: found → wanted``; names may differ."""
+    """Return the settings in which two recipes differ, as ``section.key: found → wanted``; names are ignored."""
     texts = []
     a, b = to_dict(wanted), to_dict(found)
     for section in ("network", "loss", "optimiser"):

@@ -1,4 +1,4 @@
-"""A network run over a recording step by step, as at run time: its last velocity is its own estimate."""
+"""Evaluation of a network on a recording in sequence, as at run time, with its own estimate as last velocity."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class DrivenSteps:
     """A network's estimates of a recording's steps, in order.
 
     Attributes:
-        poses, initial, reference: ``T_k_k1`` ``(N, 4, 4)`` estimated, before the residual, and true (NaN where
+        poses, initial, reference: ``T_k_k1`` ``(N, 4, 4)``: estimates, initial poses, and reference (NaN if
             unknown).
     """
 
@@ -45,17 +45,17 @@ def drive(
 ) -> DrivenSteps:
     """Estimate a recording's steps in order.
 
-    A network with the last velocity as an input gets its own estimate, except for the first step, which gets the
-    shard's: how a run finds its first velocity is not evaluated here.
+    A network with velocity input takes its previous estimate; the first step takes the shard's velocity, so
+    initialisation of the velocity is not evaluated.
 
     Raises:
-        DataError: the recording has no steps, or a gap between them.
+        DataError: the recording has no usable steps, or an unusable scan between them.
     """
     pairs = Pairs([shard], network.settings)
     gaps = np.diff([pairs.where(i)[1] for i in range(len(pairs))]) != 1
     if gaps.any():
         raise DataError(
-            f"{shard.folder}: scan {pairs.where(int(gaps.argmax()))[1] + 1} is not usable; steps have a gap"
+            f"{shard.folder}: scan {pairs.where(int(gaps.argmax()))[1] + 1} is not usable; choose one without gaps"
         )
     was_training, device = network.training, next(network.parameters()).device
     network.eval()
@@ -79,8 +79,8 @@ def drive(
 def drift_of(poses: Array, reference: Array) -> tuple[float, float] | None:
     """Return KITTI's t_rel (percent) and r_rel (degrees per 100 m) of chained steps ``(N, 4, 4)``.
 
-    Segments start at every scan. Return None where the reference is not known for all steps, or the path is shorter
-    than any segment.
+    Segments start at every scan. Return None if any reference is unknown, or the path is shorter than every
+    segment.
     """
     if not len(poses) or not np.isfinite(reference).all():
         return None

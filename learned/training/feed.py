@@ -16,7 +16,7 @@ _EPOCHS_APART = 1_000_003  # a prime above any number of epochs, so that seeds o
 
 @dataclass(frozen=True, eq=False)
 class Feed:
-    """Which pairs each step of a run sees, and this process's share of them.
+    """Selects the pairs of each step of a run, and this process's share of them.
 
     Attributes:
         pairs: to train on.

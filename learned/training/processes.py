@@ -1,4 +1,4 @@
-"""One training process or several, as ``torchrun`` starts them."""
+"""Single-process training, or distributed training under ``torchrun``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Processes:
-    """This process among all.
+    """This process's place in distributed training.
 
     Attributes:
         rank: its index, from 0.
@@ -43,12 +43,12 @@ class Processes:
         return value.detach()
 
     def wait(self) -> None:
-        """Return when all processes have called this."""
+        """Block until all processes have called this."""
         if self.count > 1:
             torch.distributed.barrier()
 
     def joined(self, network: nn.Module) -> nn.Module:
-        """Return the network, or one with its loss, with gradients averaged over the processes.
+        """Wrap a network, or a network with its loss, so that gradients are averaged over the processes.
 
         On GPUs batch normalisation takes its statistics over all processes. PyTorch has no such layer for CPUs: there
         each process normalises by its own share of the batch, and the result depends on the number of processes.
@@ -60,10 +60,10 @@ class Processes:
         elif self.leads and any(isinstance(module, nn.BatchNorm2d) for module in network.modules()):
             _log.warning(
                 "%d CPU processes: batch normalisation uses each process's own share of the batch, so the result "
-                "depends on the number of processes; train with network.normalisation 'group' for one that does not",
+                "depends on the number of processes; train with network.normalisation 'group' to avoid this",
                 self.count,
             )
-        # some recipes give parts of the network no gradient, such as the LSTMs where steps ignore their start
+        # some recipes leave parameters without gradient, such as LSTMs before steps that detach their initial pose
         return DistributedDataParallel(network, find_unused_parameters=True)
 
 
@@ -72,7 +72,7 @@ def processes(device: str | None = None) -> Iterator[Processes]:
     """Join the processes that ``torchrun`` started; without it, yield a single process.
 
     Args:
-        device: name of the device; None takes this process's GPU where there is one.
+        device: name of the device; None selects this process's GPU if available, else the CPU.
     """
     count, rank = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("RANK", "0"))
     local = int(os.environ.get("LOCAL_RANK", "0"))

@@ -261,7 +261,7 @@ class _Run:
         return {"data": data, "pairs": str(len(self.pairs)), "steps": str(self.step), **self.options.about}
 
     def _agreed(self, mine: bool) -> bool:
-        """Return whether any process says so: all stop at the same step."""
+        """Return whether any process asks to stop, so that all stop at the same step."""
         return bool(self.place.total(torch.tensor(float(mine), device=self.place.device)) > 0)
 
     def _save(self) -> None:

@@ -1,4 +1,4 @@
-"""The log of a training run: one JSON object per line, and the same as event files for TensorBoard."""
+"""The log of a training run: JSON lines, and optional TensorBoard event files."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from hybridlio.core.files import write_atomically
 
 
 class TrainingLog:
-    """Rows of numbers by step, in ``log.jsonl`` and in ``tensorboard/``.
+    """Writer of numbers by step to ``log.jsonl`` and ``tensorboard/``.
 
-    tensorboardX writes the event files; without it there are none.
+    Event files are written only if tensorboardX is installed.
 
     Args:
-        folder: of the run.
-        step: step of the last checkpoint. Later rows of an interrupted run are dropped.
+        folder: folder of the run.
+        step: step of the last checkpoint. Later rows of an interrupted run are deleted.
     """
 
     def __init__(self, folder: str | os.PathLike[str], step: int) -> None:

@@ -24,7 +24,7 @@ class Steps:
     """A network's estimates of all pairs, in their order.
 
     Attributes:
-        poses, initial, reference: ``(N, 4, 4)``; the reference is NaN where unknown.
+        poses, initial, reference: ``(N, 4, 4)``; the reference is NaN if unknown.
         loss, po2pl_m: ``(N,)``.
     """
 
@@ -43,7 +43,7 @@ def run_steps(
     device: torch.device | str = "cpu",
     progress: Callable[[int, int], None] | None = None,
 ) -> Steps:
-    """Estimate every pair, with initial poses perturbed as in training, by draws of seed 0."""
+    """Estimate every pair, with initial poses perturbed as in training (seed 0, so that validations compare)."""
     was_training, size = network.training, recipe.optimiser.batch
     network.eval()
     parts: list[tuple[Array, ...]] = []
@@ -61,7 +61,7 @@ def run_steps(
 
 
 def validate(network: OdometryNetwork, pairs: Pairs, recipe: Recipe, device: torch.device | str = "cpu") -> Validation:
-    """Run the network over pairs and compare with the reference where there is one."""
+    """Run the network on pairs; return loss, and errors for pairs with a reference."""
     steps = run_steps(network, pairs, recipe, device)
     known = np.isfinite(steps.reference).all(axis=(1, 2))
     loss, po2pl = float(steps.loss.mean()), float(steps.po2pl_m.mean())

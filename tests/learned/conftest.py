@@ -138,7 +138,7 @@ class ScanMaps:
 
 @pytest.fixture
 def seen() -> Callable[..., ScanMaps]:
-    """What a spinning sensor at a pose sees of a room of half sizes, with a centimetre of noise."""
+    """Simulate a spinning lidar's scan of a box-shaped room, from a pose, with 1 cm of noise."""
     elevations, azimuths = np.deg2rad(np.arange(-39, 40, 2)), np.deg2rad(np.arange(1, 360, 2))
     up, around = (angles.ravel() for angles in np.meshgrid(elevations, azimuths, indexing="ij"))
     rays = np.column_stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
@@ -165,7 +165,7 @@ def tiny_recipe() -> Recipe:
 
 @pytest.fixture
 def weights(seeing_recipe: Recipe, tmp_path: Path) -> Callable[..., Path]:
-    """Writes weights that know nothing yet, of a network with changed settings: δT is nearly the identity."""
+    """Return a function that writes untrained weights, with changed settings, whose δT is nearly the identity."""
 
     def write(**changes: Any) -> Path:
         recipe = replace(seeing_recipe, network=replace(seeing_recipe.network, residual_scale=1e-6, **changes))

@@ -149,7 +149,7 @@ def test_the_information_counts_points_whatever_the_kernels_scale():
         assert found.information[0, 3:, 3:].trace().item() == pytest.approx(400)
 
 
-def test_a_corridor_says_nothing_of_the_way_along_it():
+def test_a_corridor_does_not_constrain_motion_along_it():
     cloud = room()
     along_x = cloud.normals[..., 0] == 0
     cloud = Clouds(cloud.points, cloud.normals, along_x)

@@ -113,7 +113,7 @@ def test_a_constant_rate_turns_the_initial_pose_by_as_much_as_it_gives_in_the_ti
     assert torch.allclose(net(imu, None, dt)[:, :3, :3], se3.so3_exp(rate * dt[:, None]), atol=1e-6)
 
 
-def test_an_initial_pose_is_shaken_before_it_is_refined_and_is_judged_as_it_was():
+def test_an_initial_pose_is_perturbed_for_refinement_only():
     net, x = network().eval(), given()
     shake = se3.exp(torch.tensor([[0.0, 0.0, 0.01, 0.1, 0.0, 0.0]])).expand(3, 4, 4)
     plain, shaken = net(x), net(replace(x, perturbation=shake))
@@ -203,14 +203,14 @@ def test_every_variant_gives_poses_and_a_gradient_to_every_weight(changes):
     assert len(out.poses) == settings.iterations * (settings.projective_steps + settings.encoder)
     R = out.pose[:, :3, :3]
     assert torch.allclose(R @ R.transpose(1, 2), torch.eye(3).expand(3, 3, 3), atol=1e-5)
-    # steps take the pose before them as given: each is taught by what it gives itself
+    # steps detach their input pose: each is trained by its own output only
     taught = [out.initial, *out.poses] if settings.projective_steps else [out.pose]
     torch.stack(taught).square().sum().backward()
     missing = [name for name, p in net.named_parameters() if p.grad is None or not p.grad.isfinite().all()]
     assert missing == []
 
 
-def test_translation_does_not_see_normals_where_branches_are_apart():
+def test_translation_ignores_normals_with_separate_branches():
     x = given()
     for normals, sees in (("separate", False), ("joined", True)):
         net = network(normals=normals, imu="none").eval()

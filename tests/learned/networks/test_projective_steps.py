@@ -73,7 +73,7 @@ def test_one_step_solves_a_small_motion_of_planes():
     assert torch.allclose(found[0] @ moved_back, torch.eye(4), atol=2e-4)
 
 
-def test_a_point_of_no_weight_says_nothing():
+def test_points_of_zero_weight_do_not_change_the_step():
     generator = torch.Generator().manual_seed(0)
     normals = torch.nn.functional.normalize(torch.randn(1, 3, 600, generator=generator), dim=1)
     points, distance = 10 * torch.randn(1, 3, 600, generator=generator), torch.zeros(1, 1, 600)

@@ -16,7 +16,7 @@ def state() -> State:
     return State(0, np.eye(4), three, three, three, three, np.eye(15), np.eye(3))
 
 
-def test_the_lstms_predict_and_learn_how_sure_they_are(weights):
+def test_lstm_covariance_follows_prediction_errors(weights):
     lstm = LstmInitialPose(LstmSettings(str(weights())))
     first = lstm.predict(frame(1), state())
     assert first.from_imu
@@ -29,13 +29,13 @@ def test_the_lstms_predict_and_learn_how_sure_they_are(weights):
     assert sigmas[4] < 0.01
 
 
-def test_without_samples_the_lstms_say_that_they_do_not_know(weights):
+def test_without_samples_the_prediction_is_marked_as_failed(weights):
     found = LstmInitialPose(LstmSettings(str(weights()))).predict(frame(1, imu=False), state())
     assert not found.ok
     assert found.covariance[3, 3] > 1.0
 
 
-def test_a_velocity_conditioned_lstm_goes_on_at_the_last_steps_velocity(weights):
+def test_a_velocity_conditioned_lstm_continues_at_the_last_velocity(weights):
     lstm = LstmInitialPose(LstmSettings(str(weights(velocity=True))))
     still = lstm.predict(frame(1), state()).pose
     lstm.correct(frame(1), RelativePose(se3.exp([0, 0, 0, 1.0, 0, 0]), WIDE, source="truth"))

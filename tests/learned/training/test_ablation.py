@@ -19,7 +19,7 @@ from hybridlio.learned.training.train import RunOptions
 CPU = RunOptions(device="cpu")
 
 
-def test_driving_tells_the_network_the_velocity_it_found_itself(winding, tiny_recipe):
+def test_driving_feeds_back_the_estimated_velocity(winding, tiny_recipe):
     settings = replace(tiny_recipe.network, velocity=True, residual_scale=1e-6)
     torch.manual_seed(0)
     network = OdometryNetwork(settings)
@@ -48,7 +48,7 @@ def test_drift_of_steps_that_are_one_percent_long_is_one_percent():
     assert drift_of(poses, np.full_like(reference, np.nan)) is None
 
 
-def test_rows_share_a_budget_and_are_not_done_again(rooms, tiny_recipe, tmp_path):
+def test_rows_share_a_budget_and_finished_rows_are_reused(rooms, tiny_recipe, tmp_path):
     rows = [
         replace(tiny_recipe, name="one"),
         replace(tiny_recipe, name="two", loss=replace(tiny_recipe.loss, lambda_=0)),
@@ -74,7 +74,7 @@ def test_rows_share_a_budget_and_are_not_done_again(rooms, tiny_recipe, tmp_path
         run_rows([rows[0], rows[0]], data, tmp_path, 6, CPU)
 
 
-def test_an_interrupted_row_goes_on_where_it_stopped(rooms, tiny_recipe, tmp_path):
+def test_an_interrupted_row_resumes_from_its_checkpoint(rooms, tiny_recipe, tmp_path):
     def stop(_, done):
         if done.step == 3:
             raise KeyboardInterrupt

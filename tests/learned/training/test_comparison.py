@@ -39,7 +39,7 @@ def test_on_other_recordings_published_averages_stand_beside_and_their_sequences
     assert figures["09"] == "2.24 / 1.13"
 
 
-def test_a_row_that_failed_says_why_and_keeps_its_published_figures():
+def test_a_failed_row_shows_the_reason_and_its_published_figures():
     lines = [line(ON_OTHERS), line(None, "noimu", "no-imu", error="training diverged at step 3")]
     text = to_markdown(2, lines, "9 steps a row")
     assert "* noimu: training diverged at step 3" in text

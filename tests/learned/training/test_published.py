@@ -31,7 +31,7 @@ def test_averages_over_the_test_sequences_are_those_of_the_sequences(number):
             assert figures["test"] == pytest.approx((figures["09"] + figures["10"]) / 2, abs=0.02)
 
 
-def test_the_file_says_where_its_figures_come_from(project_root):
+def test_the_file_cites_its_sources(project_root):
     text = (project_root / "learned" / "training" / "published.csv").read_text()
     assert "UnDeepLIO" in text.splitlines()[0]
     assert len(list(csv.reader(text.splitlines()[1:]))) == 1 + 2 * sum(len(published(n)) for n in range(1, 6))

@@ -62,7 +62,7 @@ def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit(rooms, tiny_recipe, 
         assert torch.equal(a, b)
 
 
-def test_given_initial_poses_are_shaken_alike_after_resuming(rooms, tiny_recipe, tmp_path):
+def test_given_initial_poses_get_the_same_perturbation_after_resuming(rooms, tiny_recipe, tmp_path):
     recipe = with_optimiser(
         replace(tiny_recipe, network=replace(tiny_recipe.network, imu="given")), initial_noise_m=0.1, epochs=2
     )
@@ -167,7 +167,7 @@ def test_training_starts_from_given_weights(rooms, tiny_recipe, tmp_path):
         assert torch.allclose(a, b, atol=1e-6)
 
 
-def test_progress_tells_rate_and_remaining_time(rooms, tiny_recipe, tmp_path):
+def test_progress_reports_rate_and_remaining_time(rooms, tiny_recipe, tmp_path):
     seen = []
     train(tiny_recipe, Pairs(rooms[:1], tiny_recipe.network), tmp_path, options=CPU, watchers=Watchers(seen.append))
     assert [p.step for p in seen] == list(range(1, 13))
@@ -192,7 +192,7 @@ def test_every_pair_comes_once_an_epoch_in_another_order():
     assert first == epoch_order(settings, 0, 10)
 
 
-def test_what_is_not_finite_is_null_in_the_log(tmp_path):
+def test_non_finite_values_are_null_in_the_log(tmp_path):
     log = TrainingLog(tmp_path, 0)
     log.write(1, loss=float("nan"), po2pl_m=None)
     log.close()
