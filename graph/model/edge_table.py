@@ -58,6 +58,7 @@ class EdgeTable:
     """
 
     def __init__(self, dimension: co.Dimension) -> None:
+        self._dimension = dimension
         size = co.TANGENT_SIZE[dimension]
         self._columns = {
             "id": GrowingArray((), np.int64),
@@ -144,7 +145,7 @@ class EdgeTable:
 
     def where(self, keep: Mask | slice) -> EdgeTable:
         """Return a copy of some rows."""
-        copy = EdgeTable.__new__(EdgeTable)
+        copy = EdgeTable(self._dimension)
         copy._columns = {name: column.where(keep) for name, column in self._columns.items()}
         kept = self.robust.keys() & copy.ids.tolist() if self.robust else ()
         copy.robust = {factor_id: self.robust[factor_id] for factor_id in kept}

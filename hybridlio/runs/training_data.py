@@ -96,17 +96,18 @@ def prepare_shards(
     found = [item for path in paths for item in _find(Path(path), options)]
     recordings = [item for item in found if isinstance(item, Sequence)]
     total = sum(len(sequence) for sequence in recordings)
-    done, folders, waiting = 0, {}, []
-    for sequence in recordings:
-        folder = options.cache / shard_name(sequence, recipe, options.initial_pose)
-        folders[id(sequence)] = folder
+    names = [shard_name(sequence, recipe, options.initial_pose) for sequence in recordings]
+    folders = [options.cache / name for name in names]
+    done, waiting = 0, []
+    for sequence, folder in zip(recordings, folders, strict=True):
         report = _report(progress, sequence.name, done, total)
         if not _prepare_once(sequence, folder, recipe, options, report, wait=False):
-            waiting.append(sequence)  # another process is preparing it
+            waiting.append((sequence, folder))  # another process is preparing it
         done += len(sequence)
-    for sequence in waiting:
-        _prepare_once(sequence, folders[id(sequence)], recipe, options, _ignore, wait=True)
-    return [item if isinstance(item, Shard) else Shard(folders[id(item)]) for item in found]
+    for sequence, folder in waiting:
+        _prepare_once(sequence, folder, recipe, options, _ignore, wait=True)
+    prepared = iter(folders)  # in the order of the recordings among what was found
+    return [item if isinstance(item, Shard) else Shard(next(prepared)) for item in found]
 
 
 def training_pairs(

@@ -15,7 +15,7 @@ from hybridlio.core.errors import DataError
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.points.fields import Columns
 
-_COUNTS = range(3, 8)
+_COUNTS = range(3, 8)  # x y z alone, up to x y z with intensity, ring, time and one more: what data sets publish
 _TYPES = ("<f8", "<f4")
 _NAMES = {"<f4": "float32", "<f8": "float64"}
 _VALUES_READ = 105_000  # of each scan: enough to tell columns apart, and a multiple of every number of columns

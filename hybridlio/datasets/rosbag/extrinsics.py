@@ -16,7 +16,7 @@ from hybridlio.datasets.rosbag.topics import TRANSFORM_TYPES, BagTopics
 from hybridlio.datasets.rosbag.transforms import FrameTree
 
 _MATRIX = "T_imu_lidar:\n  - [1, 0, 0, 0.1]\n  - [0, 1, 0, 0.0]\n  - [0, 0, 1, 0.3]\n  - [0, 0, 0, 1]"
-_FRAMES_LISTED = 12
+_FRAMES_LISTED = 12  # in an error: more frames no longer fit three lines of 80 columns
 
 
 @dataclass

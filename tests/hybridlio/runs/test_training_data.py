@@ -118,7 +118,7 @@ def test_concurrent_processes_prepare_a_shard_once(tiny_drive, tmp_path, project
     code = (
         "import sys; from pathlib import Path\n"
         "from hybridlio.learned.settings import NetworkSettings, Recipe\n"
-        "from hybridlio.cloud.projection import MAP_GEOMETRIES\n"
+        "from hybridlio.cloud.map_geometry import MAP_GEOMETRIES\n"
         "from hybridlio.runs.training_data import DataOptions, prepare_shards\n"
         "reports = []\n"
         "recipe = Recipe(network=NetworkSettings(geometry=MAP_GEOMETRIES['16-beam']))\n"
