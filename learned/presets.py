@@ -63,8 +63,8 @@ DEFAULT = Recipe(
         velocity_noise_m_s=0.1,
     ),
 )
-"""What ships: the LSTMs correct what velocity and mean angular velocity give, and a siamese encoder of both maps weighs
-the points of a registration between them, instead of the residual being read off pooled features.
+"""The shipped method: LSTMs correct a prediction from velocity and mean angular velocity, and a siamese encoder of both
+maps weighs the points of a registration between them; the paper regresses the residual from pooled features.
 
 Each departure from ``paper``, and what it is worth, is in docs/concepts/one_loss.md.
 """

@@ -37,7 +37,7 @@ class NetworkSettings:
         geometry: cells of the maps.
         imu_samples: S, the number of IMU rows between two scans.
         imu_hidden, imu_layers: size of the LSTMs; not in the paper.
-        velocity: the translation LSTM also sees the last velocity, and its output is added to the translation at that
+        velocity: the translation LSTM also takes the last velocity, and its output is added to the translation at that
             velocity; not in the paper.
         mean_rate: the output of the orientation LSTM is added to the rotation at the mean angular velocity; not in the
             paper.
@@ -57,13 +57,13 @@ class NetworkSettings:
         projective_steps: number of weighted point-to-plane registration steps between the maps before the residual
             network in each iteration (:mod:`hybridlio.learned.networks.projective_steps`); 0 in the paper.
         weight_channels: channels of the network that weights their points; 0 uses the robust kernel's weights only.
-        vertex_scale_m: vertices are divided by this, so that inputs are about 1; a lidar sees most points within 20 m.
+        vertex_scale_m: divisor of vertices, so that inputs are of order 1; most points of a scan are within 20 m.
         residual_scale: factor on the initial weights of the last layers, so that training starts near δT = 1.
         output_scale: factor on the outputs of the last layers. Adam moves every weight by about the learning rate,
             whatever the size of the outputs; this sets their size. 1 in the paper.
 
     Raises:
-        ConfigError: a value is out of range, or nothing would estimate the residual.
+        ConfigError: a value is out of range, or neither encoder nor steps estimate the residual.
     """
 
     imu: Literal["initial-pose", "feature", "none", "given"] = "initial-pose"
@@ -171,8 +171,8 @@ class OptimiserSettings:
 
     Attributes:
         epochs: passes over the data; not in the paper.
-        batch: pairs in a step, of all processes together.
-        learning_rate: at the start.
+        batch: pairs per step, over all processes.
+        learning_rate: initial learning rate.
         schedule: ``step`` multiplies the rate by ``step_factor`` every ``step_epochs``; ``cosine`` lets it fall to 0
             over all epochs.
         step_epochs, step_factor: of the step schedule.
@@ -228,7 +228,7 @@ class Recipe:
     """All settings of a training run.
 
     Attributes:
-        name: of the preset that it started from.
+        name: name of the preset it is based on.
         network, loss, optimiser: the settings.
     """
 

@@ -1,4 +1,4 @@
-"""Pairs varied for training: mirrored, run backwards, with perturbed starts, and with part of their points.
+"""Augmentation of training pairs: mirrored, reversed in time, with perturbed initial poses, with fewer points.
 
 Every draw depends on a seed and on the pair alone, so that it is the same in every process and after resuming. Not in
 the paper.
@@ -19,11 +19,11 @@ from hybridlio.learned.losses.correspondences import Clouds
 from hybridlio.learned.networks import torch_se3 as se3
 from hybridlio.learned.settings import OptimiserSettings
 
-_VARYING, _DRAWING = 1, 2  # streams of random numbers beside that of perturbations
+_VARYING, _DRAWING = 1, 2  # stream numbers of the random generators, next to that of perturbations; any distinct ones
 
 
 def training_batch(pairs: Pairs, indices: Sequence[int], settings: OptimiserSettings, seed: int) -> PairBatch:
-    """Return these pairs together, varied as the settings say."""
+    """Return a batch of these pairs, augmented by the settings."""
     draws = np.array([np.random.default_rng([seed, i, _VARYING]).random(2) for i in indices])
     backwards = [i for i, draw in zip(indices, draws, strict=True) if draw[1] < settings.swapped and pairs.swappable(i)]
     batch = mirrored(pairs.batch(indices, backwards), torch.from_numpy(draws[:, 0] < settings.mirrored))
@@ -43,7 +43,7 @@ def perturbed(batch: PairBatch, settings: OptimiserSettings, seed: int) -> PairB
 
 
 def mirrored(batch: PairBatch, rows: Tensor) -> PairBatch:
-    """Return the batch with the pairs of ``rows`` ``(B,)`` bool seen in a mirror that swaps left and right (y)."""
+    """Return the batch with the pairs of ``rows`` ``(B,)`` bool mirrored in y (left and right swapped)."""
     if not bool(rows.any()):
         return batch
     given = batch.network
@@ -74,7 +74,7 @@ def mirrored(batch: PairBatch, rows: Tensor) -> PairBatch:
 
 
 def _mirrored_poses(poses: Tensor, polar: Tensor) -> Tensor:
-    """``M T M`` for the mirror ``M`` with ``polar`` ``(B, 3)`` on its diagonal."""
+    """Return ``M T M`` for the mirror ``M`` with ``polar`` ``(B, 3)`` on its diagonal."""
     mirror = torch.cat([polar, torch.ones_like(polar[:, :1])], dim=1)
     return mirror[:, :, None] * poses * mirror[:, None, :]
 

@@ -93,18 +93,18 @@ class Pairs:
         return self.shards[number], k
 
     def swappable(self, index: int) -> bool:
-        """Return whether :meth:`batch` can run a pair backwards: the velocity after it is known."""
+        """Return whether :meth:`batch` can reverse a pair in time: the velocity after it is known."""
         shard, k = self.where(index)
         if k + 2 >= len(shard):
             return False
         return bool(shard.imu_there[k + 1]) and bool(np.isfinite(shard.velocity_m_s[k + 2]).all())
 
     def batch(self, indices: Sequence[int], backwards: Collection[int] = ()) -> PairBatch:
-        """Return these pairs together, clouds padded to the largest.
+        """Return a batch of pairs, with clouds padded to the largest.
 
         Args:
-            indices: of the pairs.
-            backwards: those of them that run backwards in time, from the current scan to the last one.
+            indices: indices of the pairs.
+            backwards: the indices of pairs to reverse in time, from the current scan to the last one.
         """
         steps = [(_backward_step if index in backwards else _forward_step)(*self.where(index)) for index in indices]
         given = NetworkInput(
@@ -126,7 +126,7 @@ class Pairs:
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """A pair as it lies in a shard, or its reverse: scan numbers and what belongs to the step between them."""
+    """A pair of a shard, or its reverse in time: scan numbers, and the data of the step between them."""
 
     shard: Shard
     last: int
@@ -178,5 +178,5 @@ def _check_fits(shard: Shard, settings: NetworkSettings) -> None:
         raise DataError(f"{shard.folder}: maps of {shard.info.geometry}, the network takes {settings.geometry}")
     if shard.info.imu_samples != settings.imu_samples:
         raise DataError(
-            f"{shard.folder}: {shard.info.imu_samples} inertial rows a pair, the network takes {settings.imu_samples}"
+            f"{shard.folder}: {shard.info.imu_samples} IMU rows a pair, the network takes {settings.imu_samples}"
         )

@@ -1,4 +1,4 @@
-"""From a recording to a shard. How a scan is prepared is an argument, so that this runs without heavy libraries.
+"""Conversion of a recording to a shard. Scan preparation is an argument, so that this needs no heavy libraries.
 
 ``prepare`` is :func:`hybridlio.cloud.preparation.prepare` with its options, or any callable whose result has maps and
 a cloud.
@@ -24,7 +24,7 @@ from hybridlio.learned.data.shards import ScanRecord, ShardInfo, write_shard
 from hybridlio.learned.settings import NetworkSettings
 
 StepOf = Callable[[Frame], NDArray[np.float64] | None]
-"""Returns a step ``T_k_k1`` ``(4, 4)`` that leads to a frame, or None where it is not known."""
+"""Returns a step ``T_k_k1`` ``(4, 4)`` that leads to a frame, or None if unknown."""
 
 
 class AveragedCloud(Protocol):
@@ -72,7 +72,7 @@ class KnownMotion:
         initial: returns the initial pose of a frame, for a network whose initial poses are given.
         step: returns the step to a frame as odometry found it. A pair whose previous step is not known has no last
             velocity, and a network that needs one does not train on it.
-        source: where these come from; kept in the shard's description.
+        source: origin of these; stored in the shard's description.
     """
 
     initial: StepOf | None = None
@@ -96,11 +96,11 @@ def prepare_shard(
 
     Args:
         sequence: the recording.
-        folder: of the shard.
+        folder: folder of the shard.
         prepare: prepares a scan, with the map geometry of ``network``.
         network: determines the map geometry and the number of IMU rows.
-        motion: initial poses and steps, where they are known.
-        progress: called with scans done and scans in all.
+        motion: initial poses and steps, if known.
+        progress: called with the number of scans done and the total.
 
     Raises:
         DataError: the recording has fewer than two scans.
@@ -139,7 +139,7 @@ def _records(
 
 
 def _scan_record(scan: Prepared | None, geometry: MapGeometry) -> ScanRecord:
-    """Return the part of a record that belongs to the scan alone; empty where the scan is not usable."""
+    """Return the part of a record that depends on the scan only; empty if the scan is not usable."""
     empty = np.zeros((0, 3), np.float32)
     if scan is None or not scan.usable:
         return ScanRecord(np.zeros((3, geometry.rows, geometry.columns), np.float32), empty, empty, usable=False)

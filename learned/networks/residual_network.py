@@ -38,7 +38,7 @@ class BasicBlock(nn.Module):
         self.first = CircularConv(inputs, outputs, 3, stride, bare)
         self.first_norm = _norm(outputs, settings)
         self.second = CircularConv(outputs, outputs, 3, (1, 1), bare)
-        if bare:  # a block starts as its shortcut, so that signals keep their size through all of them
+        if bare:  # a block starts as its shortcut, so that activations keep their scale without normalisation
             nn.init.zeros_(self.second.conv.weight)
         self.second_norm = _norm(outputs, settings)
         same = inputs == outputs and stride == (1, 1)
@@ -49,7 +49,7 @@ class BasicBlock(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """Maps to maps of ``outputs`` channels."""
+        """Return maps of ``outputs`` channels."""
         inner = torch.relu(self.first_norm(self.first(x)))
         return torch.relu(self.second_norm(self.second(inner)) + self.shortcut(x))
 
@@ -83,10 +83,10 @@ class Encoder(nn.Module):
 
 
 def sharing_convolutions(encoder: Encoder, settings: NetworkSettings) -> Encoder:
-    """Return an encoder with the convolutions and linear layers of ``encoder`` and normalisation layers of its own.
+    """Return an encoder that shares the convolutions and linear layers of ``encoder``, with separate normalisation.
 
-    Vertices and normals have other statistics, so that one batch normalisation for both would evaluate with a running
-    mixture that fits neither.
+    Vertices and normals differ in their statistics: a shared batch normalisation would evaluate with running means of
+    both, which fit neither.
     """
     other = Encoder(encoder.stem.conv.in_channels, settings)
     for name, module in encoder.named_modules():
@@ -111,7 +111,7 @@ class ResidualNetwork(nn.Module):
         more = settings.imu_hidden if settings.imu == "feature" else 0
         both = settings.features * (1 if settings.normals == "none" else 2)
         separate = settings.normals == "separate"
-        # one kind of IMU feature each where the branches are apart; both where they are not
+        # separate branches take one kind of IMU feature each; joined branches take both
         translation_size, rotation_size = (
             (settings.features + more, both + more) if separate else (both + 2 * more,) * 2
         )
@@ -126,7 +126,7 @@ class ResidualNetwork(nn.Module):
         current: tuple[Tensor, Tensor],
         imu_features: tuple[Tensor, Tensor] | None = None,
     ) -> Tensor:
-        """Residual poses ``δT`` ``(B, 4, 4)``.
+        """Return residual poses ``δT`` ``(B, 4, 4)``.
 
         Args:
             last: vertex and normal maps ``(B, 3, H, W)`` of the last scan.
@@ -159,10 +159,10 @@ class ResidualNetwork(nn.Module):
 
 
 def _distance(last: tuple[Tensor, Tensor], current: Tensor, gradient: bool) -> Tensor:
-    """Return how far points ``(B, 3, H, W)`` lie from the planes of their cells; 0 where a cell lacks either.
+    """Return how far points ``(B, 3, H, W)`` lie from the planes of their cells; 0 without point or plane.
 
-    The signed distance d is in units of 0.1 m and bent back to 0 by the Geman-McClure kernel, so that edges and moving
-    objects do not outweigh what is left of an initial pose's error. Shape ``(B, 1, H, W)``; with ``gradient``
+    The signed distance d is in units of 0.1 m and weighted by the Geman-McClure kernel, so that edges and moving
+    objects do not outweigh the remaining error of an initial pose. Shape ``(B, 1, H, W)``; with ``gradient``
     ``(B, 7, H, W)``: also d·n and d·(p × n), with p in units of 10 m, each axis times its gain.
     """
     vertices, normals = last

@@ -117,11 +117,11 @@ class NetworkResidual:
             raise DataError(
                 f"frame {frame.index}: only {self._last.cells} cells of the network's maps "
                 f"({self.geometry.rows} x {self.geometry.columns}) have a normal, {self._settings.min_cells} are "
-                "needed; start at another scan, or take weights that were trained for this lidar"
+                "needed; start at another scan, or choose weights trained for this lidar"
             )
 
     def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:
-        """Return the network's ``T = δT·T̂``, or the initial pose marked as not ok where that fails."""
+        """Return the network's ``T = δT·T̂``, or the initial pose marked as not ok on failure."""
         self._take(frame)
         return self.assess(frame, initial)
 
@@ -161,13 +161,13 @@ class NetworkResidual:
 
     @property
     def current_scan(self) -> _Seen | None:
-        """The last scan, as an argument for :meth:`pair`."""
+        """The last scan, for use as an argument of :meth:`pair`."""
         return self._last
 
     def pair(self, earlier: _Seen, current: _Seen, initial: RelativePose) -> RelativePose:
-        """Return a scan's pose relative to any earlier one, ``T_j_k``, by the points alone.
+        """Return a scan's pose relative to any earlier one, ``T_j_k``, from the points only.
 
-        Return ``initial``, marked as not ok, where that fails.
+        Return ``initial``, marked as not ok, on failure.
         """
         if not (earlier.enough and current.enough):
             return replace(initial, ok=False)

@@ -1,4 +1,4 @@
-"""Figures of the rows of a comparison."""
+"""Results of the rows of a comparison."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ Drift = tuple[float, float]
 
 @dataclass(frozen=True)
 class RowResult:
-    """Figures of a trained row.
+    """Results of a trained row.
 
     Attributes:
-        name: of its recipe.
+        name: name of its recipe.
         steps, pairs: training steps, and pairs in them.
         seconds: duration of the training.
         train, test: t_rel (percent) and r_rel (degrees per 100 m) by recording; None for a recording that is too short.
@@ -28,12 +28,12 @@ class RowResult:
 
     @property
     def train_average(self) -> Drift | None:
-        """Mean over the training recordings; None where all are too short."""
+        """Mean over the training recordings; None if all are too short."""
         return _average(self.train)
 
     @property
     def test_average(self) -> Drift | None:
-        """Mean over the test recordings; None where all are too short."""
+        """Mean over the test recordings; None if all are too short."""
         return _average(self.test)
 
 

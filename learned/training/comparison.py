@@ -1,6 +1,6 @@
 """A comparison in the form of the paper's tables: drift by recording, means over training and test recordings.
 
-Measured and published figures stand beside each other, and the published ones are marked.
+Measured and published figures are listed together; published ones are marked.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The batches of a training run, in their order, read one step ahead."""
+"""The batches of a training run in order, prefetched by one step."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Feed:
     """Selects the pairs of each step of a run, and this process's share of them.
 
     Attributes:
-        pairs: to train on.
+        pairs: training pairs.
         settings: batch size, seed, and how pairs are varied.
         rank, processes: this process's number and the number of all.
     """
@@ -55,6 +55,6 @@ class Feed:
             epoch, skip = epoch + 1, 0
 
     def _read(self, epoch: int, indices: list[int]) -> PairBatch:
-        # a share is never empty: where a short last batch has too few pairs, its first one is repeated
+        # a share is never empty: if a short last batch has too few pairs, its first pair is repeated
         mine = indices[self.rank :: self.processes] or indices[:1]
         return training_batch(self.pairs, mine, self.settings, seed=self.settings.seed * _EPOCHS_APART + epoch)

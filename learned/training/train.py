@@ -3,10 +3,9 @@
 The result does not depend on the number of processes beyond rounding, with one exception: batch normalisation on CPUs
 (see :meth:`hybridlio.learned.training.processes.Processes.joined`).
 
-Source: UnDeepLIO, "Implementation Details". The folder of a run has ``recipe.json``, ``log.jsonl``, ``checkpoint.pt``
-``best.safetensors`` where there is something to validate on,
-and after the last step ``weights.safetensors``. Given the same folder again, a run resumes exactly at its last
-checkpoint.
+Source: UnDeepLIO, "Implementation Details". The folder of a run has ``recipe.json``, ``log.jsonl``, ``checkpoint.pt``,
+``best.safetensors`` if there is validation data, and after the last step ``weights.safetensors``. A run started again
+in the same folder resumes exactly at its last checkpoint.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ class TrainingProgress:
         epoch: index of the epoch, from 0.
         loss: mean loss of the step's pairs.
         po2pl_m: mean distance to the matched planes, in metres.
-        learning_rate: of the step.
+        learning_rate: learning rate of the step.
         pairs_per_s: average since the run was started or resumed.
         remaining_s: time for the remaining steps at that rate.
     """
@@ -196,7 +195,7 @@ class _Run:
                 if self.options.max_seconds is not None and self._agreed(seconds > self.options.max_seconds):
                     break
         except KeyboardInterrupt:
-            if self._between_steps:  # else weights are half updated, and the last checkpoint is the good one
+            if self._between_steps:  # otherwise weights are half updated: keep the last checkpoint
                 self._save()
             raise
         self._save()
@@ -210,7 +209,7 @@ class _Run:
             group["lr"] = learning_rate(settings, self.step / self.steps_an_epoch)
         batch = batch.to(self.place.device)
         value: LossValue = self.objective(batch)
-        counted = self.place.rank < len(indices)  # else this share repeats a pair, see Feed
+        counted = self.place.rank < len(indices)  # otherwise this share repeats a pair, see Feed
         share = value.total.sum() / len(indices) * float(counted)
         self.optimiser.zero_grad(set_to_none=True)
         torch.autograd.backward(share * self.place.count)  # gradients are averaged over processes
@@ -281,5 +280,7 @@ def _checkpoint_in(out: Path, recipe: Recipe, pairs: int) -> Checkpoint | None:
     if found.data != pairs:
         differing.append(f"pairs: {found.data} → {pairs}")
     if differing:
-        raise ConfigError(f"{path}: of another run ({'; '.join(differing)}); choose another folder, or delete it")
+        raise ConfigError(
+            f"{path}: checkpoint of another run ({'; '.join(differing)}); choose another folder or delete it"
+        )
     return found

@@ -1,4 +1,4 @@
-"""A small room to train in: boxes seen from a moving sensor, as shards, so that tests need no simulator."""
+"""Small training shards of a box-shaped room seen by a moving sensor, so that tests need no simulator."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ RECIPE = Recipe(
 
 @pytest.fixture(autouse=True)
 def one_thread():
-    """Networks as small as these are slower on two threads, and other tests run beside."""
+    """Use one thread: small networks are slower on two, and tests run in parallel."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -67,7 +67,7 @@ def hit_walls(rays: np.ndarray, T_world_lidar: np.ndarray, half: np.ndarray) -> 
 
 
 def room_records(count: int, seed: int) -> list[ScanRecord]:
-    """Scans of a room on a winding way, with inertial rows that tell of each step."""
+    """Return scans of a room on a winding path, with IMU rows that match each step."""
     rng = np.random.default_rng(seed)
     half, T = rng.uniform([6, 5, 2], [9, 8, 3]), np.eye(4)
     records = []
@@ -97,7 +97,7 @@ def room_records(count: int, seed: int) -> list[ScanRecord]:
 
 @pytest.fixture(scope="session")
 def room_shards(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Two shards of a made-up room: 17 scans to train on, and 9 of another room."""
+    """Two shards of synthetic rooms: 17 training scans, and 9 scans of another room."""
     folder = tmp_path_factory.mktemp("rooms")
     write_shard(folder / "one", room_records(17, 1), "room one", GEOMETRY, 15)
     write_shard(folder / "two", room_records(9, 2), "room two", GEOMETRY, 15)
@@ -112,7 +112,7 @@ def rooms(room_shards: tuple[Path, Path]) -> tuple[Shard, Shard]:
 
 @pytest.fixture
 def winding(tmp_path: Path) -> Shard:
-    """A drive of 12 scans without gaps, with a velocity at each but the first; its steps are made up."""
+    """A drive of 12 scans without gaps, with a velocity at each but the first; its steps are synthetic."""
     rng = np.random.default_rng(5)
     records = []
     for k, record in enumerate(room_records(12, 3)):
@@ -126,7 +126,7 @@ def winding(tmp_path: Path) -> Shard:
 
 @dataclass(frozen=True, eq=False)
 class ScanMaps:
-    """A scan that is prepared already."""
+    """A prepared scan."""
 
     points: np.ndarray
     vertex_map: np.ndarray = field(init=False)
@@ -153,7 +153,7 @@ def seen() -> Callable[..., ScanMaps]:
 
 @pytest.fixture
 def seeing_recipe() -> Recipe:
-    """The tiny recipe for maps of the cells that ``seen`` gives."""
+    """The tiny recipe with the map geometry of ``seen``."""
     return replace(RECIPE, network=replace(NETWORK, geometry=SEEN_GEOMETRY))
 
 

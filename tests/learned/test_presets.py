@@ -37,7 +37,7 @@ def test_rows_carry_the_names_of_the_published_figures():
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_recipes_survive_the_way_through_json(name):
+def test_recipes_round_trip_through_json(name):
     recipe = preset(name)
     assert from_dict(Recipe, json.loads(json.dumps(to_dict(recipe)))) == recipe
     assert recipe.name == name
@@ -56,7 +56,7 @@ def test_the_splits_are_the_papers_and_leave_03_out_where_the_imu_is_used():
         split("medium", PAPER.network)
 
 
-def test_unknown_names_list_what_there_is():
+def test_unknown_names_list_the_presets():
     with pytest.raises(ConfigError, match="nubert"):
         preset("newbert")
     with pytest.raises(ConfigError, match="1, 2, 3, 4, 5"):
@@ -77,7 +77,7 @@ def test_unknown_names_list_what_there_is():
         ({"network": {"geometry": {"rows": 1}}}, "geometry"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused_by_name(values, what):
+def test_invalid_settings_are_refused_by_name(values, what):
     with pytest.raises(ConfigError, match=what):
         from_dict(Recipe, values)
 

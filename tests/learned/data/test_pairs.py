@@ -105,7 +105,7 @@ def test_shards_of_other_cells_or_rows_are_refused(tmp_path):
     shard = shard_of(tmp_path, [record(k) for k in range(2)])
     with pytest.raises(DataError, match="52"):
         Pairs([shard], NetworkSettings())
-    with pytest.raises(DataError, match="15 inertial rows"):
+    with pytest.raises(DataError, match="15 IMU rows"):
         Pairs([shard], replace(SETTINGS, imu_samples=10))
 
 

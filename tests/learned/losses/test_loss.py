@@ -91,7 +91,7 @@ def test_both_terms_are_weighed_and_the_mean_is_the_sum_by_count():
     assert torch.allclose(mean, whole / 400)
 
 
-def test_robust_kernels_are_near_zero_as_squares_and_far_away_as_they_are_known():
+def test_robust_kernels_are_quadratic_near_zero_and_have_their_known_limits():
     n = torch.tensor([[[1.0, 0.0, 0.0]]], dtype=torch.float64)
     zero, one = torch.zeros_like(n), torch.ones(1, 1, dtype=torch.float64)
     matches = Matches(zero, n, zero, n, one, torch.ones(1))
@@ -190,7 +190,7 @@ def test_without_targets_nothing_is_near():
     assert torch.isinf(distance).all()
 
 
-def test_padding_and_points_without_normals_count_for_nothing():
+def test_padding_and_points_without_normals_have_zero_weight():
     cloud = room()
     T = pose(*SHIFT)
     whole = losses.loss(match_nearest(T, cloud, cloud), T, LossSettings())

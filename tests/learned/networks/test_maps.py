@@ -18,7 +18,7 @@ def clouds(count: int = 6000, batch: int = 2, seed: int = 0) -> np.ndarray:
 
 
 def differing(ours: torch.Tensor, theirs: list[np.ndarray]) -> float:
-    """Share of cells that do not hold the same, to float32's digits."""
+    """Return the share of cells that differ by more than float32 rounding."""
     apart = ~np.isclose(ours.detach().numpy(), np.stack(theirs), atol=2e-4).all(axis=1)
     return float(apart.mean())
 
@@ -27,12 +27,12 @@ def differing(ours: torch.Tensor, theirs: list[np.ndarray]) -> float:
 def test_vertex_maps_have_the_cells_of_the_numpy_leaf(geometry):
     points = clouds()
     ours = maps.vertex_map(torch.tensor(points), geometry)
-    # the last digit of an arc sine may push a point over a border: one cell in some ten thousand
+    # rounding of an arc sine may move a point across a border: about one cell in ten thousand
     assert differing(ours, [projection.vertex_map(cloud, geometry) for cloud in points]) < 2e-4
     assert maps.valid_cells(ours).float().mean() > 0.05
 
 
-def test_points_that_belong_nowhere_fall_into_no_cell():
+def test_invalid_points_fall_into_no_cell():
     points = torch.tensor([[[0, 0, 0], [np.nan, 1, 1], [np.inf, 0, 0], [0, 0, 50], [10, 0, 0]]], dtype=torch.float32)
     chosen = maps.winners(points, SMALL)
     assert chosen[chosen >= 0].tolist() == [4]
@@ -79,7 +79,7 @@ def test_moving_by_the_identity_leaves_a_map_as_it_is():
     assert torch.equal(moved, vertices)
 
 
-def test_the_gradient_of_a_moved_map_is_that_of_the_points_it_shows():
+def test_the_gradient_of_a_moved_map_is_that_of_its_points():
     vertices = box_maps(1)
     t = torch.tensor([[0.3, -0.1, 0.05]], requires_grad=True)
     T = se3.make(torch.eye(3)[None], t)

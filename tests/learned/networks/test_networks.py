@@ -97,7 +97,7 @@ def test_translation_depends_on_acceleration_alone_and_rotation_on_angular_veloc
     assert not torch.allclose(T[:, :3, 3], by_accel[:, :3, 3])
 
 
-def test_a_velocity_moves_the_initial_pose_by_as_much_as_it_gives_in_the_time():
+def test_a_velocity_translates_the_initial_pose_by_velocity_times_duration():
     net = ImuNetwork(replace(TINY, velocity=True, siamese="twins"))
     torch.nn.init.zeros_(net.translation.weight)
     torch.nn.init.zeros_(net.translation.bias)
@@ -105,7 +105,7 @@ def test_a_velocity_moves_the_initial_pose_by_as_much_as_it_gives_in_the_time():
     assert torch.allclose(net(x.imu, x.velocity_m_s, x.dt_s)[:, :3, 3], 0.1 * x.velocity_m_s)
 
 
-def test_a_constant_rate_turns_the_initial_pose_by_as_much_as_it_gives_in_the_time():
+def test_a_constant_rate_rotates_the_initial_pose_by_rate_times_duration():
     net = ImuNetwork(replace(TINY, mean_rate=True, rotation="log"))
     torch.nn.init.zeros_(net.rotation.weight)
     rate, dt = torch.tensor([[0.1, -0.2, 0.5], [0.0, 0.0, -0.3]]), torch.tensor([0.1, 0.2])
@@ -138,7 +138,7 @@ def test_evaluation_gives_the_features_of_training(siamese, normalisation):
     net, x = network(siamese=siamese, normalisation=normalisation, vertex_scale_m=1.0), given(batch=8)
     residual = net.residual_network
     with torch.no_grad():
-        for _ in range(60):  # running statistics forget their start by a tenth each time
+        for _ in range(60):  # running statistics decay by a tenth each time
             trained = _branch_features(residual, net, x)
         evaluated = _branch_features(residual.eval(), net, x)
     for a, b in zip(trained, evaluated, strict=True):
@@ -155,7 +155,7 @@ def test_initial_poses_start_near_the_identity():
     x = given(batch=8)
     for siamese in ("shared", "twins"):
         moved = se3.log(network(siamese=siamese).imu_network(x.imu))
-        assert moved.norm(dim=1).median() < 0.05  # 0.3 where the last layers start as any other
+        assert moved.norm(dim=1).median() < 0.05  # 0.3 with default initialisation of the last layers
 
 
 def test_features_do_not_depend_on_where_the_map_is_cut():
@@ -165,7 +165,7 @@ def test_features_do_not_depend_on_where_the_map_is_cut():
     assert torch.allclose(encoder(x), encoder(x.roll(8, dims=-1)), atol=1e-5)
 
 
-def test_a_convolution_looks_over_the_edge_of_the_columns_but_not_of_the_rows():
+def test_convolutions_wrap_around_columns_but_not_rows():
     conv, x = CircularConv(1, 1, 3, (1, 1)), torch.zeros(1, 1, 5, 6)
     torch.nn.init.ones_(conv.conv.weight)
     x[0, 0, 0, 0] = 1.0

@@ -25,7 +25,7 @@ def test_saved_weights_give_the_same_network_again(rooms, tiny_recipe, tmp_path,
     recipe = replace(tiny_recipe, network=replace(tiny_recipe.network, siamese=siamese, normalisation="batch"))
     network = OdometryNetwork(recipe.network)
     given = Pairs(rooms[:1], recipe.network).batch([0, 1]).network
-    network(given)  # moves the statistics of batches
+    network(given)  # updates running batch statistics
     network.eval()
     save_weights(tmp_path / "w.safetensors", network, recipe, {"data": "room one"})
     found = load_weights(tmp_path / "w.safetensors")

@@ -53,12 +53,12 @@ def test_along_a_corridor_the_covariance_is_large_and_the_direction_listed_as_de
     in_corridor = STEP[:3, :3] @ found.covariance[3:, 3:] @ STEP[:3, :3].T
     sigmas = np.sqrt(np.diag(in_corridor))
     assert sigmas[0] > 100 * sigmas[1]
-    # nor does the refinement go astray in it
+    # refinement does not diverge along it either
     assert abs(se3.log(se3.between(STEP, found.pose))[3]) < 0.1
 
 
 def answering(residual, pose, monkeypatch):
-    """The network's answer from now on."""
+    """Replace the network's answer."""
     answer = type("Answer", (), {"pose": torch.tensor(pose, dtype=torch.float32)[None]})
     monkeypatch.setattr(residual._network, "refine_encoded", lambda *_: answer)
 
@@ -137,9 +137,9 @@ def test_after_a_long_correction_the_network_runs_again(weights, seen, monkeypat
 def test_imu_features_are_computed_once_a_scan_with_the_velocity_before_it(weights, seen, monkeypatch):
     scans = [seen(np.linalg.matrix_power(STEP, k), seed=k) for k in range(3)]
     residual = source(weights(imu="feature", velocity=True), scans, replace(FEW, refine_steps=0))
-    told, velocities = [], []
+    features_seen, velocities = [], []
     answer = type("Answer", (), {"pose": torch.tensor(STEP, dtype=torch.float32)[None]})
-    monkeypatch.setattr(residual._network, "refine_encoded", lambda *given: (told.append(given[3]), answer)[1])
+    monkeypatch.setattr(residual._network, "refine_encoded", lambda *given: (features_seen.append(given[3]), answer)[1])
     features = residual._network.imu_network.features
     monkeypatch.setattr(
         residual._network.imu_network,
@@ -150,8 +150,8 @@ def test_imu_features_are_computed_once_a_scan_with_the_velocity_before_it(weigh
     for k in (1, 2):
         residual.propose(frame(k), far)
         residual.assess(frame(k), far)
-    assert len(told) == 8  # twice each time, for the way is long
-    assert len({id(features) for features in told}) == len(velocities) == 2
+    assert len(features_seen) == 8  # two runs a step, because the correction is long
+    assert len({id(features) for features in features_seen}) == len(velocities) == 2
     assert np.allclose(velocities, [np.zeros(3), STEP[:3, :3].T @ STEP[:3, 3] / 0.1], atol=1e-5)
 
 
@@ -202,7 +202,7 @@ def test_every_variant_of_the_network_refines_a_given_initial_pose(weights, seen
     scans = [seen(np.eye(4), seed=0), seen(STEP, seed=1)]
     found = source(weights(**changes), scans, replace(FEW, refine_steps=8)).refine(frame(1), initial(OFF))
     assert found.ok
-    assert not found.from_imu  # weighed by the points, it may stand in a graph beside the samples
+    assert not found.from_imu  # its covariance is from the points only, so a graph may use it with the IMU
 
 
 def test_scans_several_steps_apart_are_registered_by_their_points_alone(weights, seen):

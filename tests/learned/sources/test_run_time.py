@@ -18,7 +18,7 @@ from hybridlio.runs.run import run_odometry
 GEOMETRY = MapGeometry(16.0, -16.0, 16, 180)
 
 
-def test_both_run_in_the_odometry_as_objects_of_ones_own(weights, tiny_drive):
+def test_both_run_in_the_odometry_as_user_supplied_objects(weights, tiny_drive):
     path = str(weights(geometry=GEOMETRY))
 
     def prepare_for(recipe):
@@ -35,12 +35,12 @@ def test_both_run_in_the_odometry_as_objects_of_ones_own(weights, tiny_drive):
     untrained, found = steps.values()
     assert [step.source for step in untrained] == ["network" if step.ok else "lstm" for step in untrained]
     assert [step.source for step in found] == ["network"] * 7
-    # what the network has not learned, steps down the loss make up for; the drive starts at 10 m/s
+    # Gauss-Newton steps on the loss replace the untrained network; the drive starts at 10 m/s
     errors = [np.linalg.norm((step.pose - T)[:3, 3]) for step, T in zip(found, true, strict=True)]
     assert max(errors) < 0.1
 
 
-def test_a_pair_on_which_the_network_fails_is_listed_and_weighs_nothing(weights, tiny_drive, monkeypatch, caplog):
+def test_a_pair_on_which_the_network_fails_is_listed_and_gets_no_weight(weights, tiny_drive, monkeypatch, caplog):
     path = str(weights(geometry=GEOMETRY, projective_steps=3))
     options = PreparationOptions(geometry=GEOMETRY, loss_points=2000, threads=1)
     residual = NetworkResidual(lambda _: partial(prepare, options=options), replace(FEW, weights=path, refine_steps=0))

@@ -1,4 +1,4 @@
-"""Tables in the paper's form: every figure where it belongs, and what is published marked as such."""
+"""Tables in the paper's form: every figure is in its cell, and published ones are marked."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ def test_on_kitti_measured_and_published_rows_stand_under_the_same_sequences():
     assert beside["test avg"] == "2.03 / 1.14"
 
 
-def test_on_other_recordings_published_averages_stand_beside_and_their_sequences_in_a_table_of_their_own():
+def test_on_other_recordings_published_averages_are_listed_and_sequences_get_a_separate_table():
     found = tables([line(ON_OTHERS)])
     (measured,), (figures,) = found["measured"], found["published, KITTI odometry"]
     assert measured["town"] == "2.00 / 1.00"
@@ -53,6 +53,6 @@ def test_the_files_hold_every_figure(result):
     for rows in tables(lines).values():
         for row in rows:
             assert f"| {' | '.join(row.values())} |" in to_markdown(2, lines, "")
-    (said,) = to_json_dict(2, lines, "9 steps")["lines"]
-    assert said["result"]["test"] == dict(result.test)
-    assert said["published"]["t_rel_percent"]["test"] == 2.03
+    (entry,) = to_json_dict(2, lines, "9 steps")["lines"]
+    assert entry["result"]["test"] == dict(result.test)
+    assert entry["published"]["t_rel_percent"]["test"] == 2.03

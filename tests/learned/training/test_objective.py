@@ -17,7 +17,7 @@ L1 = LossSettings(kernel_m=0.03, reduction="mean", max_distance_m=1.0)
 
 @pytest.fixture
 def pairs(rooms, tiny_recipe):
-    """Eight pairs of scans of a room, with what a network of the tiny recipe takes."""
+    """Eight pairs of scans of a room, with the inputs of the tiny recipe's network."""
     return Pairs(rooms[:1], tiny_recipe.network).batch(range(8))
 
 
@@ -38,7 +38,7 @@ def test_gauss_newton_steps_down_the_loss_lead_to_the_truth(pairs, tiny_recipe):
     assert errors[2] < 0.02
 
 
-def test_one_pose_costs_the_same_however_its_matches_are_looked_for(pairs, tiny_recipe):
+def test_the_loss_of_one_pose_does_not_depend_on_where_matches_are_searched(pairs, tiny_recipe):
     pose = off(pairs, [0.0, 0.0, 0.01, 0.05, 0.0, 0.0])
     output = NetworkOutput(pose, (pose,))
     each, answer = (
@@ -50,7 +50,7 @@ def test_one_pose_costs_the_same_however_its_matches_are_looked_for(pairs, tiny_
     assert torch.allclose(with_initial.total, 1.5 * each.total)
 
 
-def test_a_target_adds_the_distance_to_where_the_loss_leads(pairs, tiny_recipe):
+def test_a_target_adds_the_distance_to_the_pose_after_descent(pairs, tiny_recipe):
     pose = off(pairs, [0.0, 0.0, 0.0, 0.05, 0.0, 0.0])
     settings, geometry = replace(L1, target_weight=1.0), tiny_recipe.network.geometry
     target = descended(pose, clouds_for(pairs, L1), settings, geometry)

@@ -23,7 +23,7 @@ def test_every_row_of_a_comparison_has_published_figures(number):
 
 @pytest.mark.parametrize("number", range(1, 6))
 def test_averages_over_the_test_sequences_are_those_of_the_sequences(number):
-    """Where a table's test sequences are 09 and 10, their mean is the printed average, but for rounding."""
+    """If a table's test sequences are 09 and 10, their mean equals the printed average up to rounding."""
     for row in published(number):
         if row.method.startswith(("LOAM", "LeGO", "Self", "Ours-hard")):
             continue

@@ -54,7 +54,7 @@ def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit(rooms, tiny_recipe, 
     train(tiny_recipe, pairs, tmp_path / "parts", options=replace(CPU, max_steps=5))
     assert len(losses(tmp_path / "parts")) == 5
     with (tmp_path / "parts" / "log.jsonl").open("a") as log:
-        log.write('{"step": 6, "loss": 99.0}\n{"step": 7, "lo')  # what a killed run may leave
+        log.write('{"step": 6, "loss": 99.0}\n{"step": 7, "lo')  # as a killed run may leave it
     resumed = train(tiny_recipe, pairs, tmp_path / "parts", options=CPU)
     assert losses(tmp_path / "parts") == losses(tmp_path / "whole")
     assert len(losses(tmp_path / "whole")) == 12
@@ -74,7 +74,7 @@ def test_given_initial_poses_get_the_same_perturbation_after_resuming(rooms, tin
 
 
 def test_two_processes_agree_with_one_on_the_same_batches(rooms, room_shards, tiny_recipe, tmp_path, project_root):
-    # 15 pairs in batches of 4: the last batch has 3, shared unevenly; the LSTMs are beyond this loss's reach
+    # 15 pairs in batches of 4: the last batch has 3, shared unevenly; this loss gives the LSTMs no gradient
     tiny_recipe = replace(tiny_recipe, network=replace(tiny_recipe.network, projective_steps=1))
     train(tiny_recipe, Pairs(rooms[:1], tiny_recipe.network), tmp_path / "one", options=CPU)
     script = tmp_path / "run.py"
@@ -200,13 +200,13 @@ def test_non_finite_values_are_null_in_the_log(tmp_path):
 
 
 def test_progress_counts_to_where_the_run_ends_not_its_schedule(rooms, tiny_recipe, tmp_path):
-    told = []
+    reports = []
     train(
         tiny_recipe,
         Pairs(rooms[:1], tiny_recipe.network),
         tmp_path,
         options=replace(CPU, max_steps=2),
-        watchers=Watchers(told.append),
+        watchers=Watchers(reports.append),
     )
-    assert [(p.step, p.steps) for p in told] == [(1, 2), (2, 2)]
-    assert told[-1].remaining_s == 0
+    assert [(p.step, p.steps) for p in reports] == [(1, 2), (2, 2)]
+    assert reports[-1].remaining_s == 0
