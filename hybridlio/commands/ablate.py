@@ -15,7 +15,7 @@ from hybridlio.commands.common import INTERRUPTED, guarded
 from hybridlio.commands.terminal import print_message, print_result, print_table
 from hybridlio.commands.train import Device, Recordings, first_process_progress, is_first_process
 from hybridlio.core.errors import ConfigError, HybridLioError
-from hybridlio.datasets.rosbag.topics import NO_CHOICE, BagTopics
+from hybridlio.datasets.rosbag.choices import NO_CHOICE, BagTopics
 
 if TYPE_CHECKING:
     from rich.table import Table

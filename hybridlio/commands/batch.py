@@ -10,7 +10,7 @@ import typer
 from hybridlio.commands import common
 from hybridlio.commands.common import guarded
 from hybridlio.commands.terminal import print_message, print_result, print_table, progress
-from hybridlio.datasets.rosbag.topics import NO_CHOICE, BagTopics
+from hybridlio.datasets.rosbag.choices import NO_CHOICE, BagTopics
 from hybridlio.runs.engines import LOCAL
 
 if TYPE_CHECKING:

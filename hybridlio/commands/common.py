@@ -16,7 +16,7 @@ import typer
 
 from hybridlio.commands.terminal import print_message, set_up_logging
 from hybridlio.core.errors import ConfigError, DataError, HybridLioError
-from hybridlio.datasets.rosbag.topics import BagTopics, option_of
+from hybridlio.datasets.rosbag.choices import BagTopics, option_of
 from hybridlio.odometry.registry import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
 
 if TYPE_CHECKING:

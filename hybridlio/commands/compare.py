@@ -12,7 +12,7 @@ from hybridlio.commands.common import guarded
 from hybridlio.commands.terminal import print_message, print_result, print_table, progress
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.tables import counted
-from hybridlio.datasets.rosbag.topics import NO_CHOICE, BagTopics
+from hybridlio.datasets.rosbag.choices import NO_CHOICE, BagTopics
 from hybridlio.odometry.registry import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import typer
 from hybridlio.commands import common
 from hybridlio.commands.common import guarded
 from hybridlio.commands.terminal import print_result
-from hybridlio.datasets.rosbag.topics import NO_CHOICE, BagTopics
+from hybridlio.datasets.rosbag.choices import NO_CHOICE, BagTopics
 
 _WIDTH, _INDENT = 80, 14  # columns of a plain terminal, and of the labels
 

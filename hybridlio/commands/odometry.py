@@ -11,7 +11,7 @@ from hybridlio.commands import common
 from hybridlio.commands.common import PartialResultError, guarded
 from hybridlio.commands.terminal import print_message, print_result, print_table, print_warning, progress
 from hybridlio.core.tables import counted
-from hybridlio.datasets.rosbag.topics import NO_CHOICE, BagTopics
+from hybridlio.datasets.rosbag.choices import NO_CHOICE, BagTopics
 
 if TYPE_CHECKING:
     from hybridlio.evaluation.report_data import Findings

@@ -15,7 +15,7 @@ from hybridlio.commands.common import INTERRUPTED, guarded
 from hybridlio.commands.terminal import print_message, print_result, progress
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.progress import Progress
-from hybridlio.datasets.rosbag.topics import NO_CHOICE, BagTopics
+from hybridlio.datasets.rosbag.choices import NO_CHOICE, BagTopics
 from hybridlio.odometry.registry import INITIAL_POSE_SOURCES
 
 if TYPE_CHECKING:

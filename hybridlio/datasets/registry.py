@@ -19,7 +19,7 @@ from hybridlio.datasets.kitti import odometry, raw
 from hybridlio.datasets.kitti.vertical_angle import check_angle
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.rosbag import reader as rosbag
-from hybridlio.datasets.rosbag.topics import BagTopics
+from hybridlio.datasets.rosbag.choices import BagTopics
 from hybridlio.datasets.sequence import Sequence
 
 

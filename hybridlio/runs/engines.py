@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hybridlio.core.errors import ConfigError, MissingDependencyError
-from hybridlio.odometry.config import Config
+
+if TYPE_CHECKING:  # the command line imports this module for the name of an engine
+    from hybridlio.odometry.config import Config
 
 Task = tuple[Callable[..., Any], tuple[Any, ...]]
 
@@ -141,4 +143,4 @@ def with_thread_limit(config: Config, threads: int) -> Config:
             for key, value in tree.items()
         }
 
-    return Config.model_validate(limit(config.model_dump()))
+    return type(config).model_validate(limit(config.model_dump()))

@@ -15,7 +15,7 @@ from typing import Any
 from hybridlio.core.errors import ConfigError, DataError, HybridLioError
 from hybridlio.core.files import read_yaml, user_path
 from hybridlio.datasets.registry import check_options, open_sequence, sequence_names
-from hybridlio.datasets.rosbag.topics import NO_CHOICE, BagTopics
+from hybridlio.datasets.rosbag.choices import NO_CHOICE, BagTopics
 from hybridlio.datasets.sequence import Sequence, frame_range, part_of
 
 _YAML, _TEXT = (".yaml", ".yml"), (".txt", ".list")

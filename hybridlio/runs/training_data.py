@@ -28,7 +28,7 @@ from hybridlio.core.motion_limits import UNKNOWN_TRANSLATION_SIGMA_M
 from hybridlio.core.progress import Progress
 from hybridlio.core.sensors import Scan
 from hybridlio.datasets.registry import check_options, open_sequence, sequence_names
-from hybridlio.datasets.rosbag.topics import NO_CHOICE, BagTopics
+from hybridlio.datasets.rosbag.choices import NO_CHOICE, BagTopics
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.learned.data.pairs import Pairs
 from hybridlio.learned.data.preparing import KnownMotion, prepare_shard

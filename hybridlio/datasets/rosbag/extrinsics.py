@@ -12,7 +12,8 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import Calibration
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.rosbag.bag import Bag, Topic
-from hybridlio.datasets.rosbag.topics import TRANSFORM_TYPES, BagTopics
+from hybridlio.datasets.rosbag.choices import BagTopics
+from hybridlio.datasets.rosbag.topics import TRANSFORM_TYPES
 from hybridlio.datasets.rosbag.transforms import FrameTree
 
 _MATRIX = "T_imu_lidar:\n  - [1, 0, 0, 0.1]\n  - [0, 1, 0, 0.0]\n  - [0, 0, 1, 0.3]\n  - [0, 0, 0, 1]"

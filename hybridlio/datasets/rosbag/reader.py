@@ -19,10 +19,11 @@ from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.reference import poses_at
 from hybridlio.datasets.rosbag import measurements
 from hybridlio.datasets.rosbag.bag import METADATA, ROS_1, ROS_2_FILES, Bag, Topic, bag_files, part_number
+from hybridlio.datasets.rosbag.choices import BagTopics
 from hybridlio.datasets.rosbag.extrinsics import Mounting, calibration_file
 from hybridlio.datasets.rosbag.measurements import Log
 from hybridlio.datasets.rosbag.scans import BagScans
-from hybridlio.datasets.rosbag.topics import TRANSFORM_TYPES, BagTopics, choose
+from hybridlio.datasets.rosbag.topics import TRANSFORM_TYPES, choose
 from hybridlio.datasets.rosbag.transforms import FrameTree
 from hybridlio.datasets.rosbag.wire import Header, read_header, read_imu
 from hybridlio.datasets.sequence import Sequence

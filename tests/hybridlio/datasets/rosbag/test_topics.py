@@ -10,7 +10,7 @@ import pytest
 
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.datasets import open_sequence
-from hybridlio.datasets.rosbag.topics import BagTopics
+from hybridlio.datasets.rosbag.choices import BagTopics
 
 STAMP = 1_700_000_000_000_000_000
 
