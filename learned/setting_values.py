@@ -36,7 +36,7 @@ def from_dict(kind: type[_S], values: Mapping[str, Any], where: str = "settings"
         where: path of these values in their file, for messages.
 
     Raises:
-        ConfigError: a key is unknown or missing, or a value has the wrong type or is out of range; says where.
+        ConfigError: a key is unknown or missing, or a value has the wrong type or is out of range; names the key.
     """
     if not isinstance(values, Mapping):
         raise ConfigError(f"{where}: expected named values, got {type(values).__name__}")

@@ -121,7 +121,7 @@ class LossSettings:
 
     Attributes:
         alpha, lambda_: weights of the point-to-plane and of the plane-to-plane term.
-        product: ``dot`` for ``|n·d|``, or ``element-wise`` for ``Σᵢ|nᵢdᵢ|``, as the paper's text says.
+        product: ``dot`` for ``|n·d|``, or ``element-wise`` for ``Σᵢ|nᵢdᵢ|``, as in the paper's text.
         matching: ``nearest`` neighbour in the whole last cloud; ``nearest-projected``, among the points that the maps
             show; or ``same-pixel``.
         kernel: ``l1`` (the paper's), ``huber`` or ``geman-mcclure`` on the point-to-plane distance.

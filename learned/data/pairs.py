@@ -61,7 +61,7 @@ class Pairs:
         settings: of the network; pairs without the inputs that it needs are left out.
 
     Raises:
-        DataError: a shard does not fit the settings, or no pair is left; says which and why.
+        DataError: a shard does not fit the settings, or no pair is left; names the shard and the reason.
     """
 
     def __init__(self, shards: Sequence[Shard], settings: NetworkSettings) -> None:

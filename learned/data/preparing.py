@@ -91,7 +91,7 @@ def prepare_shard(
     """Prepare every scan of a recording and write the shard.
 
     A scan that cannot be read becomes a record that is not usable. The velocity at each scan is that of the step
-    before, as at run time: by ``motion.step`` where given, else by the reference where there is one, else by
+    before, as at run time: by ``motion.step`` if given, else by the reference if available, else by
     ``motion.initial``.
 
     Args:

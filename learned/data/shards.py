@@ -23,9 +23,9 @@ from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.files import write_atomically
 
-FORMAT = 1
+FORMAT = 1  # raise by 1 when the files of a shard change
 _STEP_M = 0.004  # a fifth of an HDL-64E's range noise; int16 then reaches 131 m, beyond the range limit of 120 m
-_LIMIT_M = 32767 * _STEP_M
+_LIMIT_M = 32767 * _STEP_M  # largest int16
 _STEPS = ("imu", "imu_there", "dt_s", "velocity_m_s", "initial", "reference", "usable")
 
 

@@ -14,7 +14,7 @@ from hybridlio.core.errors import ConfigError
 
 
 def pick_device(name: str = "auto") -> torch.device:
-    """Return a device by its PyTorch name; ``auto`` is a GPU where there is one, else the CPU.
+    """Return a device by its PyTorch name; ``auto`` is a GPU if available, else the CPU.
 
     Raises:
         ConfigError: this machine has no such device.
@@ -36,7 +36,7 @@ def on_device(values: NDArray[np.float32] | NDArray[np.float64], device: torch.d
 
 @contextmanager
 def at_run_time() -> Iterator[None]:
-    """Disable gradients and use one thread: for single scans a second one gains nothing, and waits on busy cores."""
+    """Disable gradients and use one thread: a second one does not speed up single scans and may wait for a core."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -4,7 +4,7 @@ The conventions are those of :mod:`hybridlio.core.se3`: a pose is ``(..., 4, 4)`
 rotation first, ``[ωx ωy ωz vx vy vz]``, perturbations are on the right, ``T·Exp(ξ)``.
 
 Euler angles are roll, pitch, yaw about the fixed x, y and z axis, in that order: ``R = Rz(yaw)·Ry(pitch)·Rx(roll)``.
-The paper says only "Euler angle"; at the small angles between two scans all orders nearly agree.
+The paper does not state an order of Euler angles; at the small angles between two scans all orders nearly agree.
 
 Formulas: Solà, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics" (2018).
 """

@@ -21,7 +21,7 @@ class PublishedRow:
     Attributes:
         method: name in the paper.
         t_rel_percent, r_rel_deg_per_100m: as printed, by KITTI sequence ``00`` to ``10``, and the means over training
-            (``train``) and test sequences (``test``); None where there is no figure.
+            (``train``) and test sequences (``test``); None if no figure is published.
     """
 
     method: str

@@ -74,7 +74,7 @@ class RunOptions:
     """Options of a run that do not change its steps.
 
     Attributes:
-        device: name of the device; None takes a GPU where there is one.
+        device: name of the device; None selects a GPU if available, else the CPU.
         checkpoint_every: steps between checkpoints; the end of each epoch has one, too.
         validate_every: epochs between validations.
         max_steps: end the run after this many steps in total.
