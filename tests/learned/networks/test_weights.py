@@ -91,6 +91,13 @@ def test_the_shipped_weights_load_and_are_small():
         shipped("nothing")
 
 
+def test_the_shipped_published_weights_have_no_registration_step():
+    network = load_weights(shipped("published")).recipe.network
+    assert network.projective_steps == 0
+    assert network.encoder
+    assert network.imu == "initial-pose"
+
+
 def test_weights_are_chosen_by_path_by_the_name_of_shipped_ones_or_as_shipped(tmp_path, monkeypatch):
     assert weights_path("shipped") == weights_path("default") == shipped()
     assert weights_path(tmp_path / "mine.safetensors") == tmp_path / "mine.safetensors"
