@@ -14,7 +14,6 @@ from hybridlio.graph.model.measurements import Kind, factor_label
 from hybridlio.graph.model.new_factors import check_direction, imu_factor, vector_factor
 from hybridlio.graph.model.noise import NoiseInput, RobustLike
 
-_UP = np.array([0.0, 0.0, 1.0])
 _STANDING_SIGMA_M_S = 0.01  # of a standing vehicle: it sways on its springs by millimetres in a second
 
 
@@ -72,7 +71,7 @@ class BodyMeasurements:
 
     def add_gravity(self, key: Key, accel_m_s2: ArrayLike, sigma_rad: float, robust: RobustLike = None) -> int:
         """Add roll and pitch from an accelerometer at rest or in steady motion, whose specific force points up."""
-        return self.add_attitude(key, _UP, accel_m_s2, sigma_rad, robust)
+        return self.add_attitude(key, co.UP, accel_m_s2, sigma_rad, robust)
 
     def add_velocity(self, key: Key, velocity_m_s: ArrayLike, sigmas: ArrayLike, robust: RobustLike = None) -> int:
         """Add the body's velocity ``(3,)`` in world."""

@@ -7,13 +7,13 @@ import numpy as np
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
+from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.connectivity import components, groups
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, list_keys
 from hybridlio.graph.model.measurements import OBSERVATIONS, Factor
 
 _MOTIONS = ("rotation about x", "rotation about y", "rotation about z", "x", "y", "z")
-_UP = np.array([0.0, 0.0, 1.0])
 # Numerical rank of the observed motions, relative to the largest singular value: far above double rounding (1e-16),
 # far below what two fixes a metre apart give in a map of 100 km.
 _RANK_TOLERANCE = 1e-6
@@ -100,7 +100,7 @@ def _motion_jacobian(factor: Factor) -> Array:
     if factor.kind == "velocity":
         return np.hstack([-se3.hat(z), no_shift])
     if factor.kind == "imu":  # gravity shows the vertical
-        return np.hstack([-se3.hat(_UP), no_shift])
+        return np.hstack([-se3.hat(co.UP), no_shift])
     return np.eye(6)
 
 

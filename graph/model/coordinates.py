@@ -21,6 +21,7 @@ Dimension: TypeAlias = Literal[2, 3]
 
 IDENTITY: dict[int, Array] = {2: np.zeros(3), 3: np.r_[np.zeros(6), 1.0]}
 TANGENT_SIZE: dict[int, int] = {2: 3, 3: 6}
+UP = np.array([0.0, 0.0, 1.0])  # in world, against gravity
 # Positions of our tangent components, rotation first, in GTSAM's tangent vectors (Pose2 has x, y, θ) and in the
 # information matrices of text formats (translation first).
 GTSAM_ORDER: dict[int, list[int]] = {2: [1, 2, 0], 3: [0, 1, 2, 3, 4, 5]}

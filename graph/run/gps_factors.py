@@ -28,12 +28,12 @@ from hybridlio.core.estimates import State
 from hybridlio.core.pose_interpolation import PosePath
 from hybridlio.core.sensors import NS_PER_S, GpsFix
 from hybridlio.graph.base import noise
+from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.run.factor_groups import GroupFactors, GroupSolution, PossibleOutlier
 from hybridlio.record.record import Record
 from hybridlio.smoothing.gps_alignment import LEVEL_SIGMA_RAD, FixAlignment, align_fixes, fix_stamps
 from hybridlio.smoothing.gps_options import GpsFit, GpsOptions
 
-_UP = np.array([0.0, 0.0, 1.0])
 # Gravity against the up of the fixes' frame: deflections of the vertical rarely exceed 3e-4 rad (60 arc seconds), and
 # the Earth's curvature turns it by 1.6e-4 rad a kilometre.
 _PLUMB_SIGMA_RAD = 5e-4
@@ -174,7 +174,7 @@ def _path_of(states: Sequence[State]) -> PosePath:
 def _up_of(state: State) -> tuple[Array, float]:
     """Return the direction up ``(3,)`` in the run's world, of any length, and its standard deviation in rad."""
     if not state.has_imu:
-        return _UP, LEVEL_SIGMA_RAD
+        return co.UP, LEVEL_SIGMA_RAD
     spread = float(np.sqrt(np.trace(state.gravity_covariance) / 3)) / float(np.linalg.norm(state.gravity_m_s2))
     return -state.gravity_m_s2, float(np.hypot(spread, _PLUMB_SIGMA_RAD))
 
@@ -196,7 +196,7 @@ def _plumb_factor(start: State) -> gtsam.NonlinearFactor:
     """The frame's up is opposite to gravity; without IMU, the lidar is assumed to start about level."""
     if not start.has_imu:
         model = noise.sigmas(np.full(2, LEVEL_SIGMA_RAD))
-        return gtsam.AttitudeFactorPose3(E(0), gtsam.Unit3(_UP), model, gtsam.Unit3(_UP))
+        return gtsam.AttitudeFactorPose3(E(0), gtsam.Unit3(co.UP), model, gtsam.Unit3(co.UP))
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         R = values.atPose3(E(0)).rotation().matrix()

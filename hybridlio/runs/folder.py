@@ -24,9 +24,10 @@ from hybridlio.core.trajectory import Trajectory
 from hybridlio.core.trajectory_files import read_tum, write_kitti, write_tum
 from hybridlio.evaluation.ate_rpe import select
 from hybridlio.evaluation.evaluate import Steps
+from hybridlio.runs.whole_folder import COMPLETE_MARKER
 
 POSES, KITTI, COVARIANCES, GRAPH = "poses_tum.txt", "poses_kitti.txt", "covariances.npz", "graph.g2o"
-RECORD, CONFIG, METRICS, REFERENCE = "odometry.npz", "config.yaml", "metrics.json", "reference_tum.txt"
+RECORD, CONFIG, METRICS, REFERENCE = "odometry.npz", "config.yaml", COMPLETE_MARKER, "reference_tum.txt"
 REPORT, PICTURE, SMOOTHED, KEYFRAMES = "report.html", "trajectory.png", "smoothed", "keyframes.npz"
 FILES = (POSES, KITTI, COVARIANCES, GRAPH, RECORD, KEYFRAMES, CONFIG, METRICS, REFERENCE, REPORT, PICTURE)
 JOB, LOG = "batch_job.json", "run.log"  # of a run by `hybridlio batch`

@@ -23,7 +23,7 @@ from typing import IO
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.files import make_folder
 
-LAST = "metrics.json"  # marks a folder as complete
+COMPLETE_MARKER = "metrics.json"  # written last
 IsOwn = Callable[[PurePath], bool]
 
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # of Linux: fcntl.h and fs.h
@@ -171,11 +171,11 @@ def _exchange(a: Path, b: Path) -> bool:
 
 def _move_files(part: Path, folder: Path, is_own: IsOwn) -> None:
     """Move all files into a folder that cannot be renamed; without its marker it is incomplete meanwhile."""
-    (folder / LAST).unlink(missing_ok=True)
+    (folder / COMPLETE_MARKER).unlink(missing_ok=True)
     for path in list(folder.rglob("*")):
         if part not in path.parents and path.is_file() and is_own(path.relative_to(folder)):
             path.unlink()
-    for path in sorted(part.iterdir(), key=lambda one: one.name == LAST):
+    for path in sorted(part.iterdir(), key=lambda one: one.name == COMPLETE_MARKER):
         os.replace(path, folder / path.name)
 
 
