@@ -114,7 +114,9 @@ def _in_si_units(path: Path, values: Array, columns: ImuColumns, notes: Notes) -
             )
     if not any(stated[:3]) and rate > _NO_RATE_RAD_S:
         factors[:3] = np.pi / 180
-        notes.add(f"{path}: angular velocities reach {rate:.0f}: read in °/s, as no gyroscope measures so many rad/s")
+        notes.add(
+            f"{path}: angular velocities reach {rate:.0f}: read in °/s, as that many rad/s exceed any gyroscope's range"
+        )
     return values * factors
 
 
