@@ -24,6 +24,7 @@ from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.trajectory_files import read_kitti
 from hybridlio.datasets.imu_faults import without_filled_gaps
 from hybridlio.evaluation.ate_rpe import align, associate
+from hybridlio.record.imu_clock import on_poses_clock
 from hybridlio.record.odometry_noise import odometry_noise
 from hybridlio.record.record import Record
 from hybridlio.smoothing.gps_alignment import fix_stamps
@@ -39,7 +40,6 @@ T_LIDAR_IMU = se3.make(
     [-0.8086759, 0.3195559, -0.7997231],
 )
 FIX_SIGMA_M = 0.07  # the recording states no accuracy; smoothing raises this to the scatter of the fixes
-CLOCK_OFFSETS_S = np.arange(-3.0, 3.0, 0.02)  # steps of 2 IMU samples; a parabola refines the best
 
 
 def read(data: Path) -> tuple[hl.Trajectory, hl.Trajectory, hl.ImuSamples, tuple[hl.GpsFix, ...]]:
@@ -59,40 +59,16 @@ def read(data: Path) -> tuple[hl.Trajectory, hl.Trajectory, hl.ImuSamples, tuple
     return truth, odometry, imu, tuple(hl.GpsFix(t, p, covariance) for t, p in zip(times, fixes[:, 1:], strict=True))
 
 
-def imu_clock_offset_s(odometry: hl.Trajectory, imu: hl.ImuSamples) -> float:
-    """Return by how many seconds the IMU's clock is ahead of the scans' clock.
-
-    Minimises the median difference between the turn rates of odometry and gyroscope.
-    """
-    turned = np.linalg.norm(se3.so3_log(se3.between(odometry.poses[:-1], odometry.poses[1:])[:, :3, :3]), axis=1)
-    times, spans = odometry.times_s, np.diff(odometry.times_s)
-    speeds = np.linalg.norm(imu.gyro_rad_s, axis=1)
-    at = imu.stamps_ns / NS_PER_S
-    turned_so_far = np.concatenate([[0.0], np.cumsum((speeds[1:] + speeds[:-1]) / 2 * np.diff(at))])
-
-    def misfit(shift: float) -> float:
-        inside = (times[:-1] + shift > at[1]) & (times[1:] + shift < at[-1])
-        integral = np.diff(np.interp(times + shift, at, turned_so_far))
-        return float(np.median(np.abs(integral - turned)[inside] / spans[inside]))
-
-    costs = [misfit(shift) for shift in CLOCK_OFFSETS_S]
-    k = int(np.argmin(costs))
-    before, here, after = costs[k - 1 : k + 2]
-    spacing = CLOCK_OFFSETS_S[1] - CLOCK_OFFSETS_S[0]
-    return float(CLOCK_OFFSETS_S[k] + spacing * (before - after) / (2 * (before - 2 * here + after)))
-
-
 def make_record(odometry: hl.Trajectory, imu: hl.ImuSamples, gps: tuple[hl.GpsFix, ...]) -> Record:
     measured, gaps = without_filled_gaps(imu)
-    shift = imu_clock_offset_s(odometry, measured)
-    print(f"IMU: clock {1e3 * shift:.0f} ms ahead of the scans'; {len(gaps)} interpolated gaps removed")
-    on_scans = hl.ImuSamples(measured.stamps_ns - round(shift * NS_PER_S), measured.gyro_rad_s, measured.accel_m_s2)
     calibration = hl.Calibration(se3.inverse(T_LIDAR_IMU))
-    noise = odometry_noise(odometry, on_scans, calibration)
+    on_clock = on_poses_clock(odometry, measured, calibration)
+    print(f"IMU: stamps moved by {1e3 * on_clock.offset_s:.1f} ms; {len(gaps)} interpolated gaps removed")
+    noise = odometry_noise(odometry, on_clock.imu, calibration)
     for part, covariances in (("odometry noise per step", noise.covariances), ("of which drift", noise.drifts)):
         sigmas = np.sqrt(np.median(np.diagonal(covariances, axis1=1, axis2=2), axis=0))
         print(f"{part:>24s} {np.round(1e3 * sigmas[:3], 2)} mrad, {np.round(1e2 * sigmas[3:], 2)} cm")
-    return Record.from_odometry(odometry, on_scans, gps, calibration)
+    return Record.from_odometry(odometry, on_clock.imu, gps, calibration, imu_time_offset_s=0.0)
 
 
 def report(name: str, truth: hl.Trajectory, estimate: hl.Trajectory, time_spent: str = "") -> None:

@@ -20,13 +20,14 @@ from pathlib import Path
 
 import numpy as np
 from common import nanoseconds
-from kitti_00 import T_LIDAR_IMU, imu_clock_offset_s, read
+from kitti_00 import T_LIDAR_IMU, read
 from scipy.spatial.transform import Rotation
 
 import hybridlio as hl
 from hybridlio.core import se3
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.graph.base.preintegration import covers, predict_step, preintegrate
+from hybridlio.record.imu_clock import on_poses_clock
 from hybridlio.record.record import Record
 from hybridlio.simulation.chain import ChainSettings, make_chain
 from hybridlio.smoothing.smoothed import Smoothed
@@ -116,13 +117,11 @@ def continuous(data: Path) -> Record:
 
 def kitti(data: Path) -> Record:
     truth, _, imu, _ = read(data)
-    shift = round(imu_clock_offset_s(truth, imu) * NS_PER_S)
+    calibration = hl.Calibration(se3.inverse(T_LIDAR_IMU))
+    samples = on_poses_clock(truth, imu, calibration).imu
     inside = (truth.times_s > 40) & (truth.times_s < 190)
     part = hl.Trajectory(truth.stamps_ns[inside], truth.poses[inside])
-    samples = hl.ImuSamples(imu.stamps_ns - shift, imu.gyro_rad_s, imu.accel_m_s2)
-    return Record.from_odometry(
-        part, samples, calibration=hl.Calibration(se3.inverse(T_LIDAR_IMU)), covariances=TRUTH_STEP
-    )
+    return Record.from_odometry(part, samples, calibration=calibration, covariances=TRUTH_STEP, imu_time_offset_s=0.0)
 
 
 def main() -> None:

@@ -23,6 +23,7 @@ from hybridlio.core.geodesy import GeodeticPoint
 from hybridlio.core.sensors import NS_PER_S, Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.core.start_state import start_state
 from hybridlio.core.trajectory import Trajectory
+from hybridlio.record.imu_clock import on_poses_clock
 from hybridlio.record.loop_keyframes import LoopKeyframes
 from hybridlio.record.odometry_noise import odometry_noise
 from hybridlio.record.step_arrays import earlier_scan_arrays, relative_arrays, relative_poses, with_earlier_scans
@@ -47,6 +48,8 @@ class Record:
         calibration: the extrinsics.
         imu_noise: the noise densities that the run assumed.
         keyframes: clouds for loop closure, or None; they are stored in a separate file.
+        imu_time_offset_s: seconds that were added to the samples' stamps to bring them to the poses' clock.
+        notes: what was corrected in the data, and what is doubtful.
     """
 
     online: Trajectory
@@ -58,6 +61,8 @@ class Record:
     calibration: Calibration
     imu_noise: ImuNoise
     keyframes: LoopKeyframes | None = None
+    imu_time_offset_s: float = 0.0
+    notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         keyframes = "no" if self.keyframes is None else len(self.keyframes)
@@ -75,26 +80,32 @@ class Record:
         calibration: Calibration | None = None,
         imu_noise: ImuNoise | None = None,
         covariances: ArrayLike | None = None,
+        imu_time_offset_s: float | None = None,
     ) -> Record:
         """Make a record from the poses of another odometry, to smooth them together with IMU samples and GPS fixes.
 
         Args:
             trajectory: ``N`` lidar poses, at least two, in any world frame.
-            imu: samples on the same clock.
+            imu: the samples.
             gps: fixes; their clock may differ by a constant.
             calibration: the extrinsics; by default the IMU frame is the lidar frame.
             imu_noise: the IMU's noise densities; by default those of an industrial MEMS unit.
             covariances: ``(N-1, 6, 6)`` of the steps between consecutive poses, or one ``(6, 6)`` for all, rad² and m²,
                 rotation first. Errors of different steps must be independent. By default they are estimated from the
                 differences between poses and IMU (:func:`hybridlio.record.odometry_noise.odometry_noise`).
+            imu_time_offset_s: seconds to add to the IMU's stamps to bring them to the poses' clock. By default an
+                offset within ±5 s is found from the rotations, applied where it is significant, and noted
+                (:mod:`hybridlio.record.imu_clock`).
 
         Raises:
             DataError: fewer than two poses, or covariances of another shape or not positive definite.
         """
         if len(trajectory) < 2:
             raise DataError(f"a record needs at least two poses, got {len(trajectory)}")
-        trajectory, imu = trajectory.from_first(), imu or ImuSamples.empty()
+        trajectory = trajectory.from_first()
         calibration, imu_noise = calibration or Calibration(), imu_noise or ImuNoise()
+        on_clock = on_poses_clock(trajectory, imu or ImuSamples.empty(), calibration, imu_time_offset_s)
+        imu = on_clock.imu
         steps = _steps_of(trajectory, imu, calibration, covariances)
         start_ns, end_ns = (int(stamp) for stamp in trajectory.stamps_ns[[0, -1]])
         inside = imu.between(start_ns, end_ns)
@@ -109,6 +120,8 @@ class Record:
             start=start_state(start_ns, beginning, imu_noise),
             calibration=calibration,
             imu_noise=imu_noise,
+            imu_time_offset_s=on_clock.offset_s,
+            notes=on_clock.notes,
         )
 
     @property
@@ -199,6 +212,8 @@ def _to_arrays(record: Record) -> dict[str, Any]:
         "gps_covariances_m2": np.array([fix.covariance_m2 for fix in record.gps]).reshape(-1, 3, 3),
         "T_imu_lidar": record.calibration.T_imu_lidar,
         "imu_noise": np.array(list(asdict(record.imu_noise).values())),
+        "imu_time_offset_s": record.imu_time_offset_s,
+        "notes": np.array(record.notes, dtype=np.str_),
     }
     if record.calibration.T_camera_lidar is not None:
         arrays["T_camera_lidar"] = record.calibration.T_camera_lidar
@@ -227,4 +242,6 @@ def _from_arrays(arrays: Mapping[str, Any]) -> Record:
         start=State(**start),
         calibration=Calibration(arrays["T_imu_lidar"], arrays.get("T_camera_lidar"), arrays.get("antenna_imu_m")),
         imu_noise=ImuNoise(*map(float, arrays["imu_noise"])),
+        imu_time_offset_s=float(arrays.get("imu_time_offset_s", 0.0)),  # records of earlier releases have neither
+        notes=tuple(map(str, arrays.get("notes", ()))),
     )

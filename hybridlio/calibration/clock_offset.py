@@ -1,0 +1,237 @@
+"""The offset between the clocks of lidar and IMU, from the rotations that both measure.
+
+If its stamps are moved by ``δ``, the gyroscope turns by ``g_k(δ)`` over step ``k``, and the lidar by ``u_k`` as seen
+from the IMU. With the gyroscope's bias ``b`` and a small rotation ``φ`` between the stated and the true mounting,
+
+    ``g_k(δ) - b·Δt_k = Exp(φ)·u_k + e_k``.
+
+The errors ``e_k`` are those of the lidar's poses: a drift that adds up and a scatter that the next step takes back, so
+neighbouring steps are anticorrelated. Both are estimated from the residuals (:class:`StepNoise`). The offset of least
+weighted squares is the maximum of the likelihood, and the inverse of the normal matrix is its covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solveh_banded
+
+from hybridlio.calibration.turns import GyroPath, Turns
+from hybridlio.core import se3
+from hybridlio.core.arrays import Array, Mask
+from hybridlio.core.sensors import NS_PER_S, ImuNoise, ImuSamples
+
+_GRID_S = 0.01  # of the search; rates of vehicles and hands change little within it
+_MIN_STEPS = 50  # seven parameters need many times more steps
+_ROTATION_SIGMA_RAD = 0.05  # of stated mountings; 3° is what a hand measures
+_ITERATIONS = 12  # each also renews the weights; the offset settles to microseconds in 4 to 8
+_SETTLED_S = 1e-6
+_DIFFERENCE_S = 1e-3  # of the numeric derivative by the offset, below any time between samples
+_OUTLIER_SIGMAS = 5.0  # of a step's residual: a jump of the odometry
+_LEAST_DRIFT_SHARE = 0.05  # of a step's variance: steps that scatter alone would fix all turns over a whole run
+_LEAST_SIGMA_RAD = 1e-5  # of a step: below a lidar's and a gyroscope's resolution; keeps noise-free data solvable
+_CLIP_QUANTILE = 0.95  # of turn rates, where the search stops counting differences: a jump must not decide
+# An offset is applied from 3 ms on: below it, the errors of interpolating 100 Hz samples and of the lidar's own stamps
+# are as large, and drift does not change measurably (benchmarks/clock_offsets.py).
+LEAST_OFFSET_S = 0.003
+_SIGNIFICANT_SIGMAS = 4.0  # by chance once in 16,000 recordings
+_CONTRADICTION = 0.5  # as much unexplained in spite of a clear motion: nothing but wrong data does that
+_CLEAR_TURN_RAD = 0.005  # over a step, ten times the noise of registration; ordinary driving with bends reaches 0.01
+_LARGEST_UNEXPLAINED = 0.3  # of squared turns: with more, lidar and gyroscope do not measure one motion
+
+
+@dataclass(frozen=True, eq=False)
+class ClockOffset:
+    """The offset of the clocks and what was estimated with it.
+
+    Attributes:
+        offset_s: seconds to add to the IMU's stamps to bring them to the lidar's clock.
+        sigma_s: its standard deviation; infinite where the motion does not determine it.
+        gyro_bias_rad_s: ``(3,)``.
+        rotation_rad: ``(3,)`` rotation vector from the stated to the estimated mounting: the latter is
+            ``Exp(rotation) @ R_imu_lidar``.
+        rotation_sigma_rad: ``(3,)``.
+        steps: number of steps that were compared.
+        unexplained: squared residuals over squared turns, both without their means; 0 is a perfect fit.
+        unexplained_at_zero: the same without moving the stamps.
+        turned_rad: standard deviation of the lidar's turns over a step.
+    """
+
+    offset_s: float
+    sigma_s: float
+    gyro_bias_rad_s: Array
+    rotation_rad: Array
+    rotation_sigma_rad: Array
+    steps: int
+    unexplained: float
+    unexplained_at_zero: float
+    turned_rad: float
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether lidar and gyroscope measure one motion, and it fixes the offset better than to 3 ms."""
+        return self.unexplained < _LARGEST_UNEXPLAINED and self.sigma_s < LEAST_OFFSET_S
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether the clocks differ: by more than chance explains, and by enough to matter."""
+        least_s = max(LEAST_OFFSET_S, _SIGNIFICANT_SIGMAS * self.sigma_s)
+        return self.is_determined and abs(self.offset_s) > least_s and self.unexplained < self.unexplained_at_zero
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the lidar turns clearly more than its noise, and the gyroscope does not measure it."""
+        return self.unexplained > _CONTRADICTION and self.turned_rad > _CLEAR_TURN_RAD
+
+    def __str__(self) -> str:
+        return f"{1e3 * self.offset_s:+.1f} ± {1e3 * self.sigma_s:.1f} ms"
+
+    def applied_to(self, imu: ImuSamples) -> ImuSamples:
+        """Return the samples on the lidar's clock."""
+        return ImuSamples(imu.stamps_ns + round(self.offset_s * NS_PER_S), imu.gyro_rad_s, imu.accel_m_s2)
+
+
+def find_clock_offset(
+    turns: Turns, imu: ImuSamples, R_imu_lidar: Array, largest_s: float, noise: ImuNoise | None = None
+) -> ClockOffset | None:
+    """Return the offset within ``±largest_s``, or None with samples for fewer than 50 steps.
+
+    Args:
+        turns: of the lidar.
+        imu: the samples.
+        R_imu_lidar: ``(3, 3)`` stated mounting.
+        largest_s: bound of the search.
+        noise: the deviation of the gyroscope's bias at power-up.
+    """
+    if len(imu) < 2 or len(turns) < _MIN_STEPS:
+        return None
+    fit = _Fit(turns, imu, R_imu_lidar, noise or ImuNoise())
+    start_s = fit.search(largest_s)
+    return None if start_s is None else fit.refine(start_s, largest_s)
+
+
+@dataclass(frozen=True, eq=False)
+class StepNoise:
+    """Variances ``(3,)`` per axis of an odometry's turns: a step has ``drift + 2·scatter``, neighbours ``-scatter``."""
+
+    drift: Array
+    scatter: Array
+
+    @classmethod
+    def of(cls, residuals: Array, joined: Mask) -> StepNoise:
+        """Estimate both from residuals ``(N, 3)`` by their variance and the covariance of joined neighbours."""
+        variance = (residuals**2).mean(axis=0) + _LEAST_SIGMA_RAD**2
+        pairs = residuals[1:][joined] * residuals[:-1][joined]
+        scatter = np.clip(-pairs.mean(axis=0) if len(pairs) else 0.0, 0.0, (1 - _LEAST_DRIFT_SHARE) * variance / 2)
+        return cls(variance - 2 * scatter, scatter)
+
+    def solve(self, joined: Mask, columns: Array) -> Array:
+        """Return the inverse of the residuals' covariance times ``columns`` ``(N, 3, C)``."""
+        out = np.empty_like(columns)
+        for axis in range(3):
+            bands = np.zeros((2, len(columns)))
+            bands[0] = self.drift[axis] + 2 * self.scatter[axis]
+            bands[1, :-1] = np.where(joined, -self.scatter[axis], 0.0)
+            out[:, axis] = solveh_banded(bands, columns[:, axis], lower=True)
+        return out
+
+
+class _Fit:
+    """One comparison of turns with a gyroscope."""
+
+    def __init__(self, turns: Turns, imu: ImuSamples, R_imu_lidar: Array, noise: ImuNoise) -> None:
+        origin_ns = int(turns.starts_ns[0])
+        self._path = GyroPath(imu, origin_ns)
+        self._turns = turns
+        self._starts = (turns.starts_ns - origin_ns) / NS_PER_S
+        self._ends = (turns.ends_ns - origin_ns) / NS_PER_S
+        self._u = turns.rotvecs @ R_imu_lidar.T
+        self._prior = np.r_[0.0, np.full(3, noise.gyro_bias_sigma_rad_s**-2.0), np.full(3, _ROTATION_SIGMA_RAD**-2)]
+
+    def search(self, largest_s: float) -> float | None:
+        """Return the offset on a grid at which the magnitudes of the rates correlate best.
+
+        They depend neither on the mounting nor on the gyroscope's unit.
+        """
+        steps = int(np.ceil(largest_s / _GRID_S))
+        grid = np.arange(-steps, steps + 1) * _GRID_S
+        spans = self._turns.spans_s
+        speeds = _clipped(np.linalg.norm(self._u, axis=1) / spans)
+        correlations = np.full(len(grid), -np.inf)
+        for k, offset in enumerate(grid):
+            starts, ends = self._starts - offset, self._ends - offset
+            whole = self._path.covers(starts, ends)
+            if whole.sum() >= _MIN_STEPS:
+                gyro = np.linalg.norm(self._path.turns(starts[whole], ends[whole]), axis=1) / spans[whole]
+                correlations[k] = _correlation(_clipped(gyro), speeds[whole])
+        return float(grid[correlations.argmax()]) if np.isfinite(correlations).any() else None
+
+    def refine(self, offset_s: float, largest_s: float) -> ClockOffset | None:
+        """Return the offset of least weighted squares from a start within 20 ms of it."""
+        x = np.r_[offset_s, np.zeros(6)]
+        for _ in range(_ITERATIONS):
+            whole = self._whole(x[0])
+            if whole.sum() < _MIN_STEPS:
+                return None
+            kept, joined, noise = self._weights(x, whole)
+            residuals, J = self._residuals(x, kept), self._jacobian(x, kept)
+            weighted = noise.solve(joined, J)
+            normal = np.einsum("nai,naj->ij", J, weighted) + np.diag(self._prior)
+            gradient = np.einsum("nai,na->i", weighted, residuals) + self._prior * np.r_[0.0, x[1:]]
+            step = np.linalg.solve(normal + 1e-9 * np.diag(np.diag(normal)), gradient)
+            step[0] = np.clip(step[0], -2 * _GRID_S, 2 * _GRID_S)
+            x = x - step
+            x[0] = np.clip(x[0], -largest_s, largest_s)
+            if abs(step[0]) < _SETTLED_S:
+                break
+        sigmas = np.sqrt(np.diag(np.linalg.pinv(normal)))
+        at_zero = np.r_[0.0, x[1:]]
+        return ClockOffset(
+            float(x[0]), float(sigmas[0]), x[1:4], x[4:], sigmas[4:], int(kept.sum()),
+            self._unexplained(x, kept), self._unexplained(at_zero, kept & self._whole(0.0)),
+            float(np.sqrt(self._u[kept].var(axis=0).sum())),
+        )  # fmt: skip
+
+    def _whole(self, offset: float) -> Mask:
+        return self._path.covers(self._starts - offset - _DIFFERENCE_S, self._ends - offset + _DIFFERENCE_S)
+
+    def _weights(self, x: Array, whole: Mask) -> tuple[Mask, Mask, StepNoise]:
+        """Return the rows without outliers ``(N,)``, which of them are joined to the next, and their noise."""
+        residuals = np.zeros_like(self._u)
+        residuals[whole] = self._residuals(x, whole)
+        scale = 1.4826 * np.median(np.abs(residuals[whole]), axis=0) + _LEAST_SIGMA_RAD
+        kept = whole & (np.abs(residuals) < _OUTLIER_SIGMAS * scale).all(axis=1)
+        rows = np.flatnonzero(kept)
+        joined = (np.diff(rows) == 1) & self._turns.joined[rows[:-1]]
+        return kept, joined, StepNoise.of(residuals[kept], joined)
+
+    def _residuals(self, x: Array, rows: Mask) -> Array:
+        gyro = self._path.turns(self._starts[rows] - x[0], self._ends[rows] - x[0])
+        return np.asarray(gyro - x[1:4] * self._turns.spans_s[rows, None] - self._u[rows] @ se3.so3_exp(x[4:]).T)
+
+    def _jacobian(self, x: Array, rows: Mask) -> Array:
+        J = np.zeros((int(rows.sum()), 3, 7))
+        step = np.eye(7)[0] * _DIFFERENCE_S
+        J[:, :, 0] = (self._residuals(x + step, rows) - self._residuals(x - step, rows)) / (2 * _DIFFERENCE_S)
+        J[:, :, 1:4] = -np.eye(3) * self._turns.spans_s[rows, None, None]
+        turned = self._u[rows] @ se3.so3_exp(x[4:]).T
+        J[:, :, 4:] = se3.hat(turned)  # Exp(φ + dφ)·u ≈ Exp(φ)·u - hat(Exp(φ)·u)·dφ
+        return J
+
+    def _unexplained(self, x: Array, rows: Mask) -> float:
+        if not rows.any():
+            return np.inf
+        residuals, turned = self._residuals(x, rows), self._u[rows]
+        spread = ((turned - turned.mean(axis=0)) ** 2).sum()
+        return float(((residuals - residuals.mean(axis=0)) ** 2).sum() / max(spread, 1e-12))
+
+
+def _clipped(rates: Array) -> Array:
+    """Return rates ``(N,)`` with the largest few cut: a jump of the odometry must not decide."""
+    return np.minimum(rates, np.quantile(rates, _CLIP_QUANTILE))
+
+
+def _correlation(a: Array, b: Array) -> float:
+    a, b = a - a.mean(), b - b.mean()
+    return float(a @ b / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12))
