@@ -18,6 +18,7 @@ Estimation:
     run_batch          run many Recordings in parallel; BatchOptions has the settings, Batch the results
 
 Results:
+    build_map          map of a run: its scans as one cloud, without moving objects; MapSettings has the settings
     Trajectory         stamped lidar poses with covariances
     evaluate           drift, ATE, RPE and consistency against a reference
 
@@ -44,6 +45,8 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time each name l
     from hybridlio.datasets.sequence import Sequence
     from hybridlio.evaluation.evaluate import evaluate
     from hybridlio.graph.run.smooth import smooth
+    from hybridlio.mapping.build import build_map
+    from hybridlio.mapping.settings import MapSettings
     from hybridlio.odometry.config import Config, load_config
     from hybridlio.odometry.estimate import Estimate
     from hybridlio.odometry.odometry import Odometry
@@ -64,6 +67,7 @@ __all__ = [
     "HybridLioError",
     "ImuNoise",
     "ImuSamples",
+    "MapSettings",
     "Odometry",
     "Recording",
     "RelativePose",
@@ -73,6 +77,7 @@ __all__ = [
     "State",
     "Trajectory",
     "__version__",
+    "build_map",
     "evaluate",
     "find_recordings",
     "load_config",
@@ -91,6 +96,8 @@ _HOMES = {
     "datasets.sequence": ("Sequence",),
     "evaluation.evaluate": ("evaluate",),
     "graph.run.smooth": ("smooth",),
+    "mapping.build": ("build_map",),
+    "mapping.settings": ("MapSettings",),
     "odometry.config": ("Config", "load_config"),
     "odometry.estimate": ("Estimate",),
     "odometry.odometry": ("Odometry",),

@@ -21,6 +21,7 @@ FLOORS = {
     "cloud": 2,
     "datasets": 2,
     "evaluation": 2,
+    "mapping": 3,
     "registration": 3,
     "record": 3,
     "sources": 4,

@@ -14,6 +14,7 @@ from hybridlio.commands.config import config
 from hybridlio.commands.evaluate import evaluate
 from hybridlio.commands.georeference import georeference
 from hybridlio.commands.info import info
+from hybridlio.commands.map import map_
 from hybridlio.commands.odometry import odometry
 from hybridlio.commands.simulate import simulate
 from hybridlio.commands.smooth import smooth
@@ -47,3 +48,4 @@ def main(
 
 for _command in (simulate, info, odometry, smooth, georeference, batch, compare, evaluate, train, ablate, config, view):
     app.command()(_command)
+app.command("map")(map_)

@@ -21,6 +21,7 @@ from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.rosbag import reader as rosbag
 from hybridlio.datasets.rosbag.choices import BagTopics
 from hybridlio.datasets.sequence import Sequence
+from hybridlio.datasets.source import Source
 
 
 @dataclass(frozen=True)
@@ -107,10 +108,35 @@ def open_sequence(
         raise ConfigError(f"rate_hz: must be above 0 and up to {MAX_RATE_HZ:g} scans per second, got {rate_hz:g}")
     root = user_path(path).resolve()
     name, found = _find(root, reader)
-    recording = found[_pick(root, found, sequence)]
-    raw = user_path(raw_root) if raw_root is not None else None
+    chosen = _pick(root, found, sequence)
+    raw = user_path(raw_root).resolve() if raw_root is not None else None
     options = ReaderOptions(raw, vertical_angle_deg, topics or BagTopics(), rate_hz)
-    return _without_spikes(READERS[name].open(recording, options))
+    opened = _without_spikes(READERS[name].open(found[chosen], options))
+    raw_name = None if raw is None else str(raw)
+    source = Source(str(root), chosen, name, raw_name, vertical_angle_deg, options.topics, rate_hz)
+    return replace(opened, source=source)
+
+
+def reopen(source: Source, path: str | os.PathLike[str] | None = None) -> Sequence:
+    """Open a recording again as it was opened before.
+
+    Args:
+        source: of the recording.
+        path: where it is now, if it has moved.
+
+    Raises:
+        ConfigError, DataError: as :func:`open_sequence`.
+    """
+    whole = open_sequence(
+        source.path if path is None else path,
+        sequence=source.sequence,
+        reader=source.reader,
+        raw_root=source.raw_root,
+        vertical_angle_deg=source.vertical_angle_deg,
+        topics=source.topics,
+        rate_hz=source.rate_hz,
+    )
+    return whole if not source.start and source.stop is None else whole.part(source.start, source.stop)
 
 
 def _without_spikes(sequence: Sequence) -> Sequence:

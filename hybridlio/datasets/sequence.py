@@ -13,6 +13,7 @@ from hybridlio.core.errors import ConfigError, DataError, HybridLioError, strip_
 from hybridlio.core.lidar_models import LidarModel
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, GpsFix, ImuNoise, ImuSamples, Scan
 from hybridlio.core.trajectory import Trajectory
+from hybridlio.datasets.source import Source
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +37,7 @@ class Sequence:
             of a trajectory's length if reference positions are poor.
         imu_noise: the IMU's noise densities, or None if the recording does not give them.
         notes: what the reader found unusual (gaps, dropped stamps, substitutes); also logged when opening.
+        source: how to open the recording again; None for one that was made in memory.
 
     Raises:
         DataError: no scans, stamps that do not increase, ``reference`` or ``forward_speed_m_s`` of another length, or
@@ -54,6 +56,7 @@ class Sequence:
     forward_speed_m_s: Array | None = None
     imu_noise: ImuNoise | None = None
     notes: tuple[str, ...] = ()
+    source: Source | None = None
 
     def __post_init__(self) -> None:
         if not len(self.stamps_ns):
@@ -115,6 +118,7 @@ class Sequence:
             reference=reference,
             gps=tuple(fix for fix in self.gps if fix.stamp_ns > before),
             forward_speed_m_s=None if self.forward_speed_m_s is None else self.forward_speed_m_s[rows],
+            source=None if self.source is None else self.source.part(rows.start, rows.stop),
         )
 
     def _scan(self, k: int) -> Scan:

@@ -168,6 +168,8 @@ def metrics(run: Run, config: Config, evaluation: Evaluation | None) -> dict[str
         "ms_per_scan": ms_per_scan(run),
         "pose_file_frame": run.sequence.pose_file_frame,
     }
+    if run.sequence.source is not None:
+        out["recording"] = run.sequence.source.to_json_dict()
     if T is not None:
         out["T_camera_lidar"] = T.tolist()
     return out | (evaluation.to_json_dict() if evaluation is not None else {})
@@ -263,7 +265,7 @@ def _smoothed_metrics(
 ) -> dict[str, Any]:
     fit: GpsFit | None = smoothed.found.get("gps")
     closed: ClosedLoops | None = smoothed.found.get("loops")
-    kept = ("hybridlio", "sequence", "pose_file_frame", "T_camera_lidar", "frames", "frames_done", "notes")
+    kept = ("recording", "hybridlio", "sequence", "pose_file_frame", "T_camera_lidar", "frames", "frames_done", "notes")
     figures = {name: stored.metrics[name] for name in kept if name in stored.metrics}
     figures |= {name: getattr(smoothed, name) for name in ("error_before", "error_after", "iterations", "converged")}
     figures |= {"path_length_m": smoothed.trajectory.length_m}

@@ -1,0 +1,65 @@
+"""A folder of map tiles, for areas too large for one file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hybridlio.core.files import make_folder, write_atomically
+from hybridlio.core.progress import Progress
+from hybridlio.mapping.build import MapTiles
+from hybridlio.mapping.files import write_map
+from hybridlio.mapping.point_map import PointMap
+
+if TYPE_CHECKING:
+    from pyproj import CRS
+
+INDEX = "tiles.json"
+
+
+def write_tiles(
+    folder: Path,
+    tiles: MapTiles,
+    suffix: str,
+    colour: str = "height",
+    project: Callable[[PointMap], PointMap] | None = None,
+    crs: CRS | None = None,
+    progress: Progress | None = None,
+) -> int:
+    """Write each tile of a map to a file, and ``tiles.json``, which lists them with their extents, last.
+
+    Args:
+        folder: made if missing.
+        tiles: the map.
+        suffix: format of the files, of :data:`hybridlio.mapping.files.FORMATS`.
+        colour: as in :func:`~hybridlio.mapping.files.write_map`; its range is that of each tile.
+        project: applied to each tile's points, such as a projection to UTM.
+        crs: of the projected points.
+        progress: called after each tile.
+
+    Returns:
+        The number of points.
+
+    Raises:
+        ConfigError, DataError: as :func:`~hybridlio.mapping.files.write_map`.
+    """
+    make_folder(folder)
+    rows, total = [], 0
+    for done, tile in enumerate(tiles.names, 1):
+        points = tiles.points(tile)
+        if len(points):
+            points = points if project is None else project(points)
+            name = f"x{tile[0]:+05d}_y{tile[1]:+05d}{suffix}"
+            write_map(folder / name, points, colour, crs)
+            extent = [np.round(end(points.points, axis=0), 3).tolist() for end in (np.min, np.max)]
+            rows.append({"file": name, "points": len(points), "min": extent[0], "max": extent[1]})
+            total += len(points)
+        if progress is not None:
+            progress("tiles", done, len(tiles.names))
+    index = {"tile_m": tiles.tile_m, "crs": None if crs is None else crs.to_string(), "tiles": rows}
+    write_atomically(folder / INDEX, json.dumps(index, indent=2) + "\n")
+    return total
