@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.core.errors import ConfigError
-from hybridlio.core.files import atomic_path
+from hybridlio.core.files import atomic_path, user_path
 from hybridlio.mapping.colours import colours_by
 from hybridlio.mapping.point_map import PointMap
 
@@ -22,7 +23,7 @@ _LAS_SCALE_M = 0.001  # of LAS coordinates, which are integers: well below a vox
 _PLY_TYPES = {"f8": "double", "f4": "float", "u2": "ushort", "u1": "uchar"}
 
 
-def write_map(path: Path, points: PointMap, colour: str = "height", crs: CRS | None = None) -> None:
+def write_map(path: str | os.PathLike[str], points: PointMap, colour: str = "height", crs: CRS | None = None) -> None:
     """Write a map; the suffix chooses the format.
 
     ``.ply`` and ``.pcd`` (binary) have x y z and, where known, normals, intensity, times and colours. ``.las`` and
@@ -40,6 +41,7 @@ def write_map(path: Path, points: PointMap, colour: str = "height", crs: CRS | N
         ConfigError: unknown suffix or colour, a colour by a value that the map lacks, or a missing library.
         DataError: the file cannot be written.
     """
+    path = user_path(path)
     write = _writer(path)
     colours = colours_by(points, colour)
     with atomic_path(path) as part:
