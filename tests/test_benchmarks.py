@@ -121,3 +121,10 @@ def test_the_table_of_constants_names_constants_that_exist():
     done = run("constants.py", "--list")
     assert done.returncode == 0, done.stderr
     assert len(done.stdout.splitlines()) > 60
+
+
+def test_the_cost_of_keeping_a_run_is_printed(tiny_drive):
+    done = run("keeping.py", tiny_drive, "--frames", ":12")
+    assert done.returncode == 0, done.stderr
+    assert "12 scans" in done.stdout
+    assert "ms a scan" in done.stdout

@@ -34,6 +34,7 @@ class GrowingKdTree:
     """
 
     def __init__(self, points: Array, threads: int, base: GrowingKdTree | None = None) -> None:
+        self._points, self._threads = points, threads
         if base is None:
             self._large, self._settled = build_tree(points, threads), len(points)
         else:
@@ -43,6 +44,15 @@ class GrowingKdTree:
         self._small: tuple[small_gicp.KdTree, _Surroundings] | None = None
         if len(appended):
             self._small = (build_tree(appended, threads), _Surroundings(appended))
+
+    def __getstate__(self) -> tuple[Array, int, int]:
+        """Return what the trees are built from: points, number of those in the large tree, and threads."""
+        return self._points, self._settled, self._threads
+
+    def __setstate__(self, state: tuple[Array, int, int]) -> None:
+        """Build the same trees again."""
+        points, settled, threads = state
+        self.__init__(points, threads, GrowingKdTree(points[:settled], threads))  # type: ignore[misc]
 
     def __len__(self) -> int:
         return self._settled + self._appended

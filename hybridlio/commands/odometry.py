@@ -10,12 +10,15 @@ import typer
 from hybridlio.commands import common
 from hybridlio.commands.common import PartialResultError, guarded
 from hybridlio.commands.terminal import print_message, print_result, print_table, print_warning, progress
+from hybridlio.core.errors import ConfigError
 from hybridlio.core.tables import counted
 from hybridlio.datasets.rosbag.choices import NO_CHOICE, BagTopics
 
 if TYPE_CHECKING:
+    from hybridlio.datasets.sequence import Sequence
     from hybridlio.evaluation.report_data import Findings
     from hybridlio.odometry.config import Config
+    from hybridlio.odometry.odometry import Odometry
     from hybridlio.runs.run import Run
 
 _SCANS_LISTED = 20  # fits on two lines of a terminal
@@ -40,45 +43,74 @@ def odometry(
         typer.Option("-o", "--out", metavar="RUN", help="The run folder; default runs/<sequence>-<date-time>."),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing run in -o.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the run in -o that was killed, interrupted or out of space.")
+    ] = False,
     topics: BagTopics = NO_CHOICE,
     _verbosity: common.Verbose = 0,
 ) -> None:
     """Estimate the trajectory of a recording; write poses, covariances, graph, metrics and report to a run folder.
 
-    Without -o, runs/latest links to the newest run. Ctrl-C stops the run and writes what is estimated by then.
+    Without -o, runs/latest links to the newest run. Ctrl-C stops the run and writes what is estimated by then. The
+    estimates are kept on the disk as the run goes: --resume goes on after a kill.
     """
     from hybridlio.odometry.odometry import Odometry
     from hybridlio.runs.new_folder import new_run_folder
-    from hybridlio.runs.run import adapt_config, run_odometry
+    from hybridlio.runs.run import adapt_config
+    from hybridlio.runs.whole_folder import partial_folder
 
+    if resume and (out is None or overwrite):
+        raise ConfigError("--resume needs -o, the folder of the run that is to go on, and no --overwrite")
     chosen = common.load_settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
     estimator = Odometry(config=chosen)  # report unknown names before the recording is opened
     recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle, topics, rate)
     adapted = adapt_config(recording, chosen, is_explicit=initial_pose is not None or config is not None)
     if adapted != chosen:
         chosen, estimator = adapted, Odometry(config=adapted)
-    with new_run_folder(recording.name, out, overwrite, data) as folder:
-        with progress("odometry") as report:
-            run = run_odometry(recording, estimator, report)
+    with new_run_folder(recording.name, out, overwrite, data, resume=resume) as folder:
+        run = _run(partial_folder(folder), recording, chosen, estimator, resume)
         _finish(folder, run, chosen, is_latest=out is None)
+
+
+def _run(part: Path, recording: Sequence, config: Config, estimator: Odometry, resume: bool) -> Run:
+    """Run the odometry, or go on with a run, and keep its estimates in the hidden folder ``part``."""
+    from hybridlio.runs.keeper import Keeper
+    from hybridlio.runs.kept import resume_run
+    from hybridlio.runs.run import Run, finish_run
+
+    run, length = resume_run(part, recording, config, estimator) if resume else (Run(recording, estimator), 0)
+    if resume:
+        print_message(f"resumed after {run.done} of {len(recording)} scans", "none")
+    with progress("odometry") as report, Keeper(part, run, config, length) as keeper:
+        return finish_run(run, report, keeper)
 
 
 def _finish(folder: Path, run: Run, config: Config, is_latest: bool) -> None:
     """Write the run and print its result; exit with an error code where it was stopped."""
     from hybridlio.runs.new_folder import link_latest
+    from hybridlio.runs.whole_folder import discard_journal, partial_folder
     from hybridlio.runs.write import write_run
 
     if run.stopped is not None and len(run.estimates) < 2:  # the first pose is the origin, so nothing is estimated
+        discard_journal(partial_folder(folder))
         raise run.stopped
     if isinstance(run.stopped, KeyboardInterrupt):
-        print_message("interrupted: writing the estimates so far; interrupt again to discard them", "yellow")
-    findings = write_run(folder, run, config)
+        print_message("interrupted: writing the estimates so far; interrupt again to write them later", "yellow")
+    try:
+        findings = write_run(folder, run, config)
+    except BaseException:
+        print_message(f"the estimates of {run.done} scans are kept; --resume -o {folder} goes on from there", "yellow")
+        raise
     if is_latest:
         link_latest(folder)
     _print_result(folder, run, findings)
     if run.stopped is None:
         return
-    print_message(f"wrote {run.done} of {len(run.sequence)} scans to {folder}", "yellow")
+    print_message(
+        f"wrote {run.done} of {len(run.sequence)} scans to {folder}; the same command with --resume -o {folder} "
+        "estimates the others",
+        "yellow",
+    )
     if isinstance(run.stopped, KeyboardInterrupt):
         raise typer.Exit(common.INTERRUPTED)
     raise PartialResultError from run.stopped

@@ -45,7 +45,7 @@ def simulate(
     from pydantic import ValidationError
 
     from hybridlio.datasets.registry import open_sequence
-    from hybridlio.runs.new_folder import RUN
+    from hybridlio.runs.own_files import RUN
     from hybridlio.simulation import SimulationConfig
     from hybridlio.simulation import simulate as write_drive
 

@@ -10,7 +10,7 @@ import typer
 
 from hybridlio.commands.common import Verbose, guarded
 from hybridlio.commands.gps_options import Antenna, MaxShift, Outages, gps_options
-from hybridlio.commands.terminal import print_result, print_table, print_warning, progress
+from hybridlio.commands.terminal import print_message, print_result, print_table, print_warning, progress
 from hybridlio.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -46,21 +46,30 @@ def smooth(
     ] = None,
     _verbosity: Verbose = 0,
 ) -> None:
-    """Optimise all poses of a finished run together; write the smoothed trajectory and its report."""
+    """Optimise all poses of a run together; write the smoothed trajectory and its report.
+
+    Of a run that was killed, or still goes, the scans so far are smoothed; the default folder is then RUN-smoothed.
+    """
     from hybridlio.record.loop_keyframes import LoopKeyframes
     from hybridlio.record.record import Record
-    from hybridlio.runs.folder import KEYFRAMES, RECORD, SMOOTHED, read_run
+    from hybridlio.runs.folder import KEYFRAMES, RECORD, SMOOTHED, is_run_folder, read_run
+    from hybridlio.runs.kept import read_unfinished
     from hybridlio.runs.new_folder import new_run_folder
+    from hybridlio.runs.whole_folder import JOURNAL, partial_folder
     from hybridlio.runs.write import write_smoothed
 
     if not gps and not (antenna is None and outage is None and max_shift is None):
         raise ConfigError("--antenna, --outage and --max-shift apply to GPS fixes; give --gps too")
-    stored = read_run(run)
-    folder = run / SMOOTHED if out is None else out
+    is_unfinished = (partial_folder(run) / JOURNAL).is_file() and not is_run_folder(run)
+    folder = out or (run.with_name(f"{run.name}-{SMOOTHED}") if is_unfinished else run / SMOOTHED)
     if folder.resolve() == run.resolve():
         raise ConfigError(f"{folder} is the run itself; choose another folder with -o")
-    record = Record.load(run / RECORD)
-    if loops:
+    if is_unfinished:
+        stored, record = read_unfinished(run)
+        print_message(f"{run} is not finished: smoothing its first {stored.metrics['frames_done']} scans", "yellow")
+    else:
+        stored, record = read_run(run), Record.load(run / RECORD)
+    if loops and not is_unfinished:
         record = replace(record, keyframes=LoopKeyframes.load(run / KEYFRAMES))
     start_ns = int(record.online.stamps_ns[0])
     options = gps and gps_options(antenna, max_shift, outage, start_ns)

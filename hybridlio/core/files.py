@@ -6,11 +6,12 @@ import contextlib
 import datetime
 import fcntl
 import os
+import socket
 import uuid
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 from zipfile import BadZipFile
 
 from hybridlio.core.errors import DataError, HybridLioError
@@ -61,31 +62,49 @@ def make_folder(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def locked(lock_file: Path, wait: bool = True) -> Iterator[bool]:
-    """Hold an exclusive lock between processes for the length of the block.
+def locked(lock_file: Path, wait: bool = True) -> Iterator[str | None]:
+    """Hold an exclusive lock between processes for the length of the block. That of a process that died is free.
 
     Args:
-        lock_file: created with its folder where missing; it stays.
+        lock_file: names the process that holds the lock; created with its folder where missing, and removed at the end.
         wait: wait for another process that holds the lock; otherwise return at once.
 
     Yields:
-        Whether the lock is held; always True with ``wait``.
+        None if the lock is held, as always with ``wait``; else the process that holds it.
 
     Raises:
         DataError: the file cannot be created.
     """
     make_folder(lock_file.parent)
-    try:
-        file = lock_file.open("w")
-    except OSError as error:
-        raise DataError(f"cannot create the lock file {lock_file}: {error.strerror}; choose another folder") from None
-    with file:
+    while True:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError:
-            yield False
+            file = lock_file.open("a+", encoding="utf-8")
+        except OSError as error:
+            raise DataError(f"cannot write to {lock_file.parent}: {error.strerror}; choose another folder") from None
+        with file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            except BlockingIOError:
+                file.seek(0)
+                yield file.read().strip() or "another process"
+                return
+            if not _is_same_file(file, lock_file):
+                continue  # the process that held the lock has removed the file meanwhile
+            try:
+                file.truncate(0)
+                file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+                file.flush()
+                yield None
+            finally:
+                lock_file.unlink(missing_ok=True)  # before it is released: nobody acquires a lock that is then removed
             return
-        yield True
+
+
+def _is_same_file(file: IO[str], path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except FileNotFoundError:
+        return False
 
 
 @contextlib.contextmanager

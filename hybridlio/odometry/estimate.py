@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,8 @@ import numpy as np
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose
+from hybridlio.core.trajectory import Trajectory
+from hybridlio.evaluation.evaluate import Steps
 from hybridlio.sources.innovation_gate import UNTESTED, GateResult
 
 
@@ -50,3 +53,22 @@ class Estimate:
         if self.initial is None or self.relative is None:
             return np.eye(4)
         return np.asarray(self.relative.pose @ se3.inverse(self.initial.pose))
+
+
+def trajectory_of(estimates: Iterable[Estimate]) -> Trajectory:
+    """Return the poses of some estimates, with covariances."""
+    estimates = list(estimates)
+    return Trajectory(
+        np.array([e.stamp_ns for e in estimates]),
+        np.array([e.pose for e in estimates]).reshape(-1, 4, 4),
+        np.array([e.covariance for e in estimates]).reshape(-1, 6, 6),
+    )
+
+
+def steps_of(estimates: Iterable[Estimate]) -> Steps:
+    """Return the relative poses between estimates, as the backend has them."""
+    steps = [e.step for e in estimates if e.step is not None]
+    return Steps(
+        np.array([s.pose for s in steps]).reshape(-1, 4, 4),
+        np.array([s.covariance for s in steps]).reshape(-1, 6, 6),
+    )

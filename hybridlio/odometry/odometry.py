@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+from typing import Any
+
 import numpy as np
 
 from hybridlio.core.errors import ConfigError, DataError, EstimationError
@@ -13,6 +16,7 @@ from hybridlio.odometry.pipeline import Pipeline, timed
 from hybridlio.odometry.registry import check_names, make_implementations
 from hybridlio.odometry.setup import Setup
 from hybridlio.odometry.start_up import repeat_first_step, start_backend, start_residual, take_up_imu
+from hybridlio.record import plain_values
 from hybridlio.record.loop_keyframes import LoopKeyframeSelector
 from hybridlio.record.record import Record
 from hybridlio.record.recorder import Recorder
@@ -102,12 +106,71 @@ class Odometry:
         keyframes = self._keyframes.keyframes()
         return self._recorder.record(pipeline.start, pipeline.calibration, pipeline.imu_noise, keyframes, scans)
 
+    def state(self, row: int = 0) -> dict[str, Any] | None:
+        """Return what :meth:`resume` needs besides the frames and estimates: the state of the front end.
+
+        Args:
+            row: return the loop keyframes among the estimates from this one on.
+
+        Returns:
+            Values for :func:`hybridlio.record.plain_values.encode`; None before the second estimate.
+        """
+        pipeline = self._pipeline
+        if pipeline is None or pipeline.state is None:
+            return None
+        return {
+            "residual": plain_values.state_of(pipeline.residual),
+            "gate": plain_values.state_of(pipeline.gate),
+            "keyframe_position": self._keyframes.last_position,
+            "keyframes": self._keyframes.kept_since(row),
+            "start": pipeline.start,
+            "imu_noise": pipeline.imu_noise,
+        }
+
+    def resume(self, done: Iterable[tuple[Frame, Estimate]], state: Mapping[str, Any]) -> float:
+        """Bring this new odometry to where another one with the same settings was.
+
+        Backend and initial-pose source get all steps again, which takes a tenth to a fifth of the time that the run
+        took: GTSAM cannot store iSAM2. The residual source and the gate continue from their stored state.
+
+        Args:
+            done: every frame so far, without points, and its estimate.
+            state: of the other odometry after the last of these, by :meth:`state`, with all keyframes.
+
+        Returns:
+            The largest difference between a stored pose and the pose now, in metres and radians; 0 with the same
+            processor and libraries.
+        """
+        difference = 0.0
+        for frame, estimate in done:
+            if self._pipeline is None:
+                self._pipeline = self._make_pipeline(frame)
+            else:
+                difference = max(difference, self._repeat(self._pipeline, frame, estimate))
+            self._keep(estimate, frame)
+        if self._pipeline is not None:
+            plain_values.restore(self._pipeline.residual, state["residual"])
+            plain_values.restore(self._pipeline.gate, state["gate"])
+        self._keyframes.restore(state["keyframes"], state["keyframe_position"])
+        return difference
+
+    def _repeat(self, pipeline: Pipeline, frame: Frame, estimate: Estimate) -> float:
+        """Give a step to the backend and the initial-pose source again; return how far its pose is from the stored."""
+        assert estimate.relative is not None
+        initial = pipeline.predict(frame, self._state_before(frame, pipeline))
+        pipeline.state = pipeline.backend.update(frame, estimate.relative)
+        pipeline.correct(frame, initial, estimate.relative, pipeline.backend.last_step())
+        return float(np.abs(pipeline.lidar_pose(pipeline.state)[0] - estimate.pose).max())
+
     def _start(self, first: Frame) -> Pipeline:
-        setup = Setup.from_frame(self._config, first)
-        implementations = make_implementations(self._chosen, setup)
-        pipeline = Pipeline(first, setup.calibration, setup.imu_noise, *implementations, setup.predict_from_imu)
+        pipeline = self._make_pipeline(first)
         start_residual(pipeline)
         return pipeline
+
+    def _make_pipeline(self, first: Frame) -> Pipeline:
+        setup = Setup.from_frame(self._config, first)
+        implementations = make_implementations(self._chosen, setup)
+        return Pipeline(first, setup.calibration, setup.imu_noise, *implementations, setup.predict_from_imu)
 
     def _state_before(self, frame: Frame, pipeline: Pipeline) -> State:
         """Return the state at the last scan. Start the backend first, or restart it at the first IMU samples."""

@@ -8,6 +8,7 @@ default settings. Packed in memory during a run it takes five ninths of that; th
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,6 +59,9 @@ class LoopKeyframeSettings:
         check_positive(self, "spacing_m", "voxel_m", "max_points")
         within = 0 < self.max_range_m < _LARGEST_RANGE_M
         check_setting(self, "max_range_m", within, f"above 0 and below {_LARGEST_RANGE_M:.0f}")
+
+
+PackedKeyframe = tuple[int, int, PackedCloud]  # row, stamp, points
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +148,7 @@ class LoopKeyframeSelector:
     def __init__(self, settings: LoopKeyframeSettings) -> None:
         self._settings = settings
         self._position: Array | None = None
-        self._kept: list[tuple[int, int, PackedCloud]] = []  # row, stamp, points
+        self._kept: list[PackedKeyframe] = []
         self._step = min(max(round(settings.voxel_m / RESOLUTION_M), 1), _MAX_PACKING_STEP)
 
     def offer(self, row: int, scan: Scan, pose: Array) -> bool:
@@ -168,10 +172,28 @@ class LoopKeyframeSelector:
         self._position = position.copy()
         return True
 
+    def kept_since(self, row: int) -> list[PackedKeyframe]:
+        """Return the keyframes among the estimates from ``row`` on."""
+        return [kept for kept in self._kept if kept[0] >= row]
+
+    def restore(self, kept: Iterable[PackedKeyframe], position: Array | None) -> None:
+        """Continue after these keyframes; ``position`` ``(3,)`` is that of the last one, None without any."""
+        self._kept, self._position = list(kept), position
+
+    @property
+    def last_position(self) -> Array | None:
+        """``(3,)`` position of the last keyframe, None before the first."""
+        return self._position
+
     def keyframes(self) -> LoopKeyframes:
         """Return all keyframes kept so far."""
-        rows, stamps = (np.array([kept[i] for kept in self._kept], np.int64) for i in (0, 1))
-        return LoopKeyframes(rows, stamps, tuple(cloud.cloud() for _, _, cloud in self._kept))
+        return unpacked(self._kept)
+
+
+def unpacked(kept: Sequence[PackedKeyframe]) -> LoopKeyframes:
+    """Return packed keyframes as they go into the file."""
+    rows, stamps = (np.array([one[i] for one in kept], np.int64) for i in (0, 1))
+    return LoopKeyframes(rows, stamps, tuple(cloud.cloud() for _, _, cloud in kept))
 
 
 def compress(points: Floats, settings: LoopKeyframeSettings) -> NDArray[np.int16]:

@@ -14,20 +14,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hybridlio.core.errors import ConfigError, HybridLioError
-from hybridlio.core.files import make_folder, write_atomically
+from hybridlio.core.errors import ConfigError
+from hybridlio.core.files import make_folder
 from hybridlio.core.progress import Progress
 from hybridlio.datasets.protection import check_output
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.registry import check_implementations, check_names
 from hybridlio.runs import engines
+from hybridlio.runs.batch_job import Job, run_job
 from hybridlio.runs.batch_table import DONE, DONE_BEFORE, FAILED, NOT_RUN, Batch, BatchRow, summary_metrics, write_batch
-from hybridlio.runs.folder import JOB, LOG, METRICS, is_own_file
-from hybridlio.runs.new_folder import check_free
-from hybridlio.runs.own_files import BATCH
+from hybridlio.runs.folder import JOB, METRICS
+from hybridlio.runs.own_files import BATCH, check_free
 from hybridlio.runs.recordings import Recording
-from hybridlio.runs.run_log import logged_to
-from hybridlio.runs.whole_folder import held, partial_folder, replaced_folder
+from hybridlio.runs.whole_folder import discard_journal, held, partial_folder
 
 _log = logging.getLogger("hybridlio")
 
@@ -52,30 +51,6 @@ class BatchOptions:
     adapt_config: bool = True
 
 
-@dataclass(frozen=True)
-class Job:
-    """All that a process needs to run one recording.
-
-    Attributes:
-        recording: the recording to run.
-        folder: its run folder.
-        config: the settings.
-        threads: maximum number of threads of the run.
-        adapt_config: see :class:`BatchOptions`.
-    """
-
-    recording: Recording
-    folder: Path
-    config: Config
-    threads: int
-    adapt_config: bool
-
-    @property
-    def description(self) -> dict[str, Any]:
-        """Recording and settings as plain values; equal for jobs with equal results."""
-        return {"recording": self.recording.to_json_dict(), "settings": self.config.model_dump(mode="json")}
-
-
 def run_batch(
     recordings: Items[Recording],
     out: Path,
@@ -85,8 +60,9 @@ def run_batch(
 ) -> Batch:
     """Run recordings in parallel; write each to ``out/<name>``, and ``batch.json`` and ``batch.md`` to ``out``.
 
-    Complete runs are kept. An interrupt (Ctrl-C) ends the batch and is returned in :attr:`Batch.stopped`. With
-    ``overwrite``, an older run stays until the new one is complete.
+    Complete runs are kept, and those that were killed go on from their last estimates. An interrupt (Ctrl-C) ends the
+    batch and is returned in :attr:`Batch.stopped`. With ``overwrite``, an older run stays until the new one is
+    complete.
 
     Args:
         recordings: the recordings, from :func:`hybridlio.runs.recordings.find_recordings`.
@@ -118,11 +94,21 @@ def run_batch(
     with engines.engine(options.engine, parallel, threads, options.scheduler):
         make_folder(out)
         with held(out):
+            for job in missing:
+                _prepare_folder(job, options.overwrite)
             rows = {job.recording: _row(job, DONE_BEFORE if job.recording in complete else NOT_RUN) for job in jobs}
             stopped = _run_missing(missing, rows, out, progress)
             batch = Batch(out, tuple(rows.values()), stopped)
             write_batch(batch)
     return batch
+
+
+def _prepare_folder(job: Job, overwrite: bool) -> None:
+    """Forget that a killed batch had started the job; its estimates stay, unless all is to be run again."""
+    part = partial_folder(job.folder)
+    (part / JOB).unlink(missing_ok=True)
+    if overwrite:
+        discard_journal(part)
 
 
 def _workers(options: BatchOptions, recordings: int) -> tuple[int | None, int]:
@@ -236,59 +222,3 @@ def _run_alone(job: Job) -> str | None:
             return next(results)[1]
     except Exception as error:
         return f"the process died: {str(error).splitlines()[0]}"
-
-
-def run_job(job: Job) -> tuple[Recording, str | None]:
-    """Run one recording and write its run folder; return the recording, and the reason if it failed.
-
-    The library's log of the run is written to the folder's ``run.log``, with the traceback of an unexpected error. If
-    the run fails without a result, an older run in the folder stays, with the new log.
-    """
-    try:
-        check_free(job.folder, overwrite=True)
-        with replaced_folder(job.folder, is_own_file) as part:
-            write_atomically(part / JOB, json.dumps(job.description, indent=2) + "\n")
-            with logged_to(part / LOG):
-                reason = _run_in(part, job)
-            if reason is not None and not (part / METRICS).exists() and (job.folder / METRICS).exists():
-                write_atomically(job.folder / LOG, (part / LOG).read_bytes())
-                raise _NoResultError(reason)
-    except _NoResultError as error:
-        return job.recording, str(error)
-    except (OSError, HybridLioError) as error:
-        return job.recording, f"{job.folder}: cannot be written: {error}"
-    return job.recording, reason
-
-
-class _NoResultError(Exception):
-    """Keeps an older run from being replaced by one without a result."""
-
-
-def _run_in(folder: Path, job: Job) -> str | None:
-    """Run a job and write the files to a folder; return the reason if it failed."""
-    try:
-        _run(job, folder)
-    except HybridLioError as error:
-        _log.error("%s", error)
-        return str(error)
-    except Exception as error:
-        _log.exception("a bug in hybridlio")
-        return f"{type(error).__name__}: {error} (a bug in hybridlio; {LOG} has the traceback)"
-    return None
-
-
-def _run(job: Job, folder: Path) -> None:
-    from hybridlio.odometry.odometry import Odometry
-    from hybridlio.runs.run import adapt_config, run_odometry
-    from hybridlio.runs.write import write_run_files
-
-    sequence = job.recording.open()
-    config = adapt_config(sequence, job.config, is_explicit=not job.adapt_config)
-    run = run_odometry(sequence, Odometry(config=engines.with_thread_limit(config, job.threads)))
-    if isinstance(run.stopped, KeyboardInterrupt):
-        raise run.stopped
-    if run.stopped is not None and len(run.estimates) < 2:
-        raise run.stopped
-    write_run_files(folder, run, config)
-    if run.stopped is not None:
-        raise run.stopped

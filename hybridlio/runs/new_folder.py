@@ -5,26 +5,25 @@ from __future__ import annotations
 import datetime
 import logging
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 
 from hybridlio.core.errors import ConfigError, DataError
+from hybridlio.core.files import make_folder
 from hybridlio.datasets.protection import check_output
-from hybridlio.runs.folder import FILES, JOB, LOG, METRICS, RECORD, SMOOTHED, is_own_file
-from hybridlio.runs.own_files import OwnFiles
-from hybridlio.runs.whole_folder import held, recover
+from hybridlio.runs.folder import is_own_file
+from hybridlio.runs.own_files import RUN, check_free
+from hybridlio.runs.whole_folder import JOURNAL, STATE, discard_journal, held, partial_folder, recover
 
 _log = logging.getLogger(__name__)
-
-RUN = OwnFiles((*FILES, SMOOTHED), METRICS, frozenset({"hybridlio", "sequence"}))
-BATCH_JOB = OwnFiles((JOB, LOG), JOB, frozenset({"recording", "settings"}))
 
 
 @contextmanager
 def new_run_folder(
-    sequence: str, out: Path | None, overwrite: bool, *recordings: str | os.PathLike[str]
+    sequence: str, out: Path | None, overwrite: bool, *recordings: str | os.PathLike[str], resume: bool = False
 ) -> Iterator[Path]:
     """Hold the folder of a new run during the block. Entered before the run, so that a wrong folder shows early.
 
@@ -34,10 +33,12 @@ def new_run_folder(
         out: the folder; None for the default.
         overwrite: allow ``out`` to hold a run, which stays until the new one is complete.
         recordings: paths of the recordings that the run reads.
+        resume: the run that stopped or was killed in ``out`` goes on; its journal is in the hidden folder then.
 
     Raises:
-        ConfigError: ``out`` touches a recording, holds a run and ``overwrite`` is not set, holds other files, or is
-            being written by another process.
+        ConfigError: ``out`` touches a recording, holds a run, or one that is not finished, and neither ``overwrite``
+            nor ``resume`` is set, holds other files, or is being written by another process; or there is nothing to
+            resume.
         DataError: the folder cannot be created.
     """
     wanted = out or Path("runs") / f"{sequence}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
@@ -46,7 +47,11 @@ def new_run_folder(
     try:
         with held(folder):
             recover(folder, is_own_file)
-            check_free(folder, overwrite)
+            if resume:
+                _take_up(folder)
+            else:
+                check_free(folder, overwrite)
+                _check_no_journal(folder, overwrite)
             yield folder
     finally:
         if out is None:
@@ -54,33 +59,33 @@ def new_run_folder(
                 folder.rmdir()
 
 
-def check_free(folder: Path, overwrite: bool) -> None:
-    """Check that a run may be written to the folder: it is missing, empty, or holds a run and ``overwrite`` is set.
-
-    A folder with only the log of a run that failed is free, too.
+def _take_up(folder: Path) -> None:
+    """Let the hidden folder hold the journal of the run to be resumed; that of an interrupted run is copied.
 
     Raises:
-        ConfigError: it may not, or the folder touches a recording.
+        ConfigError: the folder holds no unfinished run.
     """
-    check_output(folder)
-    if not folder.exists():
+    part = partial_folder(folder)
+    if (part / JOURNAL).is_file():
         return
-    if not folder.is_dir():
-        raise ConfigError(f"{folder} is not a folder; choose another name")
-    is_run = RUN.are_in(folder)
-    if is_run and not overwrite:
-        raise ConfigError(f"{folder} already holds a run; choose another folder, or give --overwrite to replace it")
-    if not (is_run or BATCH_JOB.are_in(folder) or _is_unused(folder) or (overwrite and _is_half_run(folder))):
-        raise ConfigError(f"{folder} holds files but no run of hybridlio, and is left alone; choose another folder")
+    if not (folder / JOURNAL).is_file():
+        found = "a finished run" if RUN.are_in(folder) else "no unfinished run"
+        raise ConfigError(f"{folder} holds {found}, so there is nothing to resume; run it without --resume")
+    make_folder(part)
+    for name in (STATE, JOURNAL):  # the journal last: without it nothing is resumed
+        if (folder / name).is_file():
+            shutil.copyfile(folder / name, part / name)
 
 
-def _is_unused(folder: Path) -> bool:
-    return all(one.name in (".lock", ".partial", ".old") for one in folder.iterdir())
-
-
-def _is_half_run(folder: Path) -> bool:
-    """Return whether the folder holds nothing but files of a run that was killed while it wrote in place."""
-    return (folder / RECORD).is_file() and all(is_own_file(p.relative_to(folder)) for p in folder.iterdir())
+def _check_no_journal(folder: Path, overwrite: bool) -> None:
+    """Check that no unfinished run is lost; remove its journal if that is wanted."""
+    part = partial_folder(folder)
+    if not overwrite and (part / STATE).is_file():
+        raise ConfigError(
+            f"{folder} holds a run that was killed; give --resume to go on from its estimates, or --overwrite to start "
+            "again"
+        )
+    discard_journal(part)
 
 
 def _create_unique(wanted: Path) -> Path:

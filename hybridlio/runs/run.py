@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import islice
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.evaluation.evaluate import Steps
 from hybridlio.odometry.config import Config
-from hybridlio.odometry.estimate import Estimate
+from hybridlio.odometry.estimate import Estimate, steps_of, trajectory_of
 from hybridlio.record.record import Record
 from hybridlio.sources.innovation_gate import GATE_NIS, Verdict
 
@@ -43,6 +43,26 @@ class FrameByFrame(Protocol):
         """Return what smoothing needs of all scans so far, or of the first ``scans``."""
         ...
 
+    def state(self, row: int = 0) -> dict[str, Any] | None:
+        """Return what another odometry needs to go on, with the loop keyframes from ``row`` on."""
+        ...
+
+    def resume(self, done: Iterable[tuple[Frame, Estimate]], state: Mapping[str, Any]) -> float:
+        """Go on from there; return by how much the poses differ."""
+        ...
+
+
+class Keeps(Protocol):
+    """What keeps a run on the disk while it goes; :class:`hybridlio.runs.keeper.Keeper`."""
+
+    def see(self, frame: Frame) -> None:
+        """Take the frame that is estimated next."""
+        ...
+
+    def after_scan(self) -> None:
+        """Write what is due."""
+        ...
+
 
 @dataclass(eq=False)
 class Run:
@@ -56,7 +76,7 @@ class Run:
         unreadable: by frame, why a scan could not be read or the run could not start at it. Such a scan is bridged
             by the initial pose, or skipped before the first estimate.
         reading_s: seconds spent reading, one per estimate.
-        seconds: wall time of the loop.
+        seconds: wall time of the loop, and before a kill.
         stopped: the error or KeyboardInterrupt that stopped the run early, or None.
         last_points: ``(N, 3)`` points of the last scan read, to detect a scan that is delivered twice.
     """
@@ -79,12 +99,7 @@ class Run:
     @property
     def trajectory(self) -> Trajectory:
         """The estimated poses, in the frame of the first usable scan, with covariances."""
-        estimates = list(self.estimates)
-        return Trajectory(
-            np.array([e.stamp_ns for e in estimates]),
-            np.array([e.pose for e in estimates]).reshape(-1, 4, 4),
-            np.array([e.covariance for e in estimates]).reshape(-1, 6, 6),
-        )
+        return trajectory_of(self.estimates)
 
     @property
     def stamps_before(self) -> NDArray[np.int64]:
@@ -94,11 +109,7 @@ class Run:
     @property
     def steps(self) -> Steps:
         """The relative poses between estimates, as the backend has them."""
-        steps = [e.step for e in self.estimates if e.step is not None]
-        return Steps(
-            np.array([s.pose for s in steps]).reshape(-1, 4, 4),
-            np.array([s.covariance for s in steps]).reshape(-1, 6, 6),
-        )
+        return steps_of(self.estimates)
 
     @property
     def initial_poses(self) -> Array:
@@ -152,7 +163,9 @@ class Run:
         return replace(record, gps=tuple(near))
 
 
-def run_odometry(sequence: Sequence, odometry: FrameByFrame, progress: Progress | None = None) -> Run:
+def run_odometry(
+    sequence: Sequence, odometry: FrameByFrame, progress: Progress | None = None, keeper: Keeps | None = None
+) -> Run:
     """Run an odometry over all frames of a sequence.
 
     A scan that cannot be read is bridged by the initial pose, with a warning. An error or interrupt that stops the
@@ -162,16 +175,25 @@ def run_odometry(sequence: Sequence, odometry: FrameByFrame, progress: Progress 
         sequence: the recording.
         odometry: a new odometry.
         progress: called after each scan with the distance travelled (``12.3 m``), scans done and scans in all.
+        keeper: keeps the estimates on the disk.
     """
-    run = Run(sequence, odometry)
+    return finish_run(Run(sequence, odometry), progress, keeper)
+
+
+def finish_run(run: Run, progress: Progress | None = None, keeper: Keeps | None = None) -> Run:
+    """Run the rest of a run; see :func:`run_odometry`."""
+    sequence = run.sequence
     _log.info(
         "%s: %d scans in %.1f s, %d IMU samples", sequence.name, len(sequence), sequence.duration_s, len(sequence.imu)
     )
-    start = time.perf_counter()
-    distance_m = 0.0
+    start = time.perf_counter() - run.seconds
+    distance_m = run.trajectory.length_m if run.estimates else 0.0
     try:
-        for k in range(len(sequence)):
-            _advance(run, k)
+        for k in range(run.done, len(sequence)):
+            _advance(run, k, keeper)
+            run.seconds = time.perf_counter() - start
+            if keeper is not None:
+                keeper.after_scan()
             if len(run.estimates) > 1:
                 last = run.estimates[-2].pose[:3, 3], run.estimates[-1].pose[:3, 3]
                 distance_m += float(np.linalg.norm(last[1] - last[0]))
@@ -185,11 +207,13 @@ def run_odometry(sequence: Sequence, odometry: FrameByFrame, progress: Progress 
     return run
 
 
-def _advance(run: Run, k: int) -> None:
+def _advance(run: Run, k: int, keeper: Keeps | None) -> None:
     """Read frame ``k`` and estimate its pose. Before the first estimate, an unusable frame is skipped."""
     start = time.perf_counter()
     frame = _read_frame(run, k)
     read_s = time.perf_counter() - start
+    if keeper is not None:
+        keeper.see(frame)
     try:
         if not run.estimates and k in run.unreadable:
             raise DataError(run.unreadable[k])

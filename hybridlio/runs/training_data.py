@@ -206,10 +206,10 @@ def _prepare_once(
     sequence: Sequence, folder: Path, recipe: Recipe, options: DataOptions, report: _Done, wait: bool
 ) -> bool:
     """Prepare the recording unless its shard exists; return False if another process is at it and ``wait`` is False."""
-    with locked(folder.with_name(f".{folder.name}.lock"), wait) as is_held:
-        if is_held and not (folder / "shard.json").is_file():
+    with locked(folder.with_name(f".{folder.name}.lock"), wait) as holder:
+        if holder is None and not (folder / "shard.json").is_file():
             _prepare(sequence, folder, recipe, options.initial_pose, report)
-        return is_held
+        return holder is None
 
 
 def _prepare(sequence: Sequence, folder: Path, recipe: Recipe, initial_pose: str | None, report: _Done) -> None:

@@ -1,31 +1,32 @@
 """Result folders that appear whole: written under a hidden name, then renamed.
 
-``RUNS/NAME`` is written as ``RUNS/.NAME.partial``, and becomes visible by one rename when all its files are on the
-disk. A folder that is replaced stays until then; afterwards it is ``RUNS/.NAME.old`` until its files are removed.
-``RUNS/.NAME.lock`` names the process that writes. What a killed process leaves is cleaned by the next writer.
+``RUNS/NAME`` is written as ``RUNS/.NAME.partial``. When all its files are on the disk it becomes
+``RUNS/.NAME.complete`` and then, by one more rename, visible. A folder that is replaced stays until then; afterwards
+it is ``RUNS/.NAME.old`` until its files are removed.
+``RUNS/.NAME.lock`` names the process that writes. What a killed process leaves is cleaned by the next writer; an
+unfinished run with its journal stays, and a result that only lacked its new name gets it.
 
 Some folders cannot be renamed: mount points, the current folder, and those in a folder without write permission. For
-them the three names lie inside the folder, and files are moved one by one, ``metrics.json`` last.
+them the four names lie inside the folder, and files are moved one by one, ``metrics.json`` last.
 """
 
 from __future__ import annotations
 
 import ctypes
-import fcntl
 import os
-import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePath
-from typing import IO
 
 from hybridlio.core.errors import ConfigError, DataError
-from hybridlio.core.files import make_folder
+from hybridlio.core.files import locked, make_folder
 
 COMPLETE_MARKER = "metrics.json"  # written last
+JOURNAL, STATE = "journal.bin", "state.bin"  # of a run that is not finished; see hybridlio.runs.keeper
 IsOwn = Callable[[PurePath], bool]
 
+_NEW = ".new"  # in the new of two folders while they are exchanged
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # of Linux: fcntl.h and fs.h
 _owners: dict[Path, int] = {}  # the folders that this process holds, and the thread that holds each
 
@@ -57,59 +58,36 @@ def held(folder: Path) -> Iterator[None]:
         ConfigError: another process, or another thread of this one, holds the folder; names the process.
         DataError: the lock cannot be created.
     """
-    folder = folder.resolve()
-    if _owners.get(folder) == threading.get_ident():
+    if is_held(folder):
         yield
         return
-    lock = _hidden(folder, "lock")
-    make_folder(lock.parent)
-    file = _acquire(lock, folder)
-    _owners[folder] = threading.get_ident()
-    try:
-        yield
-    finally:
-        del _owners[folder]
-        lock.unlink(missing_ok=True)  # before it is released, so that nobody acquires a lock that is then removed
-        file.close()
-
-
-def _acquire(lock: Path, folder: Path) -> IO[str]:
-    while True:
+    folder = folder.resolve()
+    with locked(_hidden(folder, "lock"), wait=False) as holder:
+        if holder is not None:
+            raise ConfigError(f"{folder} is being written by {holder}; wait for it, or choose another folder")
+        _owners[folder] = threading.get_ident()
         try:
-            file = lock.open("a+", encoding="utf-8")
-        except OSError as error:
-            raise DataError(f"cannot write to {lock.parent}: {error.strerror}; choose another folder") from None
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.seek(0)
-            holder = file.read().strip() or "another process"
-            file.close()
-            raise ConfigError(f"{folder} is being written by {holder}; wait for it, or choose another folder") from None
-        if _is_same_file(file, lock):
-            file.truncate(0)
-            file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
-            file.flush()
-            return file
-        file.close()  # the one who held the lock removed it meanwhile
+            yield
+        finally:
+            del _owners[folder]
 
 
-def _is_same_file(file: IO[str], path: Path) -> bool:
-    try:
-        return os.path.samestat(os.fstat(file.fileno()), path.stat())
-    except FileNotFoundError:
-        return False
+def is_held(folder: Path) -> bool:
+    """Return whether this thread holds the folder, and so has checked that it may be written."""
+    return _owners.get(folder.resolve()) == threading.get_ident()
 
 
 @contextmanager
-def replaced_folder(folder: Path, is_own: IsOwn) -> Iterator[Path]:
-    """Give an empty hidden folder to write to, which replaces ``folder`` when the block ends without an error.
+def replaced_folder(folder: Path, is_own: IsOwn, keep_journal: Callable[[], bool] = bool) -> Iterator[Path]:
+    """Give a hidden folder to write to, which replaces ``folder`` when the block ends without an error.
 
-    Files in ``folder`` that are not the program's own are kept: they move to the new folder.
+    It is empty but for the journal of the run that is written. Files in ``folder`` that are not the program's own are
+    kept: they move to the new folder.
 
     Args:
         folder: the folder to create or replace.
         is_own: returns whether a path, relative to the folder, is a file that the program wrote and may remove.
+        keep_journal: returns at the end whether the run is not finished, and its journal stays with the result.
 
     Raises:
         ConfigError: another process writes the folder.
@@ -121,8 +99,13 @@ def replaced_folder(folder: Path, is_own: IsOwn) -> Iterator[Path]:
         make_folder(part)
         try:
             yield part
+            (part / _NEW).touch()
             _synchronise(part)
-            _publish(part, folder, is_own)
+            complete = _hidden(folder, "complete")
+            os.rename(part, complete)
+            if not keep_journal():
+                discard_journal(complete)
+            _publish(complete, folder, is_own)
         except OSError as error:
             if error.filename is None or not Path(error.filename).is_relative_to(folder.parent):
                 raise
@@ -134,14 +117,25 @@ def replaced_folder(folder: Path, is_own: IsOwn) -> Iterator[Path]:
 def recover(folder: Path, is_own: IsOwn) -> None:
     """Clean up what a killed writer of the folder left. The caller holds the folder.
 
-    A folder that was being replaced, and is not, comes back.
+    A result that is complete but for its name gets it. Otherwise a folder that was being replaced comes back.
     """
-    old, part, folder = _hidden(folder, "old"), partial_folder(folder), folder.resolve()
-    if old.is_dir() and not folder.exists():
+    old, part, complete = _hidden(folder, "old"), partial_folder(folder), _hidden(folder, "complete")
+    folder = folder.resolve()
+    if (complete / _NEW).exists():
+        _publish(complete, folder, is_own)
+    elif old.is_dir() and not folder.exists():
         os.rename(old, folder)
-    for leftover in (old, part):
+    (folder / _NEW).unlink(missing_ok=True)
+    for leftover in (old, part, complete):
         if leftover.is_dir():
-            _absorb(leftover, folder, is_own)
+            kept = (JOURNAL, STATE) if leftover == part and (part / JOURNAL).is_file() else ()
+            _absorb(leftover, folder, is_own, kept)
+
+
+def discard_journal(folder: Path) -> None:
+    """Remove the journal of an unfinished run, the state first: without it nothing is resumed."""
+    for name in (STATE, JOURNAL):
+        (folder / name).unlink(missing_ok=True)
 
 
 def _publish(part: Path, folder: Path, is_own: IsOwn) -> None:
@@ -155,6 +149,7 @@ def _publish(part: Path, folder: Path, is_own: IsOwn) -> None:
     else:
         os.rename(folder, old)
         os.rename(part, folder)
+    (folder / _NEW).unlink(missing_ok=True)
     _synchronise_one(folder.parent)
     if old.is_dir():
         _absorb(old, folder, is_own)
@@ -170,22 +165,30 @@ def _exchange(a: Path, b: Path) -> bool:
 
 
 def _move_files(part: Path, folder: Path, is_own: IsOwn) -> None:
-    """Move all files into a folder that cannot be renamed; without its marker it is incomplete meanwhile."""
-    (folder / COMPLETE_MARKER).unlink(missing_ok=True)
-    for path in list(folder.rglob("*")):
-        if part not in path.parents and path.is_file() and is_own(path.relative_to(folder)):
-            path.unlink()
+    """Move all files into a folder that cannot be renamed; without its marker it is incomplete meanwhile.
+
+    The old marker is removed last: while it is there, no file has been moved, so a killed call can be repeated.
+    """
+    marker = folder / COMPLETE_MARKER
+    if marker.is_file():
+        for path in [path for path in folder.rglob("*") if path != marker and part not in path.parents]:
+            if path.is_file() and is_own(path.relative_to(folder)):
+                path.unlink()
+        marker.unlink()
     for path in sorted(part.iterdir(), key=lambda one: one.name == COMPLETE_MARKER):
         os.replace(path, folder / path.name)
+    part.rmdir()
 
 
-def _absorb(leftover: Path, folder: Path, is_own: IsOwn) -> None:
-    """Remove a folder and the program's own files in it; other files move to the same place in ``folder``."""
+def _absorb(leftover: Path, folder: Path, is_own: IsOwn, kept: tuple[str, ...] = ()) -> None:
+    """Remove a folder and the program's own files in it but those kept; other files move to the place in ``folder``."""
     for path in sorted(leftover.rglob("*"), reverse=True):  # files before their folders
         if path.is_dir() and not path.is_symlink():
             with suppress(OSError):  # it still holds what could not be moved
                 path.rmdir()
-        elif is_own(path.relative_to(leftover)):
+        elif path.parent == leftover and path.name in kept:
+            continue
+        elif path == leftover / _NEW or is_own(path.relative_to(leftover)):
             path.unlink()
         else:
             target = _free_name(folder / path.relative_to(leftover))

@@ -14,15 +14,16 @@ from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.tables import counted
 from hybridlio.core.trajectory_files import write_tum
 from hybridlio.core.version import __version__
+from hybridlio.datasets.protection import check_output
 from hybridlio.evaluation.evaluate import Evaluation, Steps
 from hybridlio.evaluation.report import draw, write_report
 from hybridlio.evaluation.report_data import Findings, ReportData, analyse
 from hybridlio.odometry.config import Config, config_to_yaml
 from hybridlio.record.record import Record
 from hybridlio.runs import folder as run_folder
-from hybridlio.runs.new_folder import check_free
+from hybridlio.runs.own_files import check_free
 from hybridlio.runs.run import Run
-from hybridlio.runs.whole_folder import replaced_folder
+from hybridlio.runs.whole_folder import is_held, replaced_folder
 
 if TYPE_CHECKING:
     from hybridlio.smoothing.gps_options import GpsFit
@@ -38,7 +39,7 @@ _LARGE_SHARE = 0.1  # of all scans; more conflicts with the IMU than single bad 
 def write_run(folder: Path, run: Run, config: Config) -> Findings:
     """Write all files of a run, complete or interrupted, to a folder that appears whole or replaces an earlier run.
 
-    Files in the folder that no run has are kept.
+    Files in the folder that no run has are kept. The journal of an interrupted run stays with it.
 
     Returns:
         The evaluation of the run.
@@ -48,9 +49,15 @@ def write_run(folder: Path, run: Run, config: Config) -> Findings:
         ConfigError: the folder is no run folder, touches a recording, or is being written by another process.
         DataError: a file cannot be written.
     """
-    check_free(folder, overwrite=True)
-    with replaced_folder(folder, run_folder.is_own_file) as part:
+    _check_folder(folder)
+    with replaced_folder(folder, run_folder.is_own_file, lambda: run.stopped is not None) as part:
         return write_run_files(part, run, config)
+
+
+def _check_folder(folder: Path) -> None:
+    if not is_held(folder):  # who holds it has checked it
+        check_output(folder)
+        check_free(folder, overwrite=True)
 
 
 def write_run_files(folder: Path, run: Run, config: Config) -> Findings:
@@ -212,7 +219,7 @@ def write_smoothed(folder: Path, stored: run_folder.StoredRun, record: Record, s
         ConfigError: the folder is no run folder, touches a recording, or is being written by another process.
         DataError: a file cannot be written.
     """
-    check_free(folder, overwrite=True)
+    _check_folder(folder)
     with replaced_folder(folder, run_folder.is_own_file) as part:
         return _write_smoothed_files(part, stored, record, smoothed)
 

@@ -28,8 +28,15 @@ from hybridlio.learned.networks.weights import load_weights, weights_path
 from hybridlio.learned.settings import Recipe
 from hybridlio.learned.source_settings import NetworkResidualSettings
 from hybridlio.learned.sources.inertial_inputs import inertial
+from hybridlio.record import plain_values
 
 _log = logging.getLogger(__name__)
+plain_values.register(  # so that the state of a run can be stored
+    "torch.Tensor",
+    Tensor,
+    lambda tensor: (str(tensor.device), tensor.detach().cpu().numpy()),
+    lambda stored: torch.from_numpy(stored[1]).to(stored[0]),
+)
 
 Rows = NDArray[np.float32] | NDArray[np.float64]
 Prepare = Callable[[Scan], Mapped]
@@ -86,6 +93,7 @@ class NetworkResidual:
     """
 
     name = "network"
+    NOT_STATE = ("_settings", "_device", "_network", "_prepare", "_threads", "_pair")  # the last: within one step
 
     def __init__(
         self, prepare_for: Callable[[Recipe], Prepare], settings: NetworkResidualSettings | None = None

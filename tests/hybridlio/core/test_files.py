@@ -1,3 +1,5 @@
+import os
+import socket
 import stat
 from pathlib import Path
 
@@ -87,12 +89,13 @@ def test_invalid_yaml_is_named_in_one_line(tmp_path: Path, content: bytes | None
 
 def test_a_lock_is_held_by_one_at_a_time(tmp_path: Path) -> None:
     lock_file = tmp_path / "new" / "lock"
-    with locked(lock_file) as is_held:
-        assert is_held
-        with locked(lock_file, wait=False) as is_held_twice:
-            assert not is_held_twice
-    with locked(lock_file, wait=False) as is_held_again:
-        assert is_held_again
+    with locked(lock_file) as holder:
+        assert holder is None
+        with locked(lock_file, wait=False) as holder:
+            assert holder == f"process {os.getpid()} on {socket.gethostname()}"
+    with locked(lock_file, wait=False) as holder:
+        assert holder is None
+    assert not lock_file.exists()
 
 
 def test_a_lock_that_cannot_be_created_names_its_place(tmp_path: Path) -> None:

@@ -13,7 +13,8 @@ from hybridlio.datasets.registry import open_sequence
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.odometry import Odometry
 from hybridlio.runs.folder import is_own_file, is_run_folder
-from hybridlio.runs.new_folder import check_free, link_latest, new_run_folder
+from hybridlio.runs.new_folder import link_latest, new_run_folder
+from hybridlio.runs.own_files import check_free
 from hybridlio.runs.run import Run, run_odometry
 from hybridlio.runs.write import write_run
 
