@@ -12,3 +12,5 @@ Floats: TypeAlias = NDArray[np.float32]  # points and maps, in the precision of 
 Mask: TypeAlias = NDArray[np.bool_]
 Index: TypeAlias = NDArray[np.int64]  # positions in another array
 Stamps: TypeAlias = NDArray[np.int64]  # times in nanoseconds
+
+NS_PER_S = 1_000_000_000

@@ -10,13 +10,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hybridlio.core import se3
+from hybridlio.core.arrays import NS_PER_S as NS_PER_S
 from hybridlio.core.arrays import Array, Floats, Stamps
 from hybridlio.core.covariance import check_covariance
 from hybridlio.core.errors import DataError
 from hybridlio.core.geodesy import GeodeticPoint
 from hybridlio.core.setting_checks import check_setting
 
-NS_PER_S = 1_000_000_000
 MAX_RANGE_M = 1e4  # several times the range of any lidar; points beyond it are corrupt
 # Longest gap between IMU samples to interpolate over: 2.5 scans at 10 Hz. Between samples farther apart a vehicle's
 # acceleration and rate can be anything.

@@ -43,6 +43,7 @@ class StatedCalibration:
         rate_hz: scans per second, for a folder without stamps.
         layout: the columns of ``.bin`` scans.
         format: what is stated about the points.
+        keys: the keys that are in the file.
     """
 
     calibration: Calibration = field(default_factory=Calibration)
@@ -52,6 +53,7 @@ class StatedCalibration:
     rate_hz: float | None = None
     layout: BinLayout | None = None
     format: StatedFormat = field(default_factory=StatedFormat)
+    keys: frozenset[str] = frozenset()
 
 
 def read_calibration_yaml(path: Path, needs_imu: bool = False) -> StatedCalibration:
@@ -113,6 +115,7 @@ def _stated(content: dict[str, Any]) -> StatedCalibration:
         rate_hz=read("rate_hz", lambda key, value: _number(key, value, 0, MAX_RATE_HZ), None),
         layout=read("columns", lambda _, value: stated_layout(value), None),
         format=StatedFormat(read("point_times", _point_times, None), limits_m),
+        keys=frozenset(key for key, value in content.items() if value is not None),
     )
 
 

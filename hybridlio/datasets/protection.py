@@ -10,6 +10,7 @@ from hybridlio.core.errors import ConfigError
 from hybridlio.core.files import user_path
 from hybridlio.datasets import folder as plain_folder
 from hybridlio.datasets.kitti import odometry
+from hybridlio.datasets.published.table import PUBLISHED
 from hybridlio.datasets.rosbag.reader import SUFFIXES
 
 # Levels below the output folder that are searched for recordings: KITTI's root/date/drive is 2 deep, its
@@ -48,9 +49,11 @@ def _refusal(folder: str | os.PathLike[str], how: str, recording: Path) -> Confi
 
 
 def is_recording(folder: Path) -> bool:
-    """Return whether the folder itself is a recording of any layout: KITTI's, a plain folder or a split bag."""
+    """Return whether the folder itself is a recording of any layout."""
     if not folder.is_dir():
         return False
+    if any(layout.is_recording(folder) for layout in PUBLISHED.values()):
+        return True
     if (folder / "velodyne_points").is_dir() or odometry.is_sequence(folder) or plain_folder.is_recording(folder):
         return True
     return (folder / "metadata.yaml").is_file() and any(p.suffix in SUFFIXES for p in folder.iterdir())

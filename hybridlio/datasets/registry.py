@@ -18,6 +18,8 @@ from hybridlio.datasets.imu_faults import without_spikes
 from hybridlio.datasets.kitti import odometry, raw
 from hybridlio.datasets.kitti.vertical_angle import check_angle
 from hybridlio.datasets.notes import Notes
+from hybridlio.datasets.published.recording import Layout
+from hybridlio.datasets.published.table import PUBLISHED
 from hybridlio.datasets.rosbag import reader as rosbag
 from hybridlio.datasets.rosbag.choices import BagTopics
 from hybridlio.datasets.sequence import Sequence
@@ -58,7 +60,12 @@ class Reader:
     suffixes: tuple[str, ...] = ()
 
 
-READERS: dict[str, Reader] = {  # tried in this order
+def _published(layout: Layout) -> Reader:
+    return Reader(layout.text, layout.find, lambda path, options: layout.open(path, options.vertical_angle_deg))
+
+
+READERS: dict[str, Reader] = {  # tried in this order, layouts that are special before those that are general
+    **{name: _published(layout) for name, layout in PUBLISHED.items()},
     "kitti-raw": Reader(raw.LAYOUT, raw.find, lambda p, o: raw.open_drive(p, o.raw_root, o.vertical_angle_deg)),
     "kitti-odometry": Reader(
         odometry.LAYOUT,
@@ -196,8 +203,6 @@ def check_options(
 def _find(root: Path, reader: str | None) -> tuple[str, dict[str, Path]]:
     """Return the name of the first reader that finds recordings at ``root``, and the recordings."""
     check_options(reader)
-    if not root.exists():
-        raise DataError(f"{root}: no such folder or bag; give a recording's folder, or a bag")
     tried = [reader] if reader else list(READERS)
     if root.is_file():
         tried = [name for name in tried if root.suffix in READERS[name].suffixes]
@@ -208,6 +213,8 @@ def _find(root: Path, reader: str | None) -> tuple[str, dict[str, Path]]:
         found = READERS[name].find(root)
         if found:
             return name, found
+    if not root.exists():  # a scene of nuScenes is found at a path that does not exist
+        raise DataError(f"{root}: no such folder or bag; give a recording's folder, or a bag")
     wanted = "\n".join(f"  {name}: {READERS[name].layout}" for name in tried)
     raise DataError(f"{root}: no recording found. Layouts tried:\n{wanted}")
 

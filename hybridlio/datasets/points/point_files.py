@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -41,15 +42,13 @@ class PointFiles:
     Attributes:
         paths: one file per scan.
         stamps_ns: one stamp per scan.
-        layout: the columns of ``.bin`` files.
-        step_ns: median distance between the stamps; None if there is one scan.
+        read: reads the columns of a file.
         format: how the columns are read.
     """
 
     paths: tuple[Path, ...]
     stamps_ns: Stamps
-    layout: BinLayout
-    step_ns: int | None
+    read: Callable[[Path], Columns]
     format: PointFormat
 
     def __call__(self, k: int) -> Scan:
@@ -60,7 +59,7 @@ class PointFiles:
         """
         path = self.paths[k]
         try:
-            return self.format.scan(read_columns(path, self.layout, self.step_ns), int(self.stamps_ns[k]))
+            return self.format.scan(self.read(path), int(self.stamps_ns[k]))
         except DataError as error:
             raise DataError(f"frame {k}: {_at(path, error)}") from None
 
@@ -71,6 +70,7 @@ def open_point_files(
     notes: Notes,
     layout: BinLayout | None = None,
     stated: StatedFormat | None = None,
+    read: Callable[[Path], Columns] | None = None,
 ) -> PointFiles:
     """Look at some scans of a recording, and return the loader of all.
 
@@ -80,6 +80,7 @@ def open_point_files(
         notes: receives what was found.
         layout: the columns of ``.bin`` files; found by default.
         stated: what the user states about the points.
+        read: reads the columns of a file, for formats of a data set's own; must be picklable.
 
     Raises:
         DataError: the columns or their meaning cannot be found. A scan that cannot be read is passed over here; its
@@ -87,13 +88,14 @@ def open_point_files(
     """
     step_ns = int(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else None
     looked_at = sampled(len(paths))
-    if layout is None:
-        is_bin = paths[0].suffix == ".bin"
-        layout = find_layout([paths[k] for k in looked_at], step_ns, notes) if is_bin else BinLayout()
+    if read is None:
+        if layout is None and paths[0].suffix == ".bin":
+            layout = find_layout([paths[k] for k in looked_at], step_ns, notes)
+        read = partial(read_columns, layout=layout, step_ns=step_ns)
     samples, errors = [], []
     for k in looked_at:
         try:
-            samples.append((int(stamps_ns[k]), read_columns(paths[k], layout, step_ns)))
+            samples.append((int(stamps_ns[k]), read(paths[k])))
         except DataError as error:
             errors.append(_at(paths[k], error))
     if errors and not samples:
@@ -102,7 +104,7 @@ def open_point_files(
         found = find_format(samples, step_ns, notes, stated)
     except DataError as error:
         raise DataError(_at(paths[0].parent if len(paths) > 1 else paths[0], error)) from None
-    return PointFiles(paths, stamps_ns, layout, step_ns, found)
+    return PointFiles(paths, stamps_ns, read, found)
 
 
 def read_columns(path: Path, layout: BinLayout | None = None, step_ns: int | None = None) -> Columns:
@@ -138,7 +140,7 @@ def read_scan(path: Path, stamp_ns: int) -> Scan:
     notes = Notes(path.name)
     loader = open_point_files((path,), np.array([stamp_ns], np.int64), notes)
     try:
-        return loader.format.scan(read_columns(path, loader.layout), stamp_ns)
+        return loader.format.scan(loader.read(path), stamp_ns)
     except DataError as error:
         raise DataError(f"{path}: {error}") from None
 

@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlio.core.arrays import Stamps
+from hybridlio.core.arrays import NS_PER_S, Stamps
 from hybridlio.core.errors import DataError
-from hybridlio.core.sensors import NS_PER_S
 from hybridlio.datasets.notes import Notes
 
 Columns = Mapping[str, NDArray[Any]]

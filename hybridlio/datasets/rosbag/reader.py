@@ -12,8 +12,8 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import Calibration, ImuSamples
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.calibration_yaml import read_calibration_yaml
-from hybridlio.datasets.folder import note_mounting, on_scans_clock
 from hybridlio.datasets.gps_csv import note_fixes
+from hybridlio.datasets.imu_mounting import note_mounting, on_scans_clock
 from hybridlio.datasets.kitti.vertical_angle import raised
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.reference import poses_at
