@@ -14,6 +14,7 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.estimates import State
 from hybridlio.core.motion_limits import (
     ANGULAR_ACCELERATION_SIGMA_RAD_S2,
+    BRIDGED_ACCELERATION_SIGMA_M_S2,
     JERK_SIGMA_M_S3,
     LARGEST_ACCELERATION_M_S2,
     LARGEST_RATE_RAD_S,
@@ -22,6 +23,9 @@ from hybridlio.core.sensors import NS_PER_S, ImuNoise, ImuSamples
 
 _INTEGRATION_VARIANCE = 1e-8  # m²/s: GTSAM needs it positive; 0.1 mm per √s is far below what the accelerometer adds
 _COVER_SLACK_NS = NS_PER_S // 1000  # stamps are often rounded to milliseconds
+# Random walk of the biases over a gap in the samples, m/s³ and rad/s² per √Hz: 30 and 50 times the defaults of
+# ImuNoise, because nothing is known about the sensor during a gap.
+_GAP_ACCEL_WALK, _GAP_GYRO_WALK = 1e-2, 1e-3
 
 
 def sampling_noise(noise: ImuNoise, gap_s: float) -> tuple[float, float]:
@@ -74,6 +78,24 @@ def preintegrate(imu: ImuSamples, state: State, noise: ImuNoise) -> gtsam.Preint
     accel = (imu.accel_m_s2[:-1] + (turned @ imu.accel_m_s2[1:, :, None])[..., 0]) / 2
     for step_s, a, w in zip(steps_s, accel, gyro, strict=True):
         pim.integrateMeasurement(a, w, step_s)
+    return pim
+
+
+def preintegrate_unknown(state: State, dt_s: float) -> gtsam.PreintegratedCombinedMeasurements:
+    """Preintegrate a step of ``dt_s`` seconds without samples: at constant velocity, changed as a vehicle may.
+
+    The same factor as for samples then ties the velocity to both poses. Rotation and acceleration are zero, with the
+    largest rate and the usual acceleration as their uncertainty; the biases walk freely.
+    """
+    params = gtsam.PreintegrationCombinedParams(state.gravity_m_s2)
+    params.setAccelerometerCovariance(np.eye(3) * BRIDGED_ACCELERATION_SIGMA_M_S2**2 * dt_s)
+    params.setGyroscopeCovariance(np.eye(3) * LARGEST_RATE_RAD_S**2 * dt_s)
+    params.setIntegrationCovariance(np.eye(3) * _INTEGRATION_VARIANCE)
+    params.setBiasAccCovariance(np.eye(3) * _GAP_ACCEL_WALK**2)
+    params.setBiasOmegaCovariance(np.eye(3) * _GAP_GYRO_WALK**2)
+    pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam_bias(state))
+    at_rest = -state.T_world_imu[:3, :3].T @ state.gravity_m_s2
+    pim.integrateMeasurement(state.accel_bias_m_s2 + at_rest, state.gyro_bias_rad_s, dt_s)
     return pim
 
 

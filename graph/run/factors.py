@@ -15,9 +15,10 @@ from gtsam.symbol_shorthand import B, G, M, V, X
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose, State
-from hybridlio.core.motion_limits import BRIDGED_ACCELERATION_SIGMA_M_S2, GRAVITY_M_S2, GRAVITY_MAGNITUDE_SIGMA_M_S2
+from hybridlio.core.motion_limits import GRAVITY_M_S2, GRAVITY_MAGNITUDE_SIGMA_M_S2
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.graph.base import noise
+from hybridlio.graph.base.preintegration import preintegrate_unknown
 from hybridlio.graph.run.scan_numbers import ScanNumbers
 
 Factors = list[gtsam.NonlinearFactor]
@@ -28,9 +29,6 @@ VARIABLES = (X, V, B, G, M)  # that a scan may have
 # double precision.
 _GAUGE_SIGMA = 1e-6
 _GRAVITY_CHAIN_SIGMA_M_S2 = 1e-6  # per scan; 0.1 mm/s² after 10,000 scans, so gravity stays one vector
-# Random walk of the biases over a gap in the samples, m/s² and rad/s per √s: 30 and 50 times the defaults of ImuNoise,
-# because nothing is known about the sensor during a gap.
-_BRIDGED_BIAS_SIGMAS = np.r_[np.full(3, 1e-2), np.full(3, 1e-3)]
 _INDEX_MASK = 0xFFFFFF  # of a GTSAM key: the scan's number, without the letter
 
 
@@ -151,18 +149,13 @@ def imu_factors(i: int, j: int, pim: gtsam.PreintegratedCombinedMeasurements) ->
     ]
 
 
-def bridge_factors(i: int, j: int, dt_s: float) -> Factors:
+def bridge_factors(i: int, j: int, state: State, dt_s: float) -> Factors:
     """Return the factors of a step without IMU samples, over which velocity and biases may change freely.
 
-    The next samples tie the velocity to the poses again.
+    The velocity stays tied to the poses: after a gap, one that had only been carried over would be wrong by all that
+    the vehicle braked or accelerated, and the first samples would pull the poses after it.
     """
-    no_change = gtsam.imuBias.ConstantBias()
-    velocity_sigmas = np.full(3, BRIDGED_ACCELERATION_SIGMA_M_S2 * dt_s)
-    return [
-        gtsam.BetweenFactorVector(V(i), V(j), np.zeros(3), noise.sigmas(velocity_sigmas)),
-        gtsam.BetweenFactorConstantBias(B(i), B(j), no_change, noise.sigmas(_BRIDGED_BIAS_SIGMAS * np.sqrt(dt_s))),
-        _same_gravity(i, j),
-    ]
+    return imu_factors(i, j, preintegrate_unknown(state, dt_s))
 
 
 def _same_gravity(i: int, j: int) -> gtsam.NonlinearFactor:
@@ -196,7 +189,7 @@ def step_factors(
     graph = gtsam.NonlinearFactorGraph()
     if state.has_imu:
         dt_s = (stamp_ns - state.stamp_ns) / NS_PER_S
-        for factor in imu_factors(i, i + 1, pim) if pim else bridge_factors(i, i + 1, dt_s):
+        for factor in imu_factors(i, i + 1, pim) if pim else bridge_factors(i, i + 1, state, dt_s):
             graph.add(factor)
     if relative.drift is not None:
         starts_path = not scans.is_on_map_path(i)

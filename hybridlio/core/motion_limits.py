@@ -19,7 +19,7 @@ ACCELERATION_SIGMA_M_S2 = 2.0  # change of velocity between two scans; covers or
 ANGULAR_ACCELERATION_SIGMA_RAD_S2 = 0.5  # change of angular velocity between two scans; 0.05 rad/s in 0.1 s
 JERK_SIGMA_M_S3 = 5.0  # change of acceleration between two samples; builds up full braking in 1.6 s
 MEAN_ACCELERATION_SIGMA_M_S2 = 1.5  # mean over the first samples; tilts the vertical measured from them by 0.15 rad
-BRIDGED_ACCELERATION_SIGMA_M_S2 = 3.0  # speed at a step's end minus its mean speed, per second of step
+BRIDGED_ACCELERATION_SIGMA_M_S2 = 3.0  # acceleration over a step without samples; hard braking reaches twice that
 LARGEST_ACCELERATION_M_S2 = 4.0  # harder braking is an emergency
 LARGEST_RATE_RAD_S = 0.6  # a right-angle bend in three seconds
 
