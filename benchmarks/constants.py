@@ -91,14 +91,6 @@ TABLE = [
     *_in(
         "hybridlio/registration/settings.py",
         ICP,
-    ),
-    *_in(
-        "hybridlio/registration/settings.py",
-        MAP,
-    ),
-    *_in(
-        "hybridlio/registration/settings.py",
-        ICP,
         RegistrationSettings__kernel_m=("0.005", "2.0"),
         RegistrationSettings__max_distance_m=("0.05", "50.0"),
         RegistrationSettings__max_iterations=("1",),
@@ -109,6 +101,7 @@ TABLE = [
         LocalMapSettings__keyframe_m=("0.2", "20.0"),
         LocalMapSettings__keyframe_deg=("1.0", "90.0"),
         LocalMapSettings__voxel_m=("0.2", "20.0"),
+        LocalMapSettings__spacing_m=("1e-9", "1.0"),
         LocalMapSettings__horizon_keyframes=("3", "300"),
         LocalMapSettings__radius_m=("10.0", "1000.0"),
         LocalMapSettings__neighbours=("5", "100"),
@@ -140,7 +133,7 @@ TABLE = [
     *_in(
         "hybridlio/registration/motion_search.py",
         SEARCH,
-        COARSE_KERNEL_M=("0.02", "10.0"),
+        _COARSE_KERNEL=("0.02", "10.0"),
         _JUDGED_STRIDE=("1", "500"),
         _COARSE_ITERATIONS=("1",),
         _REFINED_CANDIDATES=("1", "1000"),
@@ -158,8 +151,7 @@ TABLE = [
         MAP,
         _KEY_BITS=("8", "31"),
         MAX_POINTS_PER_CELL=("2", "100"),
-        _MIN_SPACING_M=("0.0", "1.0"),
-        _SPARSE_RANGE_M=("2.0", "200.0"),
+        _SPARSE_RANGE=("1.0", "100.0"),
         _SPARSE_SHARE=("0.0", "0.5"),
     ),
     *_in(
@@ -167,8 +159,8 @@ TABLE = [
         MAP,
         _KEYFRAMES=("1", "50"),
         _NEIGHBOURS=("5", "100"),
-        _MAX_DISTANCE_M=("0.5", "40.0"),
-        _MIN_WIDTH_M=("0.01", "3.0"),
+        _MAX_DISTANCE=("0.25", "20.0"),
+        _MIN_WIDTH=("0.005", "1.5"),
     ),
     *_in(
         "hybridlio/cloud/plane_fitting.py",
@@ -192,7 +184,6 @@ TABLE = [
         MATCHING,
         _UNKNOWN_ROTATION_SIGMA_RAD=("1e-5", "10.0"),
         _LEVER_M=("0.0", "1e4"),
-        _WIDEST_KERNEL_M=("0.05", "100.0"),
         _LOST_COST=("0.01", "1.0"),
         _YOUNG_MAP_INFLATION=("0.0", "100.0"),
         _YOUNG_MAP_DRIFT_SHARE=("0.0", "50.0"),
@@ -203,6 +194,15 @@ TABLE = [
         MATCHING,
         _VOXEL_SHRINKAGE=("0.1",),
         _AMPLE=("0.1",),
+    ),
+    *_in(
+        "hybridlio/sources/scene_scale.py",
+        (f"{SOURCES}scene_scale.py",),
+        _STREET_VIEW_M=("3.0", "40.0"),
+        _STEPS=("1", "20"),
+        _HYSTERESIS=("0.5", "4.0"),
+        _NEW_SHARE=("0.01", "1.0"),
+        _LEAST_NOISE_SCALE=("0.01", "1.0"),
     ),
 ]
 

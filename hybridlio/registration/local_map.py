@@ -33,7 +33,7 @@ class LocalMap:
 
     def __init__(self, settings: LocalMapSettings) -> None:
         self._settings = settings
-        self._voxels = VoxelMap(settings.voxel_m, settings.horizon_keyframes, settings.neighbours, settings.threads)
+        self._voxels = VoxelMap(settings)
         self._T_map_keyframe: Array | None = None
         self._centre: Array = np.zeros(3)  # of the surface when it was last rebuilt
         self.keyframes = 0
@@ -43,6 +43,11 @@ class LocalMap:
     def only_keyframe_pose(self) -> Array | None:
         """``(4, 4)`` pose of the only keyframe; None where there are none or several."""
         return self._T_map_keyframe if self.keyframes == 1 else None
+
+    def rescale(self, settings: LocalMapSettings) -> None:
+        """Go on with other settings, at another scale of the scene; the points stay."""
+        self._settings = settings
+        self._voxels.rescale(settings)
 
     def needs_keyframe(self, T_map_lidar: Array) -> bool:
         """Return whether a scan at this pose should become a keyframe."""

@@ -19,9 +19,9 @@ from hybridlio.registration.icp import Fit, Registration, fit_at, register
 from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Surface
 
-# Candidates' speeds are 2.5 m/s apart: 0.25 m at 10 Hz and 0.5 m at 5 Hz. A kernel of that size reaches from one to the
-# next.
-COARSE_KERNEL_M = 0.5
+# Kernel of the search, in greatest distances of a match: 0.5 m of 1 m. Candidates' speeds are 2.5 m/s apart: 0.25 m at
+# 10 Hz and 0.5 m at 5 Hz, so it reaches from one to the next.
+_COARSE_KERNEL = 0.5
 _JUDGED_STRIDE = 8  # every eighth point, some hundreds, are enough to compare candidates one kernel width apart
 _COARSE_ITERATIONS = 6  # three while the kernel is halved from 0.5 to 0.1 m, and three under the narrow one
 _REFINED_CANDIDATES = 12  # of 18 speeds and 5 rates of turn by default: the best one and those beside it in both
@@ -41,6 +41,11 @@ class CoarseSearch:
     kernel_m: float
     iterations: int
     refined: int
+
+
+def coarse_kernel_m(settings: RegistrationSettings) -> float:
+    """Return the width of the kernel for starts that lie between two candidates of a search."""
+    return _COARSE_KERNEL * settings.max_distance_m
 
 
 def motions(speeds_m_s: Iterable[float], rates_deg_s: Iterable[float], dt_s: float) -> list[Array]:
@@ -93,7 +98,7 @@ def best_start(
         starts: ``(4, 4)`` poses in the surface's frame.
         settings: of the registration.
     """
-    search = CoarseSearch(COARSE_KERNEL_M, _COARSE_ITERATIONS, _REFINED_CANDIDATES)
+    search = CoarseSearch(coarse_kernel_m(settings), _COARSE_ITERATIONS, _REFINED_CANDIDATES)
     few = source[::_JUDGED_STRIDE]
     refined = [found.pose for found in refine_best(surface, few, source, starts, settings, search, _ranked)]
     max_distance_m = settings.max_distance_m

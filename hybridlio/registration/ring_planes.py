@@ -15,18 +15,23 @@ from hybridlio.core.arrays import Array, Index
 
 _KEYFRAMES = 5  # whose points are kept: at 2 m each, their rings cover the gap between two rings at 20 m
 _NEIGHBOURS = 15  # half more than for a plane in one scan, so that a ring's own points do not fill them all
-# Distance of the farthest neighbour. A single ring has fewer points within it, and larger pieces of ground are not
-# plane.
-_MAX_DISTANCE_M = 4.0
-# Smallest root mean square width of a plane. Points of one ring spread across it only by the noise of a range, about
-# 0.03 m; two rings 1 m apart spread by 0.5 m.
-_MIN_WIDTH_M = 0.25
+# Distance of the farthest neighbour, in sides of a map cell: 4 m of cells of 2 m. A single ring has fewer points within
+# it, and larger pieces of ground are not plane.
+_MAX_DISTANCE = 2.0
+# Smallest root mean square width of a plane, in sides of a map cell: 0.25 m of cells of 2 m. Points of one ring spread
+# across it only by the noise of a range, about 0.03 m; two rings 1 m apart spread by 0.5 m.
+_MIN_WIDTH = 0.125
 
 
 class RingPlanes:
-    """Fits planes to ring points of the last keyframes, map frame; starts empty."""
+    """Fits planes to ring points of the last keyframes, map frame; starts empty.
 
-    def __init__(self) -> None:
+    Args:
+        side_m: of the map's cells.
+    """
+
+    def __init__(self, side_m: float) -> None:
+        self._max_distance_m, self._min_width_m = _MAX_DISTANCE * side_m, _MIN_WIDTH * side_m
         self._recent: list[Array] = []
 
     def add_keyframe(self, points: Array, threads: int) -> tuple[Index, FittedPlanes]:
@@ -42,7 +47,7 @@ class RingPlanes:
             return np.empty(0, np.intp), fit_planes(np.empty((0, MIN_NEIGHBOURS, 3)))
         count, useful = min(_NEIGHBOURS, len(everything)), threads_for(2 * len(points), threads)
         index, distance2 = build_tree(everything, threads).batch_knn_search(points, count, useful)
-        near = np.flatnonzero(distance2[:, -1] < _MAX_DISTANCE_M**2)
+        near = np.flatnonzero(distance2[:, -1] < self._max_distance_m**2)
         planes = fit_planes(everything.take(index[near], axis=0))
-        wide = planes.width_m > _MIN_WIDTH_M
+        wide = planes.width_m > self._min_width_m
         return near[wide], FittedPlanes(*(column[wide] for column in planes))

@@ -39,7 +39,8 @@ class LocalMapSettings:
 
     Attributes:
         keyframe_m, keyframe_deg: a scan this far from the last keyframe, or turned by this much, becomes a keyframe.
-        voxel_m: side of the map's cells; each holds up to ten points at least 10 cm apart.
+        voxel_m: side of the map's cells; each holds up to ten points.
+        spacing_m: a point nearer than this to one of an earlier keyframe is not added.
         horizon_keyframes: a cell that this number of keyframes has not hit is dropped at the next rebuild.
         radius_m: points farther from the keyframe are left out of the surface at a rebuild.
         neighbours: number of points that a plane is fitted to.
@@ -54,13 +55,16 @@ class LocalMapSettings:
     keyframe_m: float = 2.0
     keyframe_deg: float = 10.0
     voxel_m: float = 2.0
+    spacing_m: float = 0.1
     horizon_keyframes: int = 30
     radius_m: float = 100.0
     neighbours: int = 10
     threads: int = 2
 
     def __post_init__(self) -> None:
-        check_positive(self, "keyframe_m", "keyframe_deg", "voxel_m", "horizon_keyframes", "radius_m", "threads")
+        check_positive(
+            self, "keyframe_m", "keyframe_deg", "voxel_m", "spacing_m", "horizon_keyframes", "radius_m", "threads"
+        )
         check_setting(
             self, "neighbours", self.neighbours >= MIN_NEIGHBOURS, f"{MIN_NEIGHBOURS} or more, as a plane needs"
         )

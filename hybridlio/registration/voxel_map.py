@@ -15,6 +15,7 @@ from hybridlio.cloud.voxel import voxel_labels
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Index
 from hybridlio.registration.ring_planes import RingPlanes
+from hybridlio.registration.settings import LocalMapSettings
 from hybridlio.registration.surface import Surface
 
 Keys = NDArray[np.int64]
@@ -23,11 +24,9 @@ _KEY_BITS = 21  # per axis, so that three fit into 63 bits of an int64: ±2000 k
 _KEY_ORIGIN = 1 << (_KEY_BITS - 1)
 
 MAX_POINTS_PER_CELL = 10  # of a cell of 2 m: enough for a plane on each of two surfaces, few enough for quick searches
-# Between points of different scans, about three times the noise of a range: nearer ones add nothing.
-_MIN_SPACING_M = 0.1
-# A sensor is sparse if more than this share of its points within this range have neighbours of a single ring. Of 64
-# beams none has, of 16 beams one in six.
-_SPARSE_RANGE_M = 20.0
+# A sensor is sparse if more than this share of its points within this range, in sides of a cell (20 m of cells of 2 m),
+# have neighbours of a single ring. Of 64 beams none has, of 16 beams one in six.
+_SPARSE_RANGE = 10.0
 _SPARSE_SHARE = 0.05
 
 
@@ -35,23 +34,28 @@ class VoxelMap:
     """Points with planes, map frame; starts empty.
 
     Args:
-        side_m: of the cells.
-        horizon: number of insertions after which a cell that none of them has hit is dropped.
-        neighbours: points of a scan that a plane is fitted to.
-        threads: for trees.
+        settings: side of the cells, spacing and number of neighbours, horizon, threads.
     """
 
-    def __init__(self, side_m: float, horizon: int, neighbours: int, threads: int) -> None:
-        self._side_m, self._horizon, self._neighbours, self._threads = side_m, horizon, neighbours, threads
-        self._cells, self._ring_planes = CellTable(), RingPlanes()
+    def __init__(self, settings: LocalMapSettings) -> None:
+        self._settings = settings
+        self._cells, self._ring_planes = CellTable(), RingPlanes(settings.voxel_m)
         self._parts: list[Planes] = []  # of every insertion since cells were last dropped
         self._insertions = 0
+
+    def rescale(self, settings: LocalMapSettings) -> None:
+        """Go on with cells of another side; all points stay, and count as hit by the last insertion."""
+        self._settings = settings
+        self._cells, self._ring_planes = CellTable(), RingPlanes(settings.voxel_m)
+        if self._parts:
+            labels, cells = cells_of(np.concatenate([part.points for part in self._parts]), settings.voxel_m)
+            self._cells.record_hits(cells, np.bincount(labels, minlength=len(cells)), self._insertions - 1)
 
     def insert(self, points: Array, T_map_lidar: Array, surface: Surface | None) -> Planes:
         """Add those of a scan's points for which there is room.
 
-        Points within 10 cm of the surface's and points whose neighbours make no plane are left out. For a sparse
-        sensor, points whose neighbours belong to one ring get a plane from the last keyframes' points.
+        Points nearer to the surface's than the spacing and points whose neighbours make no plane are left out. For a
+        sparse sensor, points whose neighbours belong to one ring get a plane from the last keyframes' points.
 
         Args:
             points: ``(N, 3)`` lidar frame.
@@ -61,17 +65,18 @@ class VoxelMap:
         Returns:
             the points that were added, with their planes.
         """
+        spacing_m, threads = self._settings.spacing_m, self._settings.threads
         moved = se3.transform(T_map_lidar, points)
-        labels, cells = cells_of(moved, self._side_m)
+        labels, cells = cells_of(moved, self._settings.voxel_m)
         chosen = _fit_capacity(MAX_POINTS_PER_CELL - self._cells.counts(cells), labels)
         if surface is not None and len(chosen):
-            chosen = chosen[surface.nearest(moved[chosen], self._threads)[1] >= _MIN_SPACING_M**2]
-        in_scan, planes, on_one_ring = _split_by_plane(points, chosen, self._neighbours, self._threads)
-        if not _is_sparse(points[chosen], points[on_one_ring]):
+            chosen = chosen[surface.nearest(moved[chosen], threads)[1] >= spacing_m**2]
+        in_scan, planes, on_one_ring = _split_by_plane(points, chosen, self._settings.neighbours, threads)
+        if not _is_sparse(points[chosen], points[on_one_ring], _SPARSE_RANGE * self._settings.voxel_m):
             on_one_ring = on_one_ring[
                 :0
             ]  # distant rings of a dense sensor are not needed, and such planes are less exact
-        across_scans, ring_planes = self._ring_planes.add_keyframe(moved[on_one_ring], self._threads)
+        across_scans, ring_planes = self._ring_planes.add_keyframe(moved[on_one_ring], threads)
         added = np.concatenate([in_scan, on_one_ring[across_scans]])
         self._cells.record_hits(cells, np.bincount(labels[added], minlength=len(cells)), self._insertions)
         self._insertions += 1
@@ -83,8 +88,8 @@ class VoxelMap:
     def drop_expired(self) -> Planes:
         """Drop the cells that the last insertions have not hit, and return all remaining points."""
         everything = Planes(*(np.concatenate(column) for column in zip(*self._parts, strict=True)))
-        self._cells.drop_before(self._insertions - self._horizon)
-        labels, cells = cells_of(everything.points, self._side_m)
+        self._cells.drop_before(self._insertions - self._settings.horizon_keyframes)
+        labels, cells = cells_of(everything.points, self._settings.voxel_m)
         kept = self._cells.contains(cells)
         if not kept.all():
             everything = Planes(*(column[kept[labels]] for column in everything))
@@ -92,9 +97,9 @@ class VoxelMap:
         return everything
 
 
-def _is_sparse(points: Array, on_one_ring: Array) -> bool:
+def _is_sparse(points: Array, on_one_ring: Array, range_m: float) -> bool:
     """Return whether many of the points near the lidar have neighbours of one ring only."""
-    near, near_on_one_ring = (np.einsum("ij,ij->i", p, p) < _SPARSE_RANGE_M**2 for p in (points, on_one_ring))
+    near, near_on_one_ring = (np.einsum("ij,ij->i", p, p) < range_m**2 for p in (points, on_one_ring))
     return bool(near_on_one_ring.sum() > _SPARSE_SHARE * near.sum())
 
 

@@ -15,12 +15,13 @@ from hybridlio.core.motion_limits import (
     UNKNOWN_TRANSLATION_SIGMA_M,
     VAGUE_TRANSLATION_SIGMA_M,
 )
-from hybridlio.core.sensors import NS_PER_S, Frame
+from hybridlio.core.sensors import NS_PER_S, Frame, Scan
 from hybridlio.registration.degeneracy import ObservedRegistration, RegistrationProblem, register_with_degeneracy
 from hybridlio.registration.icp import Registration
 from hybridlio.registration.local_map import LocalMap
-from hybridlio.registration.motion_search import COARSE_KERNEL_M, best_start, fits_better, motions
+from hybridlio.registration.motion_search import best_start, coarse_kernel_m, fits_better, motions
 from hybridlio.sources.matching_state import MatchingState, PathPoint
+from hybridlio.sources.scene_scale import SceneScale
 from hybridlio.sources.settings import ScanMatchingSettings
 from hybridlio.sources.thinned_scan import ThinnedScan, thin
 
@@ -28,7 +29,6 @@ from hybridlio.sources.thinned_scan import ThinnedScan, thin
 # 10 m away by 0.2 m, two of the default kernels.
 _UNKNOWN_ROTATION_SIGMA_RAD = 0.02
 _LEVER_M = 10.0  # half of a scan's points are nearer; turns a rotation's uncertainty into a displacement
-_WIDEST_KERNEL_M = 1.0  # the default distance within which points are matched: a wider kernel would have no effect
 _LOST_COST = 0.6  # mean cost of the points, 0 to 1; well above that of any scan that is placed correctly
 # The local map is least reliable while it is young: one keyframe has ground along its own rings only, and normals
 # between them are guesses. Its covariance is inflated by 1 + 5/keyframes, and at least half of it, divided by
@@ -52,7 +52,7 @@ class ScanMatching:
     name = "scan-matching"
 
     def __init__(self, settings: ScanMatchingSettings | None = None) -> None:
-        self._settings = settings or ScanMatchingSettings()
+        self._scale = SceneScale(settings or ScanMatchingSettings())
         self._map = LocalMap(self._settings.local_map)
         self._state = MatchingState(PathPoint(np.eye(4)), PathPoint(np.eye(4)))
         self._stamp_ns = 0
@@ -64,11 +64,11 @@ class ScanMatching:
         Raises:
             DataError: it has too few points.
         """
-        scan = thin(frame.scan, self._settings)
+        scan = self._thin(frame.scan)
         if len(scan.points) < self._settings.min_points:
             raise DataError(
-                f"frame {frame.index}: only {len(scan.points)} points between {self._settings.min_range_m} and "
-                f"{self._settings.max_range_m} m; start at a scan with at least {self._settings.min_points}"
+                f"frame {frame.index}: only {len(scan.points)} points between {self._settings.min_range_m:.2g} "
+                f"and {self._settings.max_range_m:g} m; start at a scan with at least {self._settings.min_points}"
             )
         self._map = LocalMap(self._settings.local_map)
         self._state = MatchingState.started(scan.points)
@@ -78,7 +78,7 @@ class ScanMatching:
     def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:
         """Register the scan; where that fails, return the initial pose with ``ok`` False."""
         self._insert_pending_keyframe()
-        self.current_scan = scan = thin(frame.scan, self._settings)
+        self.current_scan = scan = self._thin(frame.scan)
         dt_s = (frame.scan.stamp_ns - self._stamp_ns) / NS_PER_S
         self._stamp_ns = frame.scan.stamp_ns
         usable = len(scan.points) >= self._settings.min_points and self._map.surface is not None
@@ -86,6 +86,19 @@ class ScanMatching:
         if observed is None or observed.registration.matched < self._settings.min_matched:
             return self._bridge(scan, initial, observed)
         return self._accept(scan, initial, observed, dt_s)
+
+    @property
+    def _settings(self) -> ScanMatchingSettings:
+        """The settings at the scene's scale."""
+        return self._scale.settings
+
+    def _thin(self, scan: Scan) -> ThinnedScan:
+        """Thin a scan at the scene's scale, which it may change; the map then goes on at the new one."""
+        thinned = thin(scan, self._settings)
+        while len(scan) >= self._settings.min_points and self._scale.observe(thinned.view_m):
+            self._map.rescale(self._settings.local_map)
+            thinned = thin(scan, self._settings)
+        return thinned
 
     def take_back(self, initial: RelativePose) -> None:
         """Discard the last match: the path continues by ``initial``, and the scan does not enter the map."""
@@ -105,7 +118,7 @@ class ScanMatching:
         if too_few or earlier.surface is None:
             return replace(initial, ok=False)
         settings = self._settings.registration
-        kernel_start_m = min(max(settings.kernel_m, initial.translation_sigma_m), _WIDEST_KERNEL_M)
+        kernel_start_m = min(max(settings.kernel_m, initial.translation_sigma_m), settings.max_distance_m)
         problem = RegistrationProblem(earlier.surface, current.source, settings, current.points, np.eye(4))
         observed = register_with_degeneracy(problem, initial.pose, kernel_start_m)
         if observed.registration.matched < self._settings.min_matched:
@@ -202,7 +215,9 @@ class ScanMatching:
         if last.twist is None or self._map.surface is None:
             return None
         settings, start = self._settings, last.T_map_lidar @ se3.exp(last.twist * dt_s)
-        observed = register_with_degeneracy(self._problem(scan), start, COARSE_KERNEL_M, is_start_vague=True)
+        observed = register_with_degeneracy(
+            self._problem(scan), start, coarse_kernel_m(settings.registration), is_start_vague=True
+        )
         fits = observed.registration.matched >= settings.min_matched and observed.registration.cost < _LOST_COST
         return observed if fits else None
 
@@ -220,7 +235,8 @@ class ScanMatching:
         problem, is_vague = self._problem(scan), _is_vague(initial)
         surface, settings = problem.surface, problem.settings
         sideways_m = _LEVER_M * float(np.sqrt(initial.covariance[:3, :3].trace()))
-        kernel_start_m = min(max(settings.kernel_m, initial.translation_sigma_m, sideways_m), _WIDEST_KERNEL_M)
+        # beyond the distance within which points are matched, a wider kernel has no effect
+        kernel_start_m = min(max(settings.kernel_m, initial.translation_sigma_m, sideways_m), settings.max_distance_m)
         if initial.proposed is not None:
             proposed = self._state.current.T_map_lidar @ initial.proposed
             if fits_better(surface, scan.source, proposed, start, kernel_start_m, settings.threads):

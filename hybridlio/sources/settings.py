@@ -14,6 +14,9 @@ class ScanMatchingSettings:
     """How scans are matched.
 
     Attributes:
+        scene_scale: factor on the default lengths and speeds below, which hold for streets. By default it follows from
+            the scans, see :mod:`hybridlio.sources.scene_scale`; 1 keeps the defaults everywhere. A length that is not
+            the default is used as it is.
         target: what a scan is matched to: the ``local-map`` of recent keyframes, or the ``last-scan`` alone.
         min_range_m, max_range_m: points nearer or farther are dropped.
         map_voxel_m: side of the voxels that a scan is averaged over for the map.
@@ -38,12 +41,13 @@ class ScanMatchingSettings:
     __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  (read from YAML: unknown keys are errors)
 
     target: Literal["local-map", "last-scan"] = "local-map"
+    scene_scale: float | None = None
     min_range_m: float = 2.0
     max_range_m: float = 100.0
     map_voxel_m: float = 0.6
     source_voxel_m: float = 1.0
     least_measured: int = 20_000
-    min_points: int = 200
+    min_points: int = 50
     min_matched: float = 0.3
     covariance_scale: float = 5.0
     drift_share: float = 0.1
@@ -54,6 +58,8 @@ class ScanMatchingSettings:
 
     def __post_init__(self) -> None:
         check_setting(self, "target", self.target in ("local-map", "last-scan"), "local-map or last-scan")
+        if self.scene_scale is not None:
+            check_setting(self, "scene_scale", 0 < self.scene_scale <= 1, "above 0 and at most 1")
         check_positive(self, "map_voxel_m", "source_voxel_m", "covariance_scale")
         check_not_negative(self, "min_range_m", "min_points", "least_measured")
         check_fraction(self, "min_matched", "drift_share")

@@ -19,6 +19,7 @@ _VOXEL_SHRINKAGE = 0.7  # halves a voxel's area, so about doubles its points, at
 # A scan of this many times `least_measured` points is never too sparse: a quarter of them at least is registered with
 # the default voxels, and counting the points in range is saved.
 _AMPLE = 4
+NEAREST_M = 0.3  # no lidar of today measures well below it, and what carries the sensor is often nearer
 
 
 @dataclass(eq=False)
@@ -28,11 +29,13 @@ class ThinnedScan:
     Attributes:
         points: ``(N, 3)`` metres, lidar frame, one a voxel, for the map.
         source: ``(M, 3)`` some of ``points``, to register.
+        view_m: median range of the averaged points beyond :data:`NEAREST_M`, in range or not; NaN without points.
         settings: settings of the surface that the scan makes by itself.
     """
 
     points: Array
     source: Array
+    view_m: float
     settings: LocalMapSettings
 
     @cached_property
@@ -46,8 +49,11 @@ class ThinnedScan:
 def thin(scan: Scan, settings: ScanMatchingSettings) -> ThinnedScan:
     """Average the scan's points over voxels of ``map_voxel_m``, drop those out of range, and pick some to register."""
     points = voxel_average(scan.points, None, settings.map_voxel_m)[0].astype(np.float64)
-    points = np.asarray(points[_in_range(points, settings)])
-    return ThinnedScan(points, _pick_source(points, scan, settings), settings.local_map)
+    range2 = np.einsum("ij,ij->i", points, points)
+    seen = range2[range2 > NEAREST_M**2]
+    view_m = float(np.sqrt(np.median(seen))) if len(seen) else np.nan
+    points = np.asarray(points[_in_range(range2, settings)])
+    return ThinnedScan(points, _pick_source(points, scan, settings), view_m, settings.local_map)
 
 
 def _pick_source(points: Array, scan: Scan, settings: ScanMatchingSettings) -> Array:
@@ -58,13 +64,14 @@ def _pick_source(points: Array, scan: Scan, settings: ScanMatchingSettings) -> A
     side_m, finest_m = settings.source_voxel_m, settings.map_voxel_m / 2
     picked = voxel_pick(points, side_m)
     if len(scan) < _AMPLE * settings.least_measured:
-        measured_per_point = np.count_nonzero(_in_range(scan.points, settings)) / max(len(points), 1)
+        measured_per_point = np.count_nonzero(
+            _in_range(np.einsum("ij,ij->i", scan.points, scan.points), settings)
+        ) / max(len(points), 1)
         while measured_per_point * len(picked) < settings.least_measured and side_m > finest_m:
             side_m *= _VOXEL_SHRINKAGE
             picked = voxel_pick(points, side_m)
     return points.take(picked, axis=0)
 
 
-def _in_range(points: Array | Floats, settings: ScanMatchingSettings) -> Mask:
-    range2 = np.einsum("ij,ij->i", points, points)
+def _in_range(range2: Array | Floats, settings: ScanMatchingSettings) -> Mask:
     return np.asarray((range2 > settings.min_range_m**2) & (range2 < settings.max_range_m**2))

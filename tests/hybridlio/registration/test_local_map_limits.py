@@ -84,7 +84,7 @@ def test_a_sensor_is_sparse_if_many_near_points_are_on_single_rings(
     """16 beams have one such point in six, 64 beams hardly any; distant points do not count."""
     near, distant = floor(rng, 10.0, 1000), floor(rng, 10.0, 1000) + np.array([40.0, 0.0, 0.0])
     on_one_ring = np.concatenate([near[: int(share * 1000)], distant])
-    assert voxel_map._is_sparse(np.concatenate([near, distant]), on_one_ring) == sparse
+    assert voxel_map._is_sparse(np.concatenate([near, distant]), on_one_ring, voxel_map._SPARSE_RANGE * 2.0) == sparse
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

@@ -29,12 +29,12 @@ NORMAL = np.array([-np.sin(GRADE), 0.0, np.cos(GRADE)])
 
 
 def test_a_single_ring_makes_no_plane():
-    index, planes = RingPlanes().add_keyframe(noisy(ring(-5.0), 0), 1)
+    index, planes = RingPlanes(side_m=2.0).add_keyframe(noisy(ring(-5.0), 0), 1)
     assert len(index) == len(planes.normals) == len(planes.weights) == 0
 
 
 def test_rings_of_two_keyframes_make_planes_of_the_ground():
-    loose = RingPlanes()
+    loose = RingPlanes(side_m=2.0)
     loose.add_keyframe(noisy(ring(-5.0), 0), 1)
     second = noisy(ring(-5.0, 2.0), 1)
     index, planes = loose.add_keyframe(second, 1)
@@ -45,21 +45,21 @@ def test_rings_of_two_keyframes_make_planes_of_the_ground():
 
 
 def test_the_same_ring_from_the_same_place_makes_no_plane():
-    loose = RingPlanes()
+    loose = RingPlanes(side_m=2.0)
     for seed in range(4):
         index, _ = loose.add_keyframe(noisy(ring(-5.0), seed), 1)
         assert len(index) == 0
 
 
 def test_rings_too_far_apart_make_no_plane():
-    loose = RingPlanes()
+    loose = RingPlanes(side_m=2.0)
     loose.add_keyframe(ring(-5.0), 1)
     assert len(loose.add_keyframe(ring(-5.0, 6.0), 1)[0]) == 0
 
 
 @pytest.mark.parametrize(("between", "planes"), [(3, True), (4, False)])
 def test_only_the_last_keyframes_are_used(between: int, planes: bool):
-    loose = RingPlanes()
+    loose = RingPlanes(side_m=2.0)
     loose.add_keyframe(ring(-5.0), 1)
     for k in range(between):
         loose.add_keyframe(ring(-5.0, 500.0 * (k + 1)), 1)
@@ -67,7 +67,7 @@ def test_only_the_last_keyframes_are_used(between: int, planes: bool):
 
 
 def test_few_or_no_points_are_not_an_error():
-    loose = RingPlanes()
+    loose = RingPlanes(side_m=2.0)
     assert len(loose.add_keyframe(np.empty((0, 3)), 1)[0]) == 0
     assert len(loose.add_keyframe(ring(-5.0)[:3], 1)[0]) == 0
 
