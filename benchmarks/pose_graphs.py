@@ -2,9 +2,8 @@
 
 FOLDER holds g2o files. GTSAM solves each from the file's initial values and from its own best initialisation (3-D:
 chordal; 2-D: LAGO, which accepts diagonal noise only). GTSAM's best result is the one with the smallest error, or the
-faster of equal ones. Both times include reading, initial values and solving. ``--outliers`` adds 10 % wrong loop
-closures by seed and lets ``gnc`` find them. ``--bad-starts`` replaces the initial values of sphere2500 and torus3D (or
-of the files named) by bad ones, and prints the error reached relative to the best.
+faster of equal ones. Both times include reading, initial values and solving. ``--bad-starts`` replaces the initial
+values of sphere2500 and torus3D (or of the files named) by bad ones, and prints the error reached relative to the best.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ from scipy.spatial.transform import Rotation
 
 from hybridlio.core import se3
 from hybridlio.graph import PoseGraph
-from hybridlio.graph.model.coordinates import to_matrices
 
 _EQUAL = 1e-5  # relative difference of equal errors, GTSAM's own tolerance for convergence
 
@@ -95,36 +93,6 @@ def compare(path: Path, runs: int) -> None:
     )
 
 
-def with_wrong_loops(path: Path, seed: int) -> tuple[PoseGraph, set[int]]:
-    """Return a graph with 10 % wrong loops between random poses, copies of its right ones, and their ids."""
-    graph, rng = PoseGraph.load(path), np.random.default_rng(seed)
-    edges = [factor for factor in graph.factors.values() if factor.kind == "between"]
-    loops = [edge for edge in edges if abs(edge.keys[0] - edge.keys[1]) != 1]
-    wrong: set[int] = set()
-    while len(wrong) < round(0.1 * len(loops)):
-        i, j = (int(k) for k in rng.choice(len(graph), 2, replace=False))
-        copied = loops[rng.integers(len(loops))]
-        if abs(i - j) > 1:
-            pose = to_matrices(copied.measured[None])[0]
-            wrong.add(graph.add_between(i, j, pose, information=copied.noise.information))
-    return graph, wrong
-
-
-def compare_with_outliers(path: Path, seed: int) -> None:
-    clean = PoseGraph.load(path).optimize().poses[:, :3, 3]
-    graph, wrong = with_wrong_loops(path, seed)
-    begin = time.perf_counter()
-    solution = graph.optimize("gnc")
-    spent_s = time.perf_counter() - begin
-    rmse = np.sqrt(((solution.poses[:, :3, 3] - clean) ** 2).sum(axis=1).mean())
-    spread = np.sqrt(((clean - clean.mean(axis=0)) ** 2).sum(axis=1).mean())
-    missed, lost = len(wrong - solution.rejected), len(solution.rejected - wrong)
-    print(
-        f"{path.stem:16s} {seed:5d} {len(wrong):6d} {missed:7d} {lost:6d} {100 * rmse / spread:12.5f} {spent_s:8.2f}",
-        flush=True,
-    )
-
-
 def bad_starts(count: int, extent_m: float, seeds: int) -> dict[str, np.ndarray]:
     """Return initial poses by name: all at the identity, and random positions and attitudes by seed."""
     starts = {"identity": np.tile(np.eye(4), (count, 1, 1))}
@@ -153,8 +121,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="of g2o files")
     parser.add_argument("names", nargs="*", metavar="NAME", help="files without .g2o (default: all)")
-    parser.add_argument("--runs", type=int, default=3, help="repeats, or seeds (default: %(default)s)")
-    parser.add_argument("--outliers", action="store_true", help="add wrong loops for gnc to find")
+    parser.add_argument("--runs", type=int, default=3, help="repeats, or seeds of bad starts (default: %(default)s)")
     parser.add_argument("--bad-starts", action="store_true", help="start from bad initial values")
     options = parser.parse_args()
     if options.bad_starts:
@@ -163,12 +130,6 @@ def main() -> None:
             compare_bad_starts(options.folder / f"{name}.g2o", options.runs)
         return
     paths = [options.folder / f"{name}.g2o" for name in options.names] or sorted(options.folder.glob("*.g2o"))
-    if options.outliers:
-        print(f"{'':16s} {'seed':>5s} {'wrong':>6s} {'missed':>7s} {'lost':>6s} {'RMSE [%]':>12s} {'s':>8s}")
-        for path in paths:
-            for seed in range(options.runs):
-                compare_with_outliers(path, seed)
-        return
     print(
         f"{'errors and times':16s} {'gtsam given':>12s} {'gtsam own':>12s} {'ours':>12s} "
         f"{'gtsam s':>8s} {'ours s':>8s} {'ratio':>6s} {'solve':>6s}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hybridlio.graph.model.checks import check_determined, check_observed
 from hybridlio.graph.model.graph_data import GraphData
-from hybridlio.graph.solve.gnc import odometry_start, reject_outliers
+from hybridlio.graph.outliers.rejection import reject_outliers
 from hybridlio.graph.solve.growing_start import grow_start
 from hybridlio.graph.solve.initial_values import choose_start
 from hybridlio.graph.solve.nonlinear import IterationProgress, NonlinearSolver
@@ -29,10 +29,9 @@ def solve_batch(graph: GraphData, settings: Settings, report: IterationProgress)
 
 
 def _solve_without_outliers(data: GraphData, settings: Settings, report: IterationProgress) -> Solution:
-    start = odometry_start(data) if settings.initial == "auto" else None
-    start = choose_start(data, settings.initial) if start is None else start
-    start, rejected = reject_outliers(data, start, report)
-    kept = data.copy(without=rejected)
+    start = None if settings.initial == "auto" else choose_start(data, settings.initial)
+    found = reject_outliers(data, start, report)
+    kept = data.copy(without=found.wrong)
     check_determined(kept)
     solver = NonlinearSolver(kept, settings.max_iterations, settings.tolerance, report)
-    return Solution(data, solver(start), rejected)
+    return Solution(data, solver(found.start), found.wrong, found.doubts)

@@ -31,14 +31,22 @@ class Solution:
         iterations: Gauss-Newton and Levenberg-Marquardt steps.
         converged: whether the error had stopped falling.
         rejected: ids of the factors that ``gnc`` found to be wrong; empty for other backends.
+        doubtful: reasons why the solution may be wrong; empty where nothing speaks against it.
     """
 
-    def __init__(self, data: GraphData, result: SolverResult, rejected: frozenset[int] = frozenset()) -> None:
+    def __init__(
+        self,
+        data: GraphData,
+        result: SolverResult,
+        rejected: frozenset[int] = frozenset(),
+        doubts: tuple[str, ...] = (),
+    ) -> None:
         self.error_before = result.error_before
         self.error = result.error
         self.iterations = result.iterations
         self.converged = result.converged
         self.rejected = rejected
+        self.doubtful = doubts if result.converged else (*doubts, f"not converged after {result.iterations} iterations")
         self._data = data
         self._result = result
         self._index = data.index
@@ -47,9 +55,10 @@ class Solution:
         state = "converged" if self.converged else "not converged"
         landmarks = f"{len(self.landmarks)} landmarks, " if self.landmarks else ""
         rejected = f", {len(self.rejected)} factors rejected" if self.rejected else ""
+        doubts = f", doubtful: {'; '.join(self.doubtful)}" if self.doubtful else ""
         return (
             f"<Solution: {len(self._index)} poses, {landmarks}error {self.error_before:.6g} -> {self.error:.6g} "
-            f"in {self.iterations} iterations, {state}{rejected}>"
+            f"in {self.iterations} iterations, {state}{rejected}{doubts}>"
         )
 
     def __contains__(self, key: object) -> bool:

@@ -9,6 +9,7 @@ here the set is grown greedily.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -65,6 +66,18 @@ class LoopArrays:
     covariances: Array
 
 
+class Odometry(Protocol):
+    """Relative poses along odometry, with covariances of right perturbations."""
+
+    def relative(self, i: Index, j: Index) -> Array:
+        """Return ``T_i_j`` ``(…, 4, 4)``."""
+        ...
+
+    def covariance(self, i: Index, j: Index) -> Array:
+        """Return the covariance ``(…, 6, 6)`` of :meth:`relative`."""
+        ...
+
+
 def odometry_chi2(loops: LoopArrays, chain: OdometryChain, scale: float) -> Array:
     """Return χ² ``(M,)`` of the difference between each loop and odometry, with odometry's covariances scaled."""
     predicted = chain.relative(loops.earlier, loops.later)
@@ -77,24 +90,30 @@ def pairwise_chi2(loops: LoopArrays, chain: OdometryChain, scale: float) -> Arra
     out = np.zeros((len(loops.earlier), len(loops.earlier)))
     for a in range(len(out) - 1):
         rest = np.arange(a + 1, len(out))
-        out[a, rest] = out[rest, a] = _cycle_chi2(loops, a, rest, chain, scale)
+        out[a, rest] = out[rest, a] = cycle_chi2(loops, np.full(len(rest), a), rest, chain, scale)
     return out
 
 
-def _cycle_chi2(loops: LoopArrays, a: int, b: Index, chain: OdometryChain, scale: float) -> Array:
-    """χ² of cycles: loop ``a``, odometry to the later end of ``b``, back along ``b``, odometry to the start of ``a``.
+def cycle_chi2(loops: LoopArrays, a: Index, b: Index, chain: Odometry, scale: float) -> Array:
+    """Return χ² ``(K,)`` of cycles: loop ``a``, odometry to the later end of ``b``, back along ``b`` and to the start.
 
     The covariance of the composed pose sums those of its four parts, each rotated into the frame at the end.
+
+    Args:
+        loops: ``M`` of them.
+        a, b: ``(K,)`` indices of the two loops of each cycle.
+        chain: odometry between the ends of loops.
+        scale: factor on odometry's covariances.
     """
-    start, end = np.full(len(b), loops.earlier[a]), np.full(len(b), loops.later[a])
-    ahead, back = chain.relative(end, loops.later[b]), chain.relative(loops.earlier[b], start)
+    ahead = chain.relative(loops.later[a], loops.later[b])
+    back = chain.relative(loops.earlier[b], loops.earlier[a])
     homeward = se3.inverse(loops.poses[b]) @ back
     error = se3.log(loops.poses[a] @ ahead @ homeward)
     covariance = (
         se3.rotate_covariance(loops.covariances[a], se3.inverse(ahead @ homeward))
-        + se3.rotate_covariance(scale * chain.covariance(end, loops.later[b]), se3.inverse(homeward))
+        + se3.rotate_covariance(scale * chain.covariance(loops.later[a], loops.later[b]), se3.inverse(homeward))
         + se3.rotate_covariance(loops.covariances[b], se3.inverse(homeward))
-        + scale * chain.covariance(loops.earlier[b], start)
+        + scale * chain.covariance(loops.earlier[b], loops.earlier[a])
     )
     return _chi2(error, covariance)
 

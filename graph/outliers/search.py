@@ -1,0 +1,113 @@
+"""Searches for the correct loops: nearest ones first, or all at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from hybridlio.core.arrays import Array, Mask
+from hybridlio.graph.base.truncated_squares import GRADUATION
+from hybridlio.graph.outliers.loop_support import LoopSupport
+from hybridlio.graph.outliers.weighted_solver import WeightedSolver
+
+_FIRST_REACH = 4  # edges: the shortest loops that odometry of a few steps cannot fold
+_COARSE_GRADUATION = 3.0  # within a round, whose candidates start near their places; 1.4 takes three times longer
+# χ² in units of the bound from which a round starts at most: of a loop whose odometry has drifted by a hundred times
+# its stated noise. Higher starts only add steps at which no weight changes.
+_LARGEST_CHI2 = 1e4
+_REPAIRS = 40  # at most, each a solution of the whole graph: all that is rejected in a small graph, a sample in a large
+_SOURCES_AT_ONCE = 256  # rows of distances in memory: 100 MB for 50,000 poses
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The result of one search.
+
+    Attributes:
+        values: GTSAM's values, solved with the correct loops alone.
+        correct: ``(M,)`` which loops are within the bound.
+        cost: the truncated cost there.
+    """
+
+    values: gtsam.Values
+    correct: Mask
+    cost: float
+
+
+def all_at_once(solver: WeightedSolver, start: gtsam.Values) -> Found:
+    """Graduate over all loops together, from their joint solution, as the paper does."""
+    candidates = np.ones(len(solver.loops.i), dtype=bool)
+    values = solver.solve(start, candidates.astype(np.float64))
+    return _refined(solver, *solver.graduate(values, candidates, solver.bound, GRADUATION))
+
+
+def nearest_first(solver: WeightedSolver, start: gtsam.Values, support: LoopSupport, growth: float) -> Found:
+    """Take in loops in rounds, those that span the fewest edges first, so that odometry has not drifted far.
+
+    A round graduates over the loops so far and those whose ends are at most so many edges apart, along odometry and
+    the loops that count as correct; each round takes in loops of ``growth`` times as many. Loops that a neighbour
+    confirms come first, all others when these have made the map rigid.
+
+    Args:
+        solver: of the graph.
+        start: values along the odometry.
+        support: what pairs of neighbouring loops say.
+        growth: factor on the number of edges.
+    """
+    count, poses = len(solver.loops.i), len(solver.poses(start))
+    values, correct, tried = start, np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+    mostly_confirmed = 2 * np.count_nonzero(support.supported) > count
+    phases = [(support.supported, float(_FIRST_REACH)), (np.ones(count, dtype=bool), float(_FIRST_REACH))]
+    if mostly_confirmed:
+        phases[1] = phases[1][0], poses * growth  # the map is rigid: all at once
+    for allowed, reach in phases:
+        while not tried[allowed].all():
+            near = _spans(solver, correct, reach) <= reach if reach < poses else np.ones(count, dtype=bool)
+            candidates = correct | (near & (allowed | tried))
+            if (candidates & ~tried).any():
+                bound = solver.bound * support.scale
+                values, correct = solver.graduate(values, candidates, bound, _COARSE_GRADUATION, _LARGEST_CHI2)
+                tried |= candidates
+            reach *= growth
+    return _refined(solver, values, correct)
+
+
+def repaired(solver: WeightedSolver, found: Found) -> Found:
+    """Take back rejected loops one by one, those of least χ² first, where that lowers the cost."""
+    best, tried = found, found.correct.copy()
+    for _ in range(_REPAIRS):
+        left = np.flatnonzero(~(tried | best.correct))
+        if not len(left):
+            break
+        loop = left[np.argmin(solver.chi2(best.values)[left])]
+        tried[loop] = True
+        with_loop = best.correct.copy()
+        with_loop[loop] = True
+        again = _refined(solver, best.values, with_loop)
+        best = again if again.cost < best.cost else best
+    return best
+
+
+def _refined(solver: WeightedSolver, values: gtsam.Values, correct: Mask) -> Found:
+    values, correct = solver.refine(values, correct)
+    return Found(values, correct, solver.cost(values))
+
+
+def _spans(solver: WeightedSolver, correct: Mask, limit: float) -> Array:
+    """Return the number of edges ``(M,)`` between the ends of each loop, infinite beyond the limit."""
+    loops, odometry = solver.loops, solver.odometry
+    i, j = np.concatenate([odometry.i, loops.i[correct]]), np.concatenate([odometry.j, loops.j[correct]])
+    count = int(max(loops.i.max(), loops.j.max(), i.max(initial=0), j.max(initial=0))) + 1
+    adjacency = coo_matrix((np.ones(len(i)), (i, j)), shape=(count, count)).tocsr()
+    sources, row = np.unique(loops.i, return_inverse=True)
+    spans = np.empty(len(loops.i))
+    for first in range(0, len(sources), _SOURCES_AT_ONCE):
+        some = sources[first : first + _SOURCES_AT_ONCE]
+        distances = dijkstra(adjacency, directed=False, unweighted=True, indices=some, limit=limit)
+        inside = (row >= first) & (row < first + len(some))
+        spans[inside] = distances[row[inside] - first, loops.j[inside]]
+    return spans
