@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -75,6 +76,7 @@ def ablate(
     """
     from hybridlio.datasets.protection import check_output
     from hybridlio.learned.networks.devices import pick_device
+    from hybridlio.runs.new_folder import claimed
     from hybridlio.runs.own_files import TRAINING, table_files
     from hybridlio.runs.training_data import DataOptions
 
@@ -84,14 +86,17 @@ def ablate(
     chosen = _choose_rows(table, None if rows is None else common.split_names(rows), split)
     folder = out or Path("ablation") / f"table-{table}"
     shards = cache or folder.parent / "shards"
-    for output in (folder, shards):
-        check_output(output)
-    for files, place in ((table_files(table), folder), *((TRAINING, folder / row.name) for row in chosen)):
-        files.check(place)
+    check_output(shards)
+    for row in chosen:
+        TRAINING.check(folder / row.name)
     options = DataOptions(shards, None, None, reader, raw_root, topics)
     budget = f"{steps} steps per row{', reduced size' if reduced else ''}"
-    lines = _run_rows(table, chosen, _row_runner(data, test, options, folder, steps, reduced, device))
-    _finish(folder, table, lines, budget)
+    with claimed(folder, table_files(table)) if is_first_process() else nullcontext():
+        if is_first_process():
+            for row in chosen:
+                TRAINING.remove_leftovers(folder / row.name)
+        lines = _run_rows(table, chosen, _row_runner(data, test, options, folder, steps, reduced, device))
+        _finish(folder, table, lines, budget)
 
 
 def _choose_rows(number: int, presets: tuple[str, ...] | None, split: str | None) -> list[TableRow]:

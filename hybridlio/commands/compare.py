@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -53,9 +54,8 @@ def compare(
     _verbosity: common.Verbose = 0,
 ) -> None:
     """Run the odometry on the same scans with every combination of sources, and print a table of the results."""
-    from hybridlio.core.files import make_folder
-    from hybridlio.datasets.protection import check_output
     from hybridlio.runs.compare import combinations, compare_configs, table, write_comparison
+    from hybridlio.runs.new_folder import claimed
     from hybridlio.runs.own_files import COMPARISON
 
     settings = common.load_settings(config)
@@ -66,16 +66,13 @@ def compare(
         settings,
     )
     recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle, topics, rate)
-    if out is not None:  # fail before the runs, not after them
-        check_output(out, data)
-        COMPARISON.check(out)
-        make_folder(out)
-    with progress("comparing") as report:
-        comparison = compare_configs(recording, configs, report)
-    print_table(table(comparison))
-    if out is not None:
-        write_comparison(out, comparison)
-        print_result(f"wrote {out / 'compare.md'} and {out / 'compare.json'}")
+    with nullcontext() if out is None else claimed(out, COMPARISON, data):  # fails before the runs, not after them
+        with progress("comparing") as report:
+            comparison = compare_configs(recording, configs, report)
+        print_table(table(comparison))
+        if out is not None:
+            write_comparison(out, comparison)
+            print_result(f"wrote {out / 'compare.md'} and {out / 'compare.json'}")
     _finish(comparison)
 
 

@@ -44,8 +44,10 @@ def simulate(
     """
     from pydantic import ValidationError
 
+    from hybridlio.datasets.protection import check_output
     from hybridlio.datasets.registry import open_sequence
     from hybridlio.runs.own_files import RUN
+    from hybridlio.runs.whole_folder import held
     from hybridlio.simulation import SimulationConfig
     from hybridlio.simulation import simulate as write_drive
 
@@ -61,8 +63,9 @@ def simulate(
     place = out.expanduser().resolve()
     if run := next((above for above in (place, *place.parents) if RUN.are_in(above)), None):
         raise ConfigError(f"{out} is or lies inside the run folder {run}; choose another folder")
+    check_output(out, may_hold=True)
     try:
-        with progress("simulating") as report:
+        with held(place / f"drive-{config.seed:04d}"), progress("simulating") as report:
             drive = write_drive(out, config, report)
     except KeyboardInterrupt:
         print_message("interrupted; the same command resumes the simulation")

@@ -99,10 +99,10 @@ def train(
     from hybridlio.datasets.protection import check_output
     from hybridlio.learned.networks.devices import pick_device
     from hybridlio.learned.networks.weights import load_weights, weights_path
+    from hybridlio.runs.new_folder import claimed
     from hybridlio.runs.own_files import TRAINING
     from hybridlio.runs.recipes import choose_recipe, for_steps
     from hybridlio.runs.training_data import DataOptions, training_pairs
-    from hybridlio.runs.whole_folder import held
 
     pick_device(device)
     if steps is not None and epochs is not None:
@@ -110,14 +110,11 @@ def train(
     start = load_weights(weights_path(init_from)) if init_from is not None else None
     recipe = choose_recipe(preset, start.recipe if start else None, config, initial_pose, epochs)
     folder = out or Path("training") / recipe.name
-    check_output(folder)
     if cache is not None:
         check_output(cache)
-    with held(folder) if is_first_process() else nullcontext():
-        if is_first_process():
-            TRAINING.check(folder)
-            if overwrite:
-                _clear(folder)
+    with claimed(folder, TRAINING) if is_first_process() else nullcontext():
+        if is_first_process() and overwrite:
+            _clear(folder)
         names = None if sequence is None else common.split_names(sequence)
         options = DataOptions(cache or folder / "shards", initial_pose, names, reader, raw_root, topics)
         with first_process_progress("preparing", "scans") as report:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import datetime
 import fcntl
+import glob
 import os
 import socket
 import uuid
@@ -132,6 +133,13 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def remove_leftovers(path: Path) -> None:
+    """Remove the temporary files that killed processes left of ``path``. No other process may be writing it."""
+    for left in path.parent.glob(f".{glob.escape(path.stem)}.{'[0-9a-f]' * 12}{glob.escape(path.suffix)}"):
+        with contextlib.suppress(OSError):
+            left.unlink()
 
 
 def write_atomically(path: str | os.PathLike[str], data: bytes | str) -> None:

@@ -84,7 +84,7 @@ def run_batch(
     else:
         check_implementations(config)
     check_output(out, *(recording.path for recording in recordings))
-    BATCH.check(out)
+    BATCH.check(out)  # before an engine is started
     parallel, threads = _workers(options, len(recordings))
     jobs = [Job(r, out / r.name, config, threads, options.adapt_config) for r in recordings]
     complete = {job.recording for job in jobs if _is_complete(job, options.overwrite)}
@@ -94,6 +94,7 @@ def run_batch(
     with engines.engine(options.engine, parallel, threads, options.scheduler):
         make_folder(out)
         with held(out):
+            BATCH.remove_leftovers(out)
             for job in missing:
                 _prepare_folder(job, options.overwrite)
             rows = {job.recording: _row(job, DONE_BEFORE if job.recording in complete else NOT_RUN) for job in jobs}

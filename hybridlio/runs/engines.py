@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import threading
+import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -14,6 +18,7 @@ if TYPE_CHECKING:  # the command line imports this module for the name of an eng
 Task = tuple[Callable[..., Any], tuple[Any, ...]]
 
 LOCAL = "loky"
+_WATCH, _WATCH_S = "parent", 0.5  # name of the thread that watches the parent process, and how often it does
 
 
 def is_remote(name: str) -> bool:
@@ -62,7 +67,7 @@ def run_tasks(tasks: Iterable[Task]) -> Generator[Any]:
     """Yield the result of each task: as it ends where the engine supports that, otherwise all together at the end.
 
     Every task runs in another process than this one, even a single task, so that a crash does not end this process.
-    Closing the generator cancels tasks that are still running.
+    Closing the generator cancels tasks that are still running. Processes on this machine end when this one does.
     """
     import joblib
     from joblib.parallel import get_active_backend
@@ -75,7 +80,25 @@ def run_tasks(tasks: Iterable[Task]) -> Generator[Any]:
         pre_dispatch=jobs if jobs > 0 else "all",
         return_as="generator_unordered" if has_generator else "list",
     )
-    yield from parallel(joblib.delayed(call)(*arguments) for call, arguments in tasks)
+    yield from parallel(joblib.delayed(_run_task)(os.getpid(), call, arguments) for call, arguments in tasks)
+
+
+def _run_task(parent: int, call: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+    """Run a task in its process, which ends with its parent, even where that is killed."""
+    if os.getppid() == parent and not any(thread.name == _WATCH for thread in threading.enumerate()):
+        threading.Thread(target=_end_with, args=(parent,), name=_WATCH, daemon=True).start()
+    return call(*arguments)
+
+
+def _end_with(parent: int) -> None:
+    """End this process, without writing anything more, when another process has become its parent.
+
+    Linux can do so by a signal (PR_SET_PDEATHSIG), but sends it when the parent's thread ends that had started the
+    process, and joblib starts processes from several threads.
+    """
+    while os.getppid() == parent:
+        time.sleep(_WATCH_S)
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.files import make_folder
 from hybridlio.datasets.protection import check_output
 from hybridlio.runs.folder import is_own_file
-from hybridlio.runs.own_files import RUN, check_free
+from hybridlio.runs.own_files import RUN, OwnFiles, check_free
 from hybridlio.runs.whole_folder import JOURNAL, STATE, discard_journal, held, partial_folder, recover
 
 _log = logging.getLogger(__name__)
@@ -57,6 +57,23 @@ def new_run_folder(
         if out is None:
             with suppress(OSError):  # it holds the run
                 folder.rmdir()
+
+
+@contextmanager
+def claimed(folder: Path, files: OwnFiles, *recordings: str | os.PathLike[str]) -> Iterator[None]:
+    """Hold a folder while a command writes its files there; what a killed process left of them is removed.
+
+    Raises:
+        ConfigError: the folder touches a recording, holds files of these names by somebody else, or is being written by
+            another process.
+        DataError: the folder cannot be created.
+    """
+    check_output(folder, *recordings)
+    files.check(folder)
+    make_folder(folder)
+    with held(folder):
+        files.remove_leftovers(folder)
+        yield
 
 
 def _take_up(folder: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hybridlio.core.errors import ConfigError
+from hybridlio.core.files import remove_leftovers
 from hybridlio.runs.folder import FILES, JOB, LOG, METRICS, RECORD, SMOOTHED, is_own_file
 from hybridlio.runs.whole_folder import JOURNAL
 
@@ -29,6 +30,11 @@ class OwnFiles:
     def are_in(self, folder: Path) -> bool:
         """Return whether the command wrote its files to the folder before."""
         return self.keys <= _keys(folder / self.marker)
+
+    def remove_leftovers(self, folder: Path) -> None:
+        """Remove what killed processes left of the files. The caller holds the folder."""
+        for name in self.names:
+            remove_leftovers(folder / name)
 
     def check(self, folder: Path) -> None:
         """Check that writing the files, or removing them, concerns no file of somebody else.

@@ -32,7 +32,7 @@ from hybridlio.datasets.rosbag.choices import NO_CHOICE, BagTopics
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.learned.data.pairs import Pairs
 from hybridlio.learned.data.preparing import KnownMotion, prepare_shard
-from hybridlio.learned.data.shards import FORMAT, Shard
+from hybridlio.learned.data.shards import FORMAT, Shard, remove_leftovers
 from hybridlio.learned.paper_tables import split as sequences_of
 from hybridlio.learned.settings import NetworkSettings, Recipe
 from hybridlio.odometry.config import Config
@@ -208,6 +208,7 @@ def _prepare_once(
     """Prepare the recording unless its shard exists; return False if another process is at it and ``wait`` is False."""
     with locked(folder.with_name(f".{folder.name}.lock"), wait) as holder:
         if holder is None and not (folder / "shard.json").is_file():
+            remove_leftovers(folder)
             _prepare(sequence, folder, recipe, options.initial_pose, report)
         return holder is None
 

@@ -7,6 +7,7 @@ reference) are in the scan's row; row 0 has none.
 
 from __future__ import annotations
 
+import glob
 import json
 import os
 import shutil
@@ -106,6 +107,12 @@ def write_shard(
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     return info
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what killed processes left of a shard. No other process may be writing it."""
+    for left in folder.parent.glob(f".{glob.escape(folder.name)}.{'[0-9a-f]' * 12}"):
+        shutil.rmtree(left, ignore_errors=True)
 
 
 def _write_arrays(folder: Path, scans: Iterable[ScanRecord], geometry: MapGeometry, imu_samples: int) -> int:

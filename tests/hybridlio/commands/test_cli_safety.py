@@ -103,17 +103,71 @@ def test_a_simulation_is_not_written_into_a_run(finished_run, tmp_path):
 
 def test_a_second_writer_is_refused(recording, finished_run, tmp_path):
     folder = shutil.copytree(finished_run, tmp_path / "run")
-    code = "import sys; from pathlib import Path; from hybridlio.runs.whole_folder import held\n"
-    code += "with held(Path(sys.argv[1])), held(Path(sys.argv[1]) / 'smoothed'): print(1, flush=True); sys.stdin.read()"
-    words = [sys.executable, "-c", code, str(folder)]
+    other_folders = [tmp_path / name for name in ("comparison", "batch", "training", "table", "town/drive-0001")]
+    compared, batched, trained, table, drive = other_folders
+    code = """import sys
+from contextlib import ExitStack
+from pathlib import Path
+from hybridlio.runs.whole_folder import held
+with ExitStack() as stack:
+    for folder in sys.argv[1:]:
+        stack.enter_context(held(Path(folder)))
+    print(1, flush=True)
+    sys.stdin.read()
+"""
+    words = [sys.executable, "-c", code, *map(str, (folder, folder / "smoothed", *other_folders))]
+    commands = (
+        ("odometry", recording, "-o", folder, "--overwrite"),
+        ("smooth", folder),
+        ("compare", recording, "-o", compared),
+        ("batch", recording, "-o", batched, *QUICK),
+        ("train", recording, "-o", trained),
+        ("ablate", recording, "--table", 1, "--test", recording, "-o", table),
+        ("simulate", drive.parent, "--seconds", 1),
+    )
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=Path(__file__).parents[3]) as other:
         other.stdout.read(1)
-        for command in (("odometry", recording, "-o", folder, "--overwrite"), ("smooth", folder)):
+        for command in commands:
             assert f"is being written by process {other.pid}" in refused(2, *command)
         other.stdin.close()
-    ok("smooth", folder)
+    ok("smooth", folder)  # the lock of a process that ended is free
     with held(folder):
         pass
+
+
+def test_the_workers_of_a_killed_batch_end_and_the_next_one_goes_on(tiny_drive, tmp_path):
+    both = [shutil.copytree(tiny_drive.parent, tmp_path / name / tiny_drive.parent.name) for name in ("a", "b")]
+    command = ["batch", *map(str, (tmp_path / "a", tmp_path / "b")), "-o", str(tmp_path / "out"), "-j", "2"]
+    environment = {**os.environ, "MPLBACKEND": "Agg"}
+    program = [sys.executable, "-m", "hybridlio", *command]
+    with subprocess.Popen(program, cwd=Path(__file__).parents[3], env=environment, stderr=-3, stdout=-3) as run:
+        while not list((tmp_path / "out").glob(".*/journal.bin")) and run.poll() is None:
+            time.sleep(0.01)
+        workers = children_of(run.pid)
+        run.send_signal(signal.SIGKILL)
+    assert workers
+    until = time.monotonic() + 20  # they look twice a second; the machine may be busy
+    while any(Path(f"/proc/{worker}").exists() for worker in workers) and time.monotonic() < until:
+        time.sleep(0.1)
+    assert [worker for worker in workers if Path(f"/proc/{worker}").exists()] == []
+    ok(*command)
+    rows = json.loads((tmp_path / "out/batch.json").read_text())["recordings"]
+    assert [row["status"] for row in rows] == ["done", "done"]
+    assert sorted(p.name for p in (tmp_path / "out").iterdir() if p.name.startswith(".")) == []
+    assert len(both) == len(rows)
+
+
+def children_of(process: int) -> list[int]:
+    """Return the processes that a process has started."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parent = int(stat.read_text().rpartition(")")[2].split()[1])
+        except OSError:
+            continue
+        if parent == process:
+            found.append(int(stat.parent.name))
+    return found
 
 
 def test_a_killed_run_or_smoothing_keeps_the_result_that_stood_there(tiny_drive, finished_run, tmp_path):
