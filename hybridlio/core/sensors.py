@@ -50,9 +50,9 @@ class Scan:
         if points.ndim != 2 or points.shape[1] != 3:
             raise DataError(f"scan at {self.stamp_ns} ns: points must be (N, 3), got {points.shape}")
         columns = {"intensity": (self.intensity, np.float32), "time_offsets_ns": (self.time_offsets_ns, np.int64)}
-        valid = np.abs(points) < MAX_RANGE_M  # False for NaN
-        all_valid = bool(valid.all())  # almost always; then no array is copied
-        kept = np.ones(len(points), dtype=bool) if all_valid else valid.all(axis=1)
+        # almost always; then no array is made or copied. A NaN makes both comparisons false.
+        all_valid = not points.size or bool(points.max() < MAX_RANGE_M and points.min() > -MAX_RANGE_M)
+        kept = np.ones(len(points), dtype=bool) if all_valid else (np.abs(points) < MAX_RANGE_M).all(axis=1)
         for name, (values, dtype) in columns.items():
             if values is None:
                 continue

@@ -16,15 +16,18 @@ from hybridlio.core.lidar_models import LIDAR_MODELS, LidarModel
 from hybridlio.core.sensors import MAX_RANGE_M, NS_PER_S, Calibration, ImuNoise
 from hybridlio.core.setting_checks import SettingError
 from hybridlio.datasets.points.bin_layout import BinLayout, stated_layout
-from hybridlio.datasets.points.point_format import StatedFormat
+from hybridlio.datasets.points.point_format import Box, StatedFormat
 from hybridlio.datasets.points.point_times import NORMALISED, ORIGINS, UNITS_NS, StatedTimes
+from hybridlio.datasets.rosbag.transforms import FrameTree
 from hybridlio.datasets.transform_forms import HOW_TO_WRITE, parse_transform
 
 _KEYS = (
     *("T_imu_lidar", "T_camera_lidar", "lidar", "antenna_imu_m", "imu_time_offset_s", "imu_noise", "rate_hz"),
-    *("columns", "point_times"),
+    *("columns", "point_times", "vehicle", "frames", "imu_frame", "lidar_frame"),
 )
 _LIDAR_KEYS = ("model", "min_range_m", "max_range_m")
+_VEHICLE_KEYS = ("min", "max")
+_FRAME_KEYS = ("parent", "child")
 _TIMES_KEYS = ("column", "unit", "origin", "sweep_s")
 _MAX_TIME_OFFSET_S = 1e10  # of clocks that count from different years; larger ones are another unit
 MAX_RATE_HZ = 500.0  # of scans; stamps under 2 ms apart are another unit
@@ -43,7 +46,7 @@ class StatedCalibration:
         rate_hz: scans per second, for a folder without stamps.
         layout: the columns of ``.bin`` scans.
         format: what is stated about the points.
-        keys: the keys that are in the file.
+        keys: the keys that are in the file; ``T_imu_lidar`` also where frames state it.
     """
 
     calibration: Calibration = field(default_factory=Calibration)
@@ -68,6 +71,9 @@ def read_calibration_yaml(path: Path, needs_imu: bool = False) -> StatedCalibrat
       and ``max_range_m``; points outside stated ranges are left out;
     * ``imu_time_offset_s``: seconds to add to the IMU's stamps to bring them to the scans' clock;
     * ``imu_noise``: noise densities by the names of :class:`hybridlio.core.sensors.ImuNoise`;
+    * ``frames``, ``imu_frame`` and ``lidar_frame``: in place of ``T_imu_lidar``, a list of transforms between frames as
+      in a TF tree, each ``parent``, ``child`` and the child's pose in the parent, and the names of the sensors' frames;
+    * ``vehicle``: a box in the lidar frame, corners ``min`` and ``max`` in metres, whose points are left out;
     * ``rate_hz``: scans per second, for a folder without a file of stamps;
     * ``columns``: see :func:`hybridlio.datasets.points.bin_layout.stated_layout`;
     * ``point_times``: ``none``, or a mapping of the attributes of
@@ -86,7 +92,7 @@ def read_calibration_yaml(path: Path, needs_imu: bool = False) -> StatedCalibrat
         raise DataError(f"{path}: expected a mapping; {HOW_TO_WRITE}")
     if unknown := [key for key in content if key not in _KEYS]:
         raise DataError(f"{path}: unknown key {unknown[0]!r}; the keys are {', '.join(_KEYS)}")
-    if content.get("T_imu_lidar") is None and needs_imu:
+    if content.get("T_imu_lidar") is None and content.get("frames") is None and needs_imu:
         what = "lacks T_imu_lidar" if path.is_file() else "missing"
         raise DataError(f"{path}: {what}, and imu.csv needs it: {HOW_TO_WRITE}")
     try:
@@ -102,6 +108,12 @@ def _stated(content: dict[str, Any]) -> StatedCalibration:
 
     identity: Array = np.eye(4)
     T_imu_lidar = read("T_imu_lidar", parse_transform, identity)
+    stated = {key for key, value in content.items() if value is not None}
+    if tree := stated & {"frames", "imu_frame", "lidar_frame"}:
+        if "T_imu_lidar" in stated:
+            raise DataError(f"T_imu_lidar and {min(tree)} state the same; keep one of them")
+        T_imu_lidar = _by_frames(content)
+        stated.add("T_imu_lidar")
     T_camera_lidar = read("T_camera_lidar", parse_transform, None)
     lidar, limits_m = _lidar("lidar", content["lidar"]) if content.get("lidar") is not None else (None, None)
     offset_s = read(
@@ -114,8 +126,8 @@ def _stated(content: dict[str, Any]) -> StatedCalibration:
         imu_time_offset_ns=round(offset_s * NS_PER_S),
         rate_hz=read("rate_hz", lambda key, value: _number(key, value, 0, MAX_RATE_HZ), None),
         layout=read("columns", lambda _, value: stated_layout(value), None),
-        format=StatedFormat(read("point_times", _point_times, None), limits_m),
-        keys=frozenset(key for key, value in content.items() if value is not None),
+        format=StatedFormat(read("point_times", _point_times, None), limits_m, read("vehicle", _vehicle, None)),
+        keys=frozenset(stated),
     )
 
 
@@ -138,8 +150,37 @@ def _three_numbers(key: str, value: Any) -> Array:
     except (ValueError, TypeError):
         numbers = np.empty(0)
     if numbers.shape != (3,) or not np.isfinite(numbers).all():
-        raise DataError(f"{key} must be three finite numbers, the GPS antenna in the IMU's frame")
+        raise DataError(f"{key} must be three finite numbers in metres")
     return numbers
+
+
+def _vehicle(key: str, value: Any) -> Box:
+    parts = _mapping(key, value, _VEHICLE_KEYS)
+    low, high = (_three_numbers(f"{key}: {name}", parts.get(name)) for name in _VEHICLE_KEYS)
+    if not (low < high).all():
+        raise DataError(f"{key}: each number of min must be below that of max, got {low.tolist()} and {high.tolist()}")
+    return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+
+
+def _by_frames(content: dict[str, Any]) -> Array:
+    """Return ``T_imu_lidar`` from a tree of frames and the names of the sensors' frames."""
+    tree, edges = FrameTree(), content.get("frames")
+    if not isinstance(edges, list):
+        raise DataError("frames: expected a list of transforms, each with parent, child, translation and a rotation")
+    for number, edge in enumerate(edges):
+        if not isinstance(edge, dict) or not set(_FRAME_KEYS) < set(edge):
+            raise DataError(f"frames: entry {number} lacks parent, child or the child's pose in the parent")
+        parent, child = (str(edge[key]) for key in _FRAME_KEYS)
+        pose = {key: part for key, part in edge.items() if key not in _FRAME_KEYS}
+        T_parent_child = parse_transform(f"frames: entry {number}", pose.get("T_parent_child", pose))
+        tree.connect(parent, child, T_parent_child)
+    imu, lidar = content.get("imu_frame"), content.get("lidar_frame")
+    if imu is None or lidar is None:
+        raise DataError("frames need imu_frame and lidar_frame, the names of the sensors' frames")
+    T = tree.find(str(imu), str(lidar))
+    if T is None:
+        raise DataError(f"frames do not connect {imu!r} and {lidar!r}; they are {', '.join(tree.names())}")
+    return T
 
 
 def _lidar(key: str, value: Any) -> tuple[LidarModel | None, tuple[float, float] | None]:

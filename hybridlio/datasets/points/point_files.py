@@ -21,7 +21,7 @@ from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.points import pcd, ply, tables
 from hybridlio.datasets.points.bin_layout import BinLayout, column_names, find_layout
 from hybridlio.datasets.points.fields import Columns
-from hybridlio.datasets.points.point_format import PointFormat, StatedFormat, find_format, sampled
+from hybridlio.datasets.points.point_format import PointFormat, StatedFormat, learn_format, sampled
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply", ".las", ".laz", ".feather", ".parquet")
 
@@ -87,23 +87,23 @@ def open_point_files(
             error comes when it is loaded.
     """
     step_ns = int(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else None
-    looked_at = sampled(len(paths))
     if read is None:
         if layout is None and paths[0].suffix == ".bin":
-            layout = find_layout([paths[k] for k in looked_at], step_ns, notes)
+            layout = find_layout([paths[k] for k in sampled(len(paths))], step_ns, notes)
         read = partial(read_columns, layout=layout, step_ns=step_ns)
-    samples, errors = [], []
-    for k in looked_at:
+    reader = read
+
+    def columns_of(k: int) -> Columns:
         try:
-            samples.append((int(stamps_ns[k]), read(paths[k])))
+            return reader(paths[k])
         except DataError as error:
-            errors.append(_at(paths[k], error))
-    if errors and not samples:
-        raise DataError(errors[0])
+            raise DataError(_at(paths[k], error)) from None
+
     try:
-        found = find_format(samples, step_ns, notes, stated)
+        found = learn_format(stamps_ns, columns_of, notes, stated)
     except DataError as error:
-        raise DataError(_at(paths[0].parent if len(paths) > 1 else paths[0], error)) from None
+        named = str(error).startswith(str(paths[0].parent))
+        raise DataError(str(error) if named else _at(paths[0].parent if len(paths) > 1 else paths[0], error)) from None
     return PointFiles(paths, stamps_ns, read, found)
 
 

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlio.core.arrays import Array, Floats, Mask
+from hybridlio.core.arrays import Array, Floats, Mask, Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import MAX_RANGE_M, Scan
 from hybridlio.datasets.notes import Notes
+from hybridlio.datasets.points.own_vehicle import note_vehicle
 from hybridlio.datasets.points.point_times import PointTimes, StatedTimes, find_point_times
 
 Columns = Mapping[str, NDArray[Any]]
 
 SAMPLES = 5  # scans that are looked at to find the format: enough to see a pattern, 0.2 s to read
+MORE_SAMPLES = 21  # if those do not agree: some bad scans among them no longer decide; 1 s to read
 
 _INTENSITIES = ("intensity", "reflectivity", "reflectance", "remission")
 _FULL_SCALES = (1.0, 255.0, 65535.0)  # of intensities: the smallest that holds them
@@ -29,16 +31,31 @@ _MIN_CODE_ELEVATIONS_RAD = 0.03  # standard deviation: a code fills many beams, 
 
 
 @dataclass(frozen=True)
+class Box:
+    """A box in the lidar frame with sides along its axes; corners in metres."""
+
+    low_m: tuple[float, float, float]
+    high_m: tuple[float, float, float]
+
+    def holds(self, points: Floats) -> Mask:
+        """Return which of points ``(N, 3)`` lie inside, ``(N,)``."""
+        inside = (points >= np.array(self.low_m, np.float32)) & (points <= np.array(self.high_m, np.float32))
+        return np.asarray(inside.all(axis=1))
+
+
+@dataclass(frozen=True)
 class StatedFormat:
     """What a user states about points; None where it is to be found.
 
     Attributes:
         times: about their times.
         limits_m: smallest and largest range of points to use.
+        vehicle: a box around the vehicle, whose points are left out.
     """
 
     times: StatedTimes | None = None
     limits_m: tuple[float, float] | None = None
+    vehicle: Box | None = None
 
 
 @dataclass(frozen=True)
@@ -50,12 +67,14 @@ class PointFormat:
         no_return_m: range at which the sensor writes beams without a return, or None.
         times: the convention of the points' times; None if there are none.
         limits_m: smallest and largest range of points to use, as the user states; None for all.
+        vehicle: a box whose points are left out, as the user states.
     """
 
     scale_m: float = 1.0
     no_return_m: float | None = None
     times: PointTimes | None = None
     limits_m: tuple[float, float] | None = None
+    vehicle: Box | None = None
 
     @np.errstate(invalid="ignore", over="ignore")  # damaged files hold any bits
     def scan(self, columns: Columns, stamp_ns: int) -> Scan:
@@ -82,6 +101,9 @@ class PointFormat:
         return xyz.astype(np.float32, copy=False)
 
     def _returns(self, points: Floats) -> Mask:
+        plain = self.no_return_m is None and self.limits_m is None and self.vehicle is None
+        if plain and len(points) and points[:, 0].all() and np.isfinite([points.min(), points.max()]).all():
+            return np.ones(len(points), dtype=bool)  # the usual case, found without arrays of sums
         # NaN or infinite where a coordinate is; a product with ones is far quicker than all() along rows of three
         sums = np.abs(points) @ np.ones(3, np.float32)
         keep = np.asarray((sums > 0) & (sums < np.inf), dtype=bool)
@@ -90,6 +112,8 @@ class PointFormat:
         if self.limits_m is not None:
             ranges = _ranges(points)
             keep &= (ranges >= self.limits_m[0]) & (ranges <= self.limits_m[1])
+        if self.vehicle is not None:
+            keep &= ~self.vehicle.holds(points)
         return keep
 
 
@@ -104,9 +128,42 @@ def coordinates(columns: Columns) -> NDArray[Any]:
     return np.column_stack([columns["x"], columns["y"], columns["z"]])
 
 
-def sampled(count: int) -> list[int]:
+def sampled(count: int, samples: int = SAMPLES) -> list[int]:
     """Return the indices of the scans to look at, spread over a recording of ``count`` scans."""
-    return sorted({round(k) for k in np.linspace(0, count - 1, SAMPLES)}) if count else []
+    return sorted({round(k) for k in np.linspace(0, count - 1, samples)}) if count else []
+
+
+def learn_format(
+    stamps_ns: Stamps, columns_of: Callable[[int], Columns], notes: Notes, stated: StatedFormat | None = None
+) -> PointFormat:
+    """Find the format of a recording from some of its scans, from more of them if those do not agree.
+
+    Args:
+        stamps_ns: ``(N,)`` of all scans.
+        columns_of: reads the columns of scan ``k``; its :class:`DataError` names frame or file.
+        notes: receives the findings, and scans that cannot be read.
+        stated: what the user states.
+
+    Raises:
+        DataError: no scan can be read, or the meaning of the columns is not clear.
+    """
+    step_ns = int(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else None
+    for samples in (SAMPLES, MORE_SAMPLES):
+        found: list[tuple[int, Columns]] = []
+        errors: list[DataError] = []
+        for k in sampled(len(stamps_ns), samples):
+            try:
+                found.append((int(stamps_ns[k]), columns_of(k)))
+            except DataError as error:
+                errors.append(error)
+        try:
+            if not found and errors:
+                raise errors[0]
+            return find_format(found, step_ns, notes, stated)
+        except DataError:
+            if samples == MORE_SAMPLES or samples >= len(stamps_ns):
+                raise
+    raise AssertionError  # the last number of samples returns or raises
 
 
 @np.errstate(invalid="ignore", over="ignore")  # damaged files hold any bits
@@ -131,12 +188,33 @@ def find_format(
     zeros = float(np.mean([(~cloud.any(axis=1)).mean() for cloud in clouds if len(cloud)] or [0.0]))
     if zeros:
         notes.found(f"points at the origin, {zeros:.1%} of a scan, are left out: beams without a return")
-    found = PointFormat(scale_m, _no_return_m(clouds, notes), None, stated.limits_m)
+    _check_frame(clouds)
+    found = PointFormat(scale_m, _no_return_m(clouds, notes), None, stated.limits_m, stated.vehicle)
+    if stated.vehicle is None:
+        note_vehicle(clouds, notes)
     valid = []
     for (stamp, columns), cloud in zip(samples, clouds, strict=True):
         keep = found._returns(cloud)
         valid.append((stamp, {name: values[keep] for name, values in columns.items()}))
     return replace(found, times=find_point_times(valid, step_ns, notes, stated.times))
+
+
+def _check_frame(clouds: list[Floats]) -> None:
+    """Refuse clouds in a map's frame, such as UTM.
+
+    Raises:
+        DataError: most points of most clouds are beyond the range of any lidar.
+    """
+    far = []
+    for cloud in clouds:
+        ranges = _ranges(cloud[np.isfinite(cloud).all(axis=1) & cloud.any(axis=1)])
+        if len(ranges):
+            far.append(float(np.median(ranges)))
+    if far and np.median(far) > MAX_RANGE_M:
+        raise DataError(
+            f"points are {np.median(far) / 1000:.0f} km from the origin, as in a map's frame (UTM); they must be in "
+            "the lidar's: transform each scan by the inverse of its pose"
+        )
 
 
 def _scale_m(clouds: list[NDArray[Any]], notes: Notes) -> float:

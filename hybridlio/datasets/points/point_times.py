@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from hybridlio.core.arrays import NS_PER_S, Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.datasets.notes import Notes
+from hybridlio.datasets.points.whole_times import HOW_TO_STATE, readable, whole_ns
 
 Columns = Mapping[str, NDArray[Any]]
 
@@ -41,12 +42,6 @@ _MIN_RESOLUTION = 16  # steps of the number type in a sweep of 0.1 s: 6 ms, 6 cm
 _FINE_STEP = 1e-3  # of a number type, in its own unit: coarser ones can make a column constant
 _NEAR_SWEEPS = 2.0  # relative times, and absolute ones on the stamps' clock, lie within two sweeps of the stamp
 _AT_END = 0.1  # of a sweep: the stamp is at its start, middle or end, with a gap of missing points
-_EXACT = 2**53  # float64 holds every integer up to here
-_MAX_NS = 2**62  # far from the limit of int64, also after subtracting a stamp
-_HOW = (
-    "state it in calibration.yaml as 'point_times: {unit: s|ms|us|ns|normalised, origin: stamp|absolute|start|middle|"
-    "end}', or ignore the column with 'point_times: none'"
-)
 
 
 @dataclass(frozen=True)
@@ -109,31 +104,7 @@ class PointTimes:
                 f"column '{self.column}' is over 1 s from the scan's stamp ({(first - zero) / NS_PER_S:g} to "
                 f"{(last - zero) / NS_PER_S:g} s)"
             )
-        return times - zero
-
-
-def whole_ns(values: NDArray[Any], unit_ns: int, column: str) -> Stamps:
-    """Convert times to int64 nanoseconds without overflow; float64 seconds since 1970 keep all of their digits.
-
-    Raises:
-        DataError: a value is not finite, or beyond the range of int64 nanoseconds.
-    """
-    if values.dtype.kind not in "iuf":
-        raise DataError(f"column '{column}' of the point times has the type {values.dtype}, not a number")
-    if not len(values):
-        return np.empty(0, np.int64)
-    if values.dtype.kind == "f" and not np.isfinite(values).all():
-        raise DataError(f"column '{column}' has times that are not finite")
-    largest = max(abs(values.max().item()), abs(values.min().item())) * unit_ns
-    if largest > _MAX_NS:
-        raise DataError(f"column '{column}' reaches {largest / NS_PER_S:.3g} s, beyond any clock; {_HOW}")
-    if values.dtype.kind in "iu":
-        return values.astype(np.int64) * unit_ns
-    exact = values.astype(np.float64)
-    if largest < _EXACT:
-        return np.round(exact * unit_ns).astype(np.int64)
-    whole = np.floor(exact)  # apart, so that the product with the unit is exact
-    return whole.astype(np.int64) * unit_ns + np.round((exact - whole) * unit_ns).astype(np.int64)
+        return times - zero if zero else times
 
 
 def time_columns(names: Sequence[str]) -> list[str]:
@@ -168,9 +139,8 @@ def find_point_times(
         found = [(stamp, columns[name]) for stamp, columns in samples if name in columns]
         if not found:
             raise DataError(f"point_times: no column '{name}'; the columns are {', '.join(samples[0][1])}")
-        # a damaged scan must not keep the others from being read; its own error comes when it is loaded
-        values = [(stamp, column) for stamp, column in found if np.isfinite(column).all()] or found
-        fault = _fault(name, [column for _, column in values])
+        values = readable(name, found)
+        fault = _fault([column for _, column in values])
         if fault is None:
             return _convention(name, values, step_ns, notes, stated)
         notes.add(f"point times: column '{name}' {fault}; not used")
@@ -184,11 +154,10 @@ def _base(name: str) -> tuple[str, str | None]:
     return (name.removesuffix(suffix), _SUFFIXES[suffix]) if suffix else (name, None)
 
 
-def _fault(name: str, columns: list[NDArray[Any]]) -> str | None:
+def _fault(columns: list[NDArray[Any]]) -> str | None:
     """Return why a column cannot be point times, or None."""
-    for values in columns:
-        whole_ns(values, 1, name)  # raises where values are no finite numbers
-    largest = max(float(np.abs(values.astype(np.float64)).max()) for values in columns)
+    # the median: a damaged scan must not decide
+    largest = float(np.median([np.abs(values.astype(np.float64)).max() for values in columns]))
     span = _span(columns)
     if largest == 0:
         return "holds zeros only"
@@ -208,11 +177,26 @@ def _convention(
     name: str, values: list[tuple[int, NDArray[Any]]], step_ns: int | None, notes: Notes, stated: StatedTimes
 ) -> PointTimes:
     unit, unit_ns = _unit(name, [column for _, column in values], step_ns, stated)
-    times = [(stamp, whole_ns(column, unit_ns, name)) for stamp, column in values]
-    ends = [(stamp, int(ns.min()), int(ns.max())) for stamp, ns in times]
+    ends, offsets, errors = [], [], []
+    for stamp, column in values:
+        try:
+            ns = whole_ns(column, unit_ns, name)
+            ends.append((stamp, int(ns.min()), int(ns.max())))
+        except DataError as error:
+            errors.append(error)
+    if not ends:
+        raise errors[0]
     origin = stated.origin or _origin(ends, step_ns)
     found = PointTimes(name, unit_ns, origin)
-    offsets = [found.offsets_ns({name: column}, stamp) for stamp, column in values]
+    for stamp, column in values:
+        try:
+            offsets.append(found.offsets_ns({name: column}, stamp))
+        except DataError as error:
+            errors.append(error)
+    if 2 * len(offsets) <= len(values):
+        raise errors[0]
+    if len(offsets) < len(values):
+        notes.add(f"point times: in {len(values) - len(offsets)} of {len(values)} scans looked at, {errors[0]}")
     first, last = (float(np.median([end(ns) for ns in offsets])) for end in (np.min, np.max))
     apart_s = float(np.median([lo - stamp for stamp, lo, _ in ends])) / NS_PER_S
     texts = {"stamp": "from the scan's stamp", "absolute": "on the stamps' clock"}
@@ -247,9 +231,11 @@ def _unit(name: str, columns: list[NDArray[Any]], step_ns: int | None, stated: S
     apart = "" if step_ns is None else f", scans are {step_ns / 1e6:g} ms apart"
     if len(fitting) != 1:
         can = " or ".join(fitting) or "none of s, ms, us and ns"
-        raise DataError(f"column '{name}' spans {span:g} in a scan{apart}: its unit can be {can}; {_HOW}")
+        raise DataError(f"column '{name}' spans {span:g} in a scan{apart}: its unit can be {can}; {HOW_TO_STATE}")
     if fitting[0] not in units:
-        raise DataError(f"column '{name}' holds shares of a sweep whose length is unknown; {_HOW}, with 'sweep_s'")
+        raise DataError(
+            f"column '{name}' holds shares of a sweep whose length is unknown; {HOW_TO_STATE}, with 'sweep_s'"
+        )
     return fitting[0], units[fitting[0]]
 
 
@@ -265,8 +251,8 @@ def _origin(ends: list[tuple[int, int, int]], step_ns: int | None) -> str:
     """Return what times count from, given stamp, first and last time of some scans in nanoseconds."""
     spans = [last - first for _, first, last in ends]
     sweep_ns = max(float(np.median(spans)), min(step_ns or 0, _MAX_OFFSET_NS))  # a scan may hold a part of the sweep
-    relative = max(max(abs(first), abs(last)) for _, first, last in ends)
-    absolute = max(max(abs(first - stamp), abs(last - stamp)) for stamp, first, last in ends)
+    relative = float(np.median([max(abs(first), abs(last)) for _, first, last in ends]))
+    absolute = float(np.median([max(abs(first - stamp), abs(last - stamp)) for stamp, first, last in ends]))
     if min(relative, absolute) > _NEAR_SWEEPS * sweep_ns:
         return "start"
     return "stamp" if relative <= absolute else "absolute"

@@ -10,9 +10,11 @@ import numpy as np
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import Calibration
+from hybridlio.datasets.calibration_yaml import StatedCalibration
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.rosbag.bag import Bag, Topic
 from hybridlio.datasets.rosbag.choices import BagTopics
+from hybridlio.datasets.rosbag.known import KnownBag
 from hybridlio.datasets.rosbag.topics import TRANSFORM_TYPES
 from hybridlio.datasets.rosbag.transforms import FrameTree
 
@@ -30,6 +32,7 @@ class Mounting:
         wanted: frames that the user names.
         frames: frames of the messages' headers, by kind of topic.
         notes: receives what is assumed.
+        known: the published data set that the bag is of, or None.
     """
 
     bag: Bag
@@ -37,6 +40,7 @@ class Mounting:
     wanted: BagTopics
     frames: dict[str, str]
     notes: Notes
+    known: KnownBag | None = None
     _has_moving: bool = False
 
     @property
@@ -49,16 +53,16 @@ class Mounting:
         """The IMU's frame: the user's, or that of the messages."""
         return (self.wanted.imu_frame or self.frames.get("imu", "")).lstrip("/")
 
-    def calibration(self, given: Calibration, has_imu: bool, has_gps: bool) -> Calibration:
+    def calibration(self, stated: StatedCalibration, has_imu: bool, has_gps: bool) -> Calibration:
         """Return the extrinsics: those that ``calibration.yaml`` gives and, without ``T_imu_lidar`` in it, the frames'.
 
         Raises:
             DataError: there is an IMU and no transform.
         """
-        file = calibration_file(self.bag.path)
+        given = stated.calibration
         T_imu_lidar = given.T_imu_lidar
-        if has_imu and not _has_key(file, "T_imu_lidar"):
-            T_imu_lidar = self._imu_lidar(file)
+        if has_imu and "T_imu_lidar" not in stated.keys:
+            T_imu_lidar = self._imu_lidar(calibration_file(self.bag.path))
         antenna = given.antenna_imu_m
         if antenna is None and has_gps and has_imu:
             T_imu_gps = self.find(self.imu_frame, self.frames.get("gps", ""))
@@ -90,7 +94,10 @@ class Mounting:
 
     def _imu_lidar(self, file: Path) -> Array:
         imu, lidar = self.imu_frame, self.lidar_frame
-        T = self.find(imu, lidar)
+        T = self.find(imu, lidar) if self.known is None or imu != lidar else None
+        if T is None and self.known is not None:
+            self.notes.found(f"T_imu_lidar is that which is published for {self.known.name}")
+            return self.known.T_imu_lidar
         if T is None:
             raise DataError(self._unknown(imu, lidar, file))
         if imu == lidar:
@@ -116,10 +123,3 @@ class Mounting:
 def calibration_file(path: Path) -> Path:
     """Return where the ``calibration.yaml`` of a bag belongs: in its folder, or beside its file."""
     return (path if path.is_dir() else path.parent) / "calibration.yaml"
-
-
-def _has_key(file: Path, key: str) -> bool:
-    """Return whether a calibration file that can be read holds a key."""
-    from hybridlio.core.files import read_yaml
-
-    return file.is_file() and key in (read_yaml(file) or {})

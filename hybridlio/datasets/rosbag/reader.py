@@ -21,6 +21,7 @@ from hybridlio.datasets.rosbag import measurements
 from hybridlio.datasets.rosbag.bag import METADATA, ROS_1, ROS_2_FILES, Bag, Topic, bag_files, part_number
 from hybridlio.datasets.rosbag.choices import BagTopics
 from hybridlio.datasets.rosbag.extrinsics import Mounting, calibration_file
+from hybridlio.datasets.rosbag.known import known_bag
 from hybridlio.datasets.rosbag.measurements import Log
 from hybridlio.datasets.rosbag.scans import BagScans
 from hybridlio.datasets.rosbag.topics import TRANSFORM_TYPES, choose
@@ -96,13 +97,16 @@ def _open(path: Path, wanted: BagTopics, vertical_angle_deg: float | None) -> Se
     notes, bag = Notes(path.stem if path.is_file() else path.name), Bag(path)
     _note_part(path, notes)
     stated = read_calibration_yaml(calibration_file(path))
+    known = known_bag(bag, wanted, notes)
+    wanted = wanted if known is None else known.filled(wanted)
     chosen = choose(bag, wanted, notes)
     contents = _read(bag, chosen)
-    mounting = Mounting(bag, contents.tree, wanted, {kind: log.frame for kind, log in contents.logs.items()}, notes)
+    frames = {kind: log.frame for kind, log in contents.logs.items()}
+    mounting = Mounting(bag, contents.tree, wanted, frames, notes, known)
     scans = _scans(bag, chosen["lidar"], contents.logs["lidar"], notes)
     scans.learn(stated.format, notes)
     imu = _imu(chosen.get("imu"), contents.logs, notes)
-    calibration = mounting.calibration(stated.calibration, has_imu=len(imu) > 0, has_gps="gps" in chosen)
+    calibration = mounting.calibration(stated, has_imu=len(imu) > 0, has_gps="gps" in chosen)
     if len(imu):
         imu = on_scans_clock(imu, stated.imu_time_offset_ns, notes)
         note_mounting(imu, calibration.T_imu_lidar, notes)

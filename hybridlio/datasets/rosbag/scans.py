@@ -15,7 +15,7 @@ from hybridlio.core.arrays import Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import Scan
 from hybridlio.datasets.notes import Notes
-from hybridlio.datasets.points.point_format import PointFormat, StatedFormat, find_format, sampled
+from hybridlio.datasets.points.point_format import PointFormat, StatedFormat, learn_format
 from hybridlio.datasets.rosbag.bag import Bag
 from hybridlio.datasets.rosbag.clouds import LIVOX_TIMES, Columns, cloud_columns, livox_columns
 from hybridlio.datasets.rosbag.topics import LIVOX_TYPES
@@ -74,19 +74,17 @@ class BagScans:
         Raises:
             DataError: no scan can be read, or the meaning of a column is not clear.
         """
-        samples, errors = [], []
-        for k in sampled(len(self.stamps_ns)):
-            try:
-                samples.append((int(self.stamps_ns[k]), self.columns(k)))
-            except DataError as error:
-                errors.append(error)
-                notes.add(f"frame {k}: {error}")
-        if not samples:
-            raise errors[0]
-        step_ns = int(np.median(np.diff(self.stamps_ns))) if len(self.stamps_ns) > 1 else None
         if stated.times is None and self._bag().topics[self.topic].type in LIVOX_TYPES:
             stated = replace(stated, times=LIVOX_TIMES)
-        self.format = find_format(samples, step_ns, notes, stated)
+
+        def columns_of(k: int) -> Columns:
+            try:
+                return self.columns(k)
+            except DataError as error:
+                notes.add(f"frame {k}: {error}")
+                raise
+
+        self.format = learn_format(self.stamps_ns, columns_of, notes, stated)
 
     def columns(self, k: int) -> Columns:
         """Return the columns of scan ``k``, as the message holds them.

@@ -50,10 +50,15 @@ class FrameTree:
                 continue
             move = stamped.transform
             T = pose_of(move.translation, move.rotation, f"transform from {child!r} to {parent!r}")
-            if known is None:
-                self.edges[child] = _Edge(parent, T)
-            elif known.parent != parent or _differ(known.T_parent_child, T):
-                known.moves = True
+            self.connect(parent, child, T)
+
+    def connect(self, parent: str, child: str, T_parent_child: Array) -> None:
+        """Add one transform; the frame is marked as moving if an earlier one differs."""
+        known = self.edges.get(child)
+        if known is None:
+            self.edges[child] = _Edge(parent, T_parent_child)
+        elif known.parent != parent or _differ(known.T_parent_child, T_parent_child):
+            known.moves = True
 
     def find(self, target: str, source: str) -> Array | None:
         """Return ``T_target_source``, ``(4, 4)``; None if frames are unknown, unconnected or move to each other."""

@@ -166,3 +166,49 @@ class TestInAFolder:
         scan = open_sequence(folder)[3].scan
         np.testing.assert_allclose(scan.time_offsets_ns, (times - 99_000) * 1000, atol=10)
         assert np.abs(scan.points).max() < 9
+
+
+class TestFrames:
+    T_base_imu = se3.exp([0.1, -0.2, 0.3, 0.2, -0.1, 0.5])
+    T_base_lidar = se3.exp([-0.3, 0.1, 2.0, 1.0, 0.0, 1.5])
+
+    def frames(self, **names: Any) -> dict[str, Any]:
+        R = Rotation.from_matrix(self.T_base_imu[:3, :3])
+        imu = {"translation": self.T_base_imu[:3, 3].tolist(), "quaternion_xyzw": R.as_quat().tolist()}
+        return {
+            "frames": [
+                {"parent": "base_link", "child": "imu", **imu},
+                {"parent": "base_link", "child": "lidar", "T_parent_child": self.T_base_lidar.tolist()},
+            ],
+            "imu_frame": "imu",
+            "lidar_frame": "lidar",
+            **names,
+        }
+
+    def test_a_tree_of_frames_states_the_extrinsics(self, tmp_path: Path) -> None:
+        found = read(tmp_path, **self.frames())
+        expected = se3.inverse(self.T_base_imu) @ self.T_base_lidar
+        np.testing.assert_allclose(found.calibration.T_imu_lidar, expected, atol=1e-12)
+        assert "T_imu_lidar" in found.keys
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"lidar_frame": "velodyne"}, "do not connect 'imu' and 'velodyne'; they are base_link, imu, lidar"),
+            ({"lidar_frame": None}, "frames need imu_frame and lidar_frame"),
+            ({"T_imu_lidar": np.eye(4).tolist()}, "state the same; keep one"),
+            ({"frames": [{"parent": "a"}]}, "entry 0 lacks parent, child"),
+            ({"frames": "tf.yaml"}, "expected a list of transforms"),
+        ],
+    )
+    def test_frames_that_state_nothing_are_refused(self, tmp_path: Path, change: Any, message: str) -> None:
+        with pytest.raises(DataError, match=message):
+            read(tmp_path, **self.frames(**change))
+
+
+def test_a_vehicle_is_a_box_in_the_lidar_frame(tmp_path: Path) -> None:
+    box = read(tmp_path, vehicle={"min": [-1, -1, -2], "max": [2, 1, 0.5]}).format.vehicle
+    assert box is not None
+    assert (box.low_m, box.high_m) == ((-1.0, -1.0, -2.0), (2.0, 1.0, 0.5))
+    with pytest.raises(DataError, match="each number of min must be below that of max"):
+        read(tmp_path, vehicle={"min": [1, -1, -2], "max": [-1, 1, 0.5]})

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from hybridlio.core.errors import DataError
 from hybridlio.datasets.notes import Notes
-from hybridlio.datasets.points.point_times import PointTimes, StatedTimes, find_point_times, time_columns, whole_ns
+from hybridlio.datasets.points.point_times import PointTimes, StatedTimes, find_point_times, time_columns
+from hybridlio.datasets.points.whole_times import whole_ns
 
 START_NS, STEP_NS, SWEEP_NS, SCANS = 1_700_000_000_123_456_789, 100_000_000, 99_900_000, 4
 STAMPS = [START_NS + k * STEP_NS for k in range(SCANS)]
@@ -199,3 +200,15 @@ def test_livox_float64_nanoseconds_give_offsets_within_the_sweep(cases: Path) ->
         ns = found.offsets_ns({"timestamp": times}, stamp)
         assert ns.min() >= 0
         assert 90_000_000 < ns.max() <= 100_000_000
+
+
+@pytest.mark.parametrize("bad", [np.nan, 1e300, 1e10, -5e9])
+@pytest.mark.parametrize("at", range(5))
+def test_one_bad_scan_among_five_does_not_decide(bad: float, at: int) -> None:
+    stamps = [START_NS + k * STEP_NS for k in range(5)]
+    times = [SWEEP.astype(np.float64) for _ in stamps]
+    times[at] = times[at].copy()
+    times[at][7] = bad
+    found, _ = find(times, stamps=stamps)
+    assert found == PointTimes("t", 1, "stamp")
+    np.testing.assert_array_equal(offsets(found, times[(at + 1) % 5]), SWEEP)

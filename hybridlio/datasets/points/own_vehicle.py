@@ -1,0 +1,59 @@
+"""Points of the vehicle itself: those that stay at one place in the lidar's frame while all others move."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridlio.core.arrays import Floats
+from hybridlio.datasets.notes import Notes
+
+_VOXEL_M = 0.1  # twice the noise of a lidar at such ranges: a point of the vehicle stays in one or two voxels
+_NEAR_M = 4.0  # from the lidar to its vehicle's ends, but for trucks
+_FAR_M = 12.0  # where the scene is compared: three times as far
+_HALF = round(_FAR_M / _VOXEL_M) + 1  # voxels on each side of the lidar, and one for rounding
+_SHAPE = (2 * _HALF, 2 * _HALF, 2 * _HALF)
+_MIN_SCANS = 4  # a wall that is as near in all of fewer scans is usual
+_MIN_SHARE = 0.01  # of the points, worth a note
+_MAX_STILL = 0.2  # share of the farther voxels that are occupied in all scans: more, and the vehicle stands
+
+
+def note_vehicle(clouds: list[Floats], notes: Notes) -> None:
+    """Note points near the lidar that occupy the same voxels in all scans of a moving vehicle, and a box around them.
+
+    Args:
+        clouds: ``(N, 3)`` points of scans that are spread over the recording.
+        notes: receives the note.
+    """
+    near, far = [], []
+    for cloud in clouds:
+        points = cloud[np.isfinite(cloud).all(axis=1) & cloud.any(axis=1)]
+        across = np.abs(points).max(axis=1, initial=0)
+        near.append(_voxels(points[across < _NEAR_M]))
+        far.append(_voxels(points[(across >= _NEAR_M) & (across < _FAR_M)]))
+    if len(clouds) < _MIN_SCANS:
+        return
+    still, elsewhere = _in_all(near), _in_all(far)
+    usual = float(np.median([len(voxels) for voxels in far]))
+    if not len(still) or len(elsewhere) > _MAX_STILL * usual:
+        return
+    corners_at = np.column_stack(np.unravel_index(still, _SHAPE)) - _HALF
+    low, high = corners_at.min(axis=0) * _VOXEL_M, (corners_at.max(axis=0) + 1) * _VOXEL_M
+    share = float(np.mean([((c >= low) & (c <= high)).all(axis=1).mean() for c in clouds if len(c)]))
+    if share >= _MIN_SHARE:
+        least, most = ("[" + ", ".join(f"{value:.1f}" for value in corner) + "]" for corner in (low, high))
+        notes.add(
+            f"{share:.1%} of the points stay at one place near the lidar while the scene moves, as those of the "
+            f"vehicle itself; 'vehicle: {{min: {least}, max: {most}}}' in calibration.yaml leaves them out"
+        )
+
+
+def _voxels(points: Floats) -> NDArray[np.int64]:
+    """Return the numbers of the voxels that hold points, each once."""
+    return np.unique(np.ravel_multi_index(tuple(np.floor(points / _VOXEL_M).astype(np.int64).T + _HALF), _SHAPE))
+
+
+def _in_all(scans: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """Return the numbers of the voxels that are in every scan."""
+    voxels, counts = np.unique(np.concatenate(scans), return_counts=True)
+    return np.asarray(voxels[counts == len(scans)])
