@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hybridlio.core.arrays import Array
+from hybridlio.graph.base.deep_stack import on_deep_stack
 from hybridlio.graph.formats.files import read_graph, write_graph
 from hybridlio.graph.formats.load_report import LoadOptions, LoadReport
 from hybridlio.graph.landmark_measurements import LandmarkMeasurements, check_free
@@ -193,7 +194,7 @@ class PoseGraph(LandmarkMeasurements):
         """
         settings = Settings(backend, initial, max_iterations, tolerance, lag)
         solve = solve_online if backend in ONLINE_SOLVERS else solve_batch
-        return solve(self._data, settings, progress or silent)
+        return on_deep_stack(len(self), lambda: solve(self._data, settings, progress or silent))
 
     def online(self, backend: OnlineName = "incremental", *, lag: int = 200, forget: bool = False) -> OnlineSolver:
         """Return a solver that follows this graph while it grows: its ``update()`` takes over what has changed.

@@ -16,6 +16,7 @@ from hybridlio.core.errors import GraphError
 from hybridlio.core.estimates import State
 from hybridlio.core.progress import Progress
 from hybridlio.core.trajectory import Trajectory
+from hybridlio.graph.base.deep_stack import on_deep_stack
 from hybridlio.graph.base.isam import gtsam_message
 from hybridlio.graph.base.marginals import bayes_tree, pose_covariances
 from hybridlio.graph.base.preintegration import covers, preintegrate
@@ -70,6 +71,11 @@ def smooth(
     report, robust = progress or _silent, check_robust_method(robust)  # checked before the long search for loops
     fixes = [GpsGroup(record, gps if isinstance(gps, GpsOptions) else GpsOptions())] if gps else []
     added = AddedGroups([*fixes, *_with_loops(groups, record, loops, report)], robust)
+    return on_deep_stack(len(record.online), lambda: _optimise(record, added, report))
+
+
+def _optimise(record: Record, added: AddedGroups, report: Progress) -> Smoothed:
+    """Solve the run's graph with the added groups, in rounds."""
     states = _online_states(record)
     error_before: float | None = None
     for number in range(_ROUNDS):

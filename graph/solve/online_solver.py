@@ -12,6 +12,7 @@ from gtsam.symbol_shorthand import B, V, X
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError, GraphError
+from hybridlio.graph.base.deep_stack import on_deep_stack
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.checks import check_determined
 from hybridlio.graph.model.edge_table import GrowingArray
@@ -72,6 +73,9 @@ class OnlineSolver:
             GraphError: the changes do not determine every pose, or concern one that has left the lag; names the keys.
                 The solver is then as before: correct the graph and update again.
         """
+        on_deep_stack(len(self._data), self._update)
+
+    def _update(self) -> None:
         changes = self._tracker.read()
         if not changes and self._count:
             self._engine.iterate()
@@ -140,10 +144,10 @@ class OnlineSolver:
     def covariance(self, key: Key) -> Array:
         """Return the covariance of a pose or a landmark, as a solution does; only in the lag."""
         if key in self._data.landmarks:
-            covariance = self._engine.solver.marginalCovariance(self._landmarks.variable(key))
+            covariance = self._marginal(self._landmarks.variable(key))
             return np.asarray((covariance + covariance.T) / 2)
         index = self._in_lag(key)
-        covariance = self._engine.solver.marginalCovariance(X(index))
+        covariance = self._marginal(X(index))
         return co.our_order((covariance + covariance.T) / 2, self._data.dimension)
 
     def relative_covariance(self, i: Key, j: Key) -> Array:
@@ -152,7 +156,11 @@ class OnlineSolver:
         if a == b:
             return np.zeros((self._data.tangent_size,) * 2)
         T_j_i = se3.between(self._estimate(b), self._estimate(a))
-        return co.relative_covariance(self._engine.joint([X(a), X(b)]), X(a), X(b), T_j_i, self._data.dimension)
+        joint = on_deep_stack(len(self), lambda: self._engine.joint([X(a), X(b)]))
+        return co.relative_covariance(joint, X(a), X(b), T_j_i, self._data.dimension)
+
+    def _marginal(self, variable: int) -> Array:
+        return on_deep_stack(len(self), lambda: np.asarray(self._engine.solver.marginalCovariance(variable)))
 
     # one update
 

@@ -13,6 +13,7 @@ from gtsam.symbol_shorthand import B, L, V, X
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
+from hybridlio.graph.base.deep_stack import on_deep_stack
 from hybridlio.graph.base.isam import gtsam_message, incremental_solver
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
@@ -138,9 +139,9 @@ class Solution:
             GraphError: no pose or landmark has this key, or the graph is too ill-conditioned for covariances.
         """
         if key in self._data.landmarks:
-            covariance = np.asarray(self._marginals.marginalCovariance(L(self._data.landmarks.index[key])))
+            covariance = self._marginal(L(self._data.landmarks.index[key]))
             return np.asarray((covariance + covariance.T) / 2)
-        covariance = np.asarray(self._marginals.marginalCovariance(X(self._known(key))))
+        covariance = self._marginal(X(self._known(key)))
         return co.our_order((covariance + covariance.T) / 2, self._data.dimension)
 
     def relative_covariance(self, i: Key, j: Key) -> Array:
@@ -155,7 +156,7 @@ class Solution:
         a, b = self._known(i), self._known(j)
         if a == b:
             return np.zeros((self._data.tangent_size,) * 2)
-        joint = self._marginals.jointMarginalCovariance([X(a), X(b)])
+        joint = on_deep_stack(len(self._index), lambda: self._marginals.jointMarginalCovariance([X(a), X(b)]))
         T_j_i = se3.between(self.poses[b], self.poses[a])
         return co.relative_covariance(joint, X(a), X(b), T_j_i, self._data.dimension)
 
@@ -205,6 +206,9 @@ class Solution:
             residual = residual[order] if len(residual) > 2 else residual  # a planar observation has two components
             found[factor_id] = residual, 2 * float(factor.error(self._result.values))
         return found
+
+    def _marginal(self, variable: int) -> Array:
+        return on_deep_stack(len(self._index), lambda: np.asarray(self._marginals.marginalCovariance(variable)))
 
     @cached_property
     def _marginals(self) -> gtsam.Marginals | gtsam.ISAM2:
