@@ -6,16 +6,18 @@ WORKERS ?= 2
 DEMO ?= demo
 DEMO_SECONDS ?= 60
 ARGS ?=
+FUZZ ?=
 
 RUN := $(VENV)/bin/python
 READY := $(VENV)/.stamp-ready
 DOCS_READY := $(VENV)/.stamp-docs
 
-.PHONY: help demo test lint format types docs clean
+.PHONY: help demo test fuzz lint format types docs clean
 
 help:
 	@echo 'make demo     simulate a drive, run the odometry, smooth, evaluate, report   (DEMO_SECONDS=60 DEMO=demo)'
 	@echo 'make test     all tests   (WORKERS=2 ARGS="-k kalman")'
+	@echo 'make fuzz     damage the inputs of every reader   (FUZZ="--count 200 --seconds 60 --seed -1")'
 	@echo 'make lint     ruff: rules and format        make format   apply both'
 	@echo 'make types    mypy, strict, on all packages'
 	@echo 'make docs     build the documentation into site/, strictly'
@@ -26,6 +28,9 @@ demo: $(READY)
 
 test: $(READY)
 	$(RUN) -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
+
+fuzz: $(READY)
+	$(RUN) tests/fuzz_readers.py $(FUZZ)
 
 lint: $(READY)
 	$(RUN) -m ruff check .

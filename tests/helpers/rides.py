@@ -159,11 +159,20 @@ def write_folder(root: Path, ride: Ride, write_scan: Callable[[Path, Array], Any
     return folder
 
 
-def write_bag(root: Path, ride: Ride) -> Path:
-    """Write the ride as a ROS 2 bag in SQLite; return its folder."""
-    messages = bags.Messages(is_ros2=True)
+def write_bag(root: Path, ride: Ride, kind: str = "sqlite3") -> Path:
+    """Write the ride as a bag; return its folder or file.
+
+    Args:
+        root: where to write.
+        ride: the ride.
+        kind: ``sqlite3`` or ``mcap`` for ROS 2; ``ros1``, or ``lz4`` for ROS 1 with compression.
+    """
+    is_ros2 = kind in ("sqlite3", "mcap")
+    messages = bags.Messages(is_ros2)
     points = [ride.points(k).astype(np.float32) for k in range(ride.count)]
     scans = [Scan(int(t), p[:, :3], p[:, 3]) for t, p in zip(ride.stamps_ns, points, strict=True)]
     imu = ride.imu(ride.imu_stamps_ns(10))
     content = bags.drive_messages(messages, scans, imu, ride.T_imu_lidar, ride.lidar)
-    return bags.write(root / "ride", messages, content, "sqlite3")
+    root.mkdir(parents=True, exist_ok=True)
+    path = root / ("ride" if is_ros2 else "ride.bag")
+    return bags.write(path, messages, content, kind if is_ros2 else "", "lz4" if kind == "lz4" else "")

@@ -25,6 +25,7 @@ from hybridlio.datasets.published.recording import Layout, Recording
 from hybridlio.datasets.published.text import US, in_order
 
 _LAYOUT = BinLayout(tuple((name, "<f4") for name in ("x", "y", "z", "intensity", "ring")))
+_TEXTS = ("token", "name", "filename")  # ends of the names of columns that hold texts
 _LARGEST_US = 2**52  # exact in float64, and far from the limit of int64 nanoseconds
 
 
@@ -52,13 +53,19 @@ def _rows(path: Path, *keys: str) -> list[dict[str, Any]]:
         if not isinstance(row, dict) or (missing := [key for key in keys if key not in row]):
             what = f"lacks {missing[0]!r}" if isinstance(row, dict) else "is no object"
             raise DataError(f"{path}: row {number} {what}")
+        if wrong := [key for key in keys if key.endswith(_TEXTS) and not isinstance(row[key], str)]:
+            raise DataError(f"{path}: row {number}: {wrong[0]!r} must be a text")
     return rows
 
 
 def _gather(scene: Path, notes: Notes) -> Recording:
     tables, root = scene.parent, scene.parent.parent
-    (token,) = [row["token"] for row in _rows(tables / "scene.json", "name", "token") if row["name"] == scene.name][:1]
-    samples = {r["token"] for r in _rows(tables / "sample.json", "token", "scene_token") if r["scene_token"] == token}
+    tokens = [row["token"] for row in _rows(tables / "scene.json", "name", "token") if row["name"] == scene.name]
+    if not tokens:
+        raise DataError(f"{tables / 'scene.json'}: no {scene.name}")
+    samples = {
+        r["token"] for r in _rows(tables / "sample.json", "token", "scene_token") if r["scene_token"] == tokens[0]
+    }
     keys = ("filename", "sample_token", "timestamp", "calibrated_sensor_token", "ego_pose_token")
     rows = [
         row
