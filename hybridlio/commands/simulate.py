@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, get_args
 
 import typer
 
@@ -22,8 +22,23 @@ def simulate(
     seed: Annotated[int, typer.Option(help="Random seed of road, town, traffic and noise.")] = 1,
     speed: Annotated[float, typer.Option(help="Cruising speed in m/s.")] = 10.0,
     driving: Annotated[str, typer.Option(help="calm, or hard: brakes late and takes bends fast.")] = "calm",
-    scene: Annotated[str, typer.Option(help="town, corridor or field.")] = "town",
-    lidar: Annotated[str, typer.Option(help="hdl-64e, 32-beam or 16-beam.")] = "hdl-64e",
+    scene: Annotated[
+        str,
+        typer.Option(help="A road: town, corridor or field; or a scene for other platforms: office, stairs or campus."),
+    ] = "town",
+    platform: Annotated[
+        str | None,
+        typer.Option(
+            help="What carries the sensors in those scenes: handheld, drone or car; by default the usual one."
+        ),
+    ] = None,
+    lidar: Annotated[
+        str | None,
+        typer.Option(help="On roads hdl-64e, 32-beam or 16-beam; else os0, vlp-16, mid360 or rosette."),
+    ] = None,
+    imu: Annotated[
+        str | None, typer.Option(help="In those scenes: consumer-mems (default), industrial or tactical.")
+    ] = None,
     distortion: Annotated[
         bool, typer.Option("--distortion", help="Let the vehicle move during each sweep, which distorts the scans.")
     ] = False,
@@ -38,45 +53,86 @@ def simulate(
     ] = "camera",
     _verbosity: Verbose = 0,
 ) -> None:
-    """Simulate a drive and write it as KITTI raw data: lidar scans, a 100 Hz IMU and exact poses.
+    """Simulate a recording: lidar scans, an IMU and exact poses.
+
+    Road drives are written as KITTI raw data, recordings of other platforms as plain folders with 200 Hz IMU and point
+    times.
 
     The same options give the same files to the last byte. The same command resumes an interrupted simulation.
     """
-    from pydantic import ValidationError
-
-    from hybridlio.datasets.protection import check_output
-    from hybridlio.datasets.registry import open_sequence
     from hybridlio.runs.own_files import RUN
-    from hybridlio.runs.whole_folder import held
-    from hybridlio.simulation import SimulationConfig
-    from hybridlio.simulation import simulate as write_drive
+    from hybridlio.simulation.choices import Scene
 
-    values = {
-        "seconds": seconds, "length_m": length_m, "seed": seed, "speed_m_s": speed, "scene": scene, "lidar": lidar,
-        "driving": driving, "motion_distortion": distortion, "gps": gps, "loops": loops,
-        "start_moving": not start_at_rest, "poses": poses, "poses_frame": poses_frame,
-    }  # fmt: skip
-    try:
-        config = SimulationConfig.model_validate(values)
-    except ValidationError as error:
-        raise ConfigError("; ".join(_describe(e["loc"], e["msg"]) for e in error.errors())) from None
     place = out.expanduser().resolve()
     if run := next((above for above in (place, *place.parents) if RUN.are_in(above)), None):
         raise ConfigError(f"{out} is or lies inside the run folder {run}; choose another folder")
-    check_output(out, may_hold=True)
+    common = {"seconds": seconds, "seed": seed, "scene": scene, "lidar": lidar, "start_moving": not start_at_rest}
+    road = {
+        "length_m": length_m, "speed_m_s": speed, "driving": driving, "gps": gps, "loops": loops, "poses": poses,
+        "poses_frame": poses_frame, "motion_distortion": distortion,
+    }  # fmt: skip
+    body = {"platform": platform, "imu": imu}
+    is_road = scene in get_args(Scene)
+    _write(out, *(_road_drive(common | road, body) if is_road else _platform(common | body, road)))
+
+
+def _road_drive(values: dict[str, Any], others: dict[str, Any]) -> tuple[Any, Any]:
+    """Return the settings of a road drive, and what writes it."""
+    from hybridlio.simulation import SimulationConfig
+    from hybridlio.simulation import simulate as write_drive
+
+    if given := [name for name, value in others.items() if value is not None]:
+        raise ConfigError(f"--{given[0]} is for the scenes of other platforms, not for the road {values['scene']!r}")
+    return _validated(SimulationConfig, {k: v for k, v in values.items() if v is not None or k != "lidar"}), write_drive
+
+
+def _platform(values: dict[str, Any], others: dict[str, Any]) -> tuple[Any, Any]:
+    """Return the settings of a platform's recording, and what writes it."""
+    from hybridlio.simulation.choices import Scene
+    from hybridlio.simulation.config import SimulationConfig
+    from hybridlio.simulation.platforms.config import PlatformConfig
+    from hybridlio.simulation.platforms.scenes.table import SCENES
+    from hybridlio.simulation.platforms.simulate import simulate_platform
+
+    if values["scene"] not in SCENES:
+        scenes = ", ".join((*get_args(Scene), *SCENES))
+        raise ConfigError(f"--scene: unknown scene {values['scene']!r}; choose one of {scenes}")
+    usual = SimulationConfig()
+    for name, value in others.items():
+        if name != "motion_distortion" and value != getattr(usual, name):  # such recordings are always distorted
+            raise ConfigError(
+                f"{_option(name)} is for roads ({', '.join(get_args(Scene))}), not for {values['scene']!r}"
+            )
+    return _validated(PlatformConfig, {k: v for k, v in values.items() if v is not None}), simulate_platform
+
+
+def _validated(kind: Any, values: dict[str, Any]) -> Any:
+    from pydantic import ValidationError
+
     try:
-        with held(place / f"drive-{config.seed:04d}"), progress("simulating") as report:
-            drive = write_drive(out, config, report)
+        return kind.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError("; ".join(_describe(e["loc"], e["msg"]) for e in error.errors())) from None
+
+
+def _write(out: Path, config: Any, write: Any) -> None:
+    from hybridlio.datasets.registry import open_sequence
+
+    try:
+        with progress("simulating") as report:
+            folder = write(out, config, report)
     except KeyboardInterrupt:
         print_message("interrupted; the same command resumes the simulation")
         raise typer.Exit(INTERRUPTED) from None
-    sequence = open_sequence(drive)
+    sequence = open_sequence(folder)
     length = f", {sequence.reference.length_m:.1f} m" if sequence.reference is not None else ""
     print_result(f"{sequence.name}: {len(sequence)} scans{length} in {sequence.duration_s:.1f} s")
-    print_result(f"{drive}")
+    print_result(f"{folder}")
 
 
 def _describe(place: tuple[int | str, ...], message: str) -> str:
-    name = str(place[0]) if place else "options"
-    option = {"speed_m_s": "speed"}.get(name, name).replace("_", "-")
-    return f"--{option}: {message.removeprefix('Value error, ')}"
+    return f"{_option(str(place[0]) if place else 'options')}: {message.removeprefix('Value error, ')}"
+
+
+def _option(name: str) -> str:
+    return "--" + {"speed_m_s": "speed"}.get(name, name).replace("_", "-")

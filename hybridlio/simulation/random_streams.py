@@ -23,3 +23,6 @@ class RandomStream(IntEnum):
     SCAN = 9  # and the scan's number
     DROPPED_SCANS = 11
     IMU_BIAS = 12
+    SCENE = 13
+    MOTION = 14
+    MOUNT = 15

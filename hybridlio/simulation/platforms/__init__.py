@@ -1,0 +1,1 @@
+"""Recordings of other platforms than the road vehicle: people, robots and drones, in and around buildings."""

@@ -1,0 +1,1 @@
+"""The scenes: what stands in them, and the way through them."""
