@@ -13,6 +13,7 @@ Recordings:
 
 Estimation:
     Odometry           estimates frame by frame; Config has its settings, load_config reads them from a YAML file
+    OdometryStream     the same from live data, such as in a robot's node: measurements in, estimates out
     Estimate           the result of a step: pose, covariance and what they were computed from
     smooth             smooth a finished run (odometry.record()) over its whole length, with loops and GPS
     run_batch          run many Recordings in parallel; BatchOptions has the settings, Batch the results
@@ -50,6 +51,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time each name l
     from hybridlio.odometry.config import Config, load_config
     from hybridlio.odometry.estimate import Estimate
     from hybridlio.odometry.odometry import Odometry
+    from hybridlio.odometry.stream import OdometryStream
     from hybridlio.runs.batch import BatchOptions, run_batch
     from hybridlio.runs.batch_table import Batch
     from hybridlio.runs.recordings import Recording, find_recordings
@@ -69,6 +71,7 @@ __all__ = [
     "ImuSamples",
     "MapSettings",
     "Odometry",
+    "OdometryStream",
     "Recording",
     "RelativePose",
     "Scan",
@@ -101,6 +104,7 @@ _HOMES = {
     "odometry.config": ("Config", "load_config"),
     "odometry.estimate": ("Estimate",),
     "odometry.odometry": ("Odometry",),
+    "odometry.stream": ("OdometryStream",),
     "runs.batch": ("BatchOptions", "run_batch"),
     "runs.batch_table": ("Batch",),
     "runs.recordings": ("Recording", "find_recordings"),

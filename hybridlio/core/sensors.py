@@ -131,6 +131,13 @@ class ImuSamples:
         values = np.column_stack([np.interp(at, known, columns[:, i]) for i in range(6)])
         return ImuSamples(stamps, values[:, :3], values[:, 3:])
 
+    def during(self, scan: Scan) -> ImuSamples:
+        """Return the samples from the scan's first point to its last; none if the points have no times."""
+        if scan.time_offsets_ns is None or not len(scan):
+            return ImuSamples.empty()
+        first, last = scan.time_offsets_ns.min(), scan.time_offsets_ns.max()
+        return self.between(scan.stamp_ns + int(first), scan.stamp_ns + int(last))
+
     def _near_samples(self, stamp_ns: int) -> bool:
         """Return whether the samples around the stamp are close enough to interpolate between."""
         after = int(np.searchsorted(self.stamps_ns, stamp_ns, side="left"))

@@ -142,17 +142,10 @@ class Sequence:
             scan,
             imu=self.imu.between(start, end),
             gps=self.gps[first:last],
-            sweep_imu=self._during(scan),
+            sweep_imu=self.imu.during(scan),
             calibration=self.calibration,
             imu_noise=self.imu_noise,
         )
-
-    def _during(self, scan: Scan) -> ImuSamples:
-        """Return the samples from the scan's first point to its last; none if the points have no times."""
-        if scan.time_offsets_ns is None or not len(scan):
-            return ImuSamples.empty()
-        first, last = scan.time_offsets_ns.min(), scan.time_offsets_ns.max()
-        return self.imu.between(scan.stamp_ns + int(first), scan.stamp_ns + int(last))
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))

@@ -1,46 +1,43 @@
-"""Write a run's report: one HTML file that contains its plots and loads nothing from elsewhere."""
+"""Write a run's report: one HTML file that contains its charts and loads nothing from elsewhere."""
 
 from __future__ import annotations
 
-import base64
+import json
 import os
 import platform
-from collections.abc import Mapping
 from importlib import metadata, resources
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from hybridlio.core.files import write_atomically
+from hybridlio.core.trajectory import travelled_m
 from hybridlio.core.version import __version__
+from hybridlio.evaluation.charts.consistency_charts import drift_figure, nees_figure, sigma_figure
+from hybridlio.evaluation.charts.path_charts import map_figure, space_figure
+from hybridlio.evaluation.charts.plotly import Figure, packed_library
+from hybridlio.evaluation.charts.time_charts import step_figure, timeline_figure, timing_figure
 from hybridlio.evaluation.consistency import Anees
 from hybridlio.evaluation.drift import Drift
 from hybridlio.evaluation.evaluate import Evaluation
 from hybridlio.evaluation.metrics_table import format_metrics, metric_rows
-from hybridlio.evaluation.report_data import DrawnPath, Findings, ReportData, analyse
+from hybridlio.evaluation.report_data import DrawnPath, Findings, ReportData, analyse, stretches
+from hybridlio.evaluation.trust import headline, statements
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-__all__ = ["Findings", "ReportData", "analyse", "draw", "figures", "write_report"]
+__all__ = ["Findings", "ReportData", "analyse", "charts", "picture", "write_report"]
 
 _PACKAGES = ("numpy", "scipy", "gtsam", "small_gicp", "open3d", "torch", "filterpy")
-_MAX_RANGES_LISTED = 200  # about a page
+_SPEED = "speed"
+_MAX_STRETCHES = 200  # about a page
 
 
-def write_report(
-    path: str | os.PathLike[str],
-    data: ReportData,
-    findings: Findings | None = None,
-    drawn: Mapping[str, bytes] | None = None,
-) -> None:
+def write_report(path: str | os.PathLike[str], data: ReportData, findings: Findings | None = None) -> None:
     """Write the report, completely or not at all.
 
     Args:
         path: the HTML file.
         data: the run.
         findings: the result of :func:`analyse` on ``data``, if it exists already.
-        drawn: the result of :func:`draw`, if it exists already.
 
     Raises:
         DataError: the file cannot be written.
@@ -48,70 +45,101 @@ def write_report(
     import jinja2
 
     findings = analyse(data) if findings is None else findings
-    drawn = draw(data, findings) if drawn is None else drawn
     text = resources.files("hybridlio.evaluation").joinpath("report.html.jinja").read_text(encoding="utf-8")
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    write_atomically(path, environment.from_string(text).render(_page(data, findings, drawn)))
+    write_atomically(path, environment.from_string(text).render(_page(data, findings)))
 
 
-def draw(data: ReportData, findings: Findings) -> dict[str, bytes]:
-    """Return the :func:`figures` as PNG files, by name."""
-    from hybridlio.evaluation.plots import to_png
-
-    return {name: to_png(figure) for name, figure in figures(data, findings).items()}
-
-
-def figures(data: ReportData, findings: Findings) -> dict[str, Figure]:
-    """Return the figures that the data allow: trajectory, drift, steps, timing, nees, sigma_steps, sigma_poses."""
-    from hybridlio.evaluation import plots
+def picture(data: ReportData, findings: Findings) -> bytes:
+    """Return the paths from above, with height and error, as a PNG file."""
+    from hybridlio.evaluation.plots import to_png, trajectory_figure
 
     reference = None if data.reference is None or not findings.evaluations else data.reference.poses[:, :3, 3]
     bridged = None if data.ok is None else _bridged_m(data, findings)
     loops = None if data.loops is None else _loops_m(data.loops, findings.paths[data.estimate_name])
-    out = {"trajectory": plots.trajectory_figure(findings.paths, reference, bridged, loops)}
+    return to_png(trajectory_figure(findings.paths, reference, bridged, loops))
+
+
+def charts(data: ReportData, findings: Findings) -> dict[str, Figure]:
+    """Return the charts that the data allow, by name."""
+    out = {
+        "map": map_figure(data, findings),
+        "space": space_figure(data, findings),
+        "timeline": timeline_figure(data, findings),
+    }
     drifts = {name: _drift(evaluation) for name, evaluation in findings.evaluations.items()}
     drifts = {name: drift for name, drift in drifts.items() if len(drift)}
     if drifts:
-        out["drift"] = plots.drift_figure(drifts)
+        out["drift"] = drift_figure(drifts)
     if findings.step_errors:
-        out["steps"] = plots.step_error_figure(findings.step_errors)
+        out["steps"] = step_figure(findings)
     if data.timings_s:
-        out["timing"] = plots.timing_figure(data.timings_s, data.period_s)
+        out["timing"] = timing_figure(data)
     if findings.steps is not None:
-        out["nees"] = plots.nees_figure(findings.steps.times_s, findings.steps.consistency)
-        out["sigma_steps"] = plots.sigma_figure(findings.steps.times_s, findings.steps.consistency)
+        out["nees"] = nees_figure(findings.steps)
+        out["sigma_steps"] = sigma_figure(findings.steps)
     if findings.poses is not None:
-        out["sigma_poses"] = plots.sigma_figure(findings.poses.times_s, findings.poses.consistency)
+        out["sigma_poses"] = sigma_figure(findings.poses)
     return out
 
 
-def _page(data: ReportData, findings: Findings, drawn: Mapping[str, bytes]) -> dict[str, Any]:
-    inline = {name: base64.b64encode(png).decode() for name, png in drawn.items()}
-    second = data.first_scan + 1  # the first step leads to the second scan
-    bridged = [] if data.ok is None else _ranges(np.flatnonzero(~np.asarray(data.ok, bool)) + second)
-    degenerate = [] if data.degenerate is None else _ranges(np.flatnonzero(data.degenerate) + second)
+def _page(data: ReportData, findings: Findings) -> dict[str, Any]:
+    found = statements(data, findings)
+    level, summary = headline(found)
+    figures = charts(data, findings)
     return {
         "name": data.name,
         "facts": {**_own_facts(data), **data.facts},
         "tiles": _tiles(data, findings),
+        "level": level,
+        "summary": summary,
+        "statements": found,
+        "doubtful": bool(data.reference_doubts),
         "warnings": [*data.warnings, *findings.notes],
+        "stretches": _stretch_rows(data),
         "names": list(findings.evaluations),
         "metrics": metric_rows(format_metrics(e) for e in findings.evaluations.values()),
-        "plots": inline,
+        "charts": {name: figure["layout"]["height"] for name, figure in figures.items()},
+        "figures": _script_safe(figures),
+        "library": packed_library(),
         "drift_names": [name for name, e in findings.evaluations.items() if len(_drift(e))],
         "drift": _drift_rows(findings),
         "short": any(e.t_rel_percent is None for e in findings.evaluations.values()),
         "step_errors": _step_rows(findings),
         "timing": _timing_rows(data),
         "consistency": _consistency_rows(findings),
-        "bridged": bridged,
-        "degenerate": degenerate,
-        "flags_known": data.ok is not None or data.degenerate is not None,
         "config": data.config.strip(),
         "versions": _versions(),
     }
+
+
+def _script_safe(value: Any) -> str:
+    """Return JSON that cannot end the script element it stands in, nor be read as markup by Plotly."""
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False)
+    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+
+
+def _stretch_rows(data: ReportData) -> list[tuple[str, str, str, str]]:
+    """Return what is wrong, with scans, times and distances of each stretch, in the order of the run."""
+    distance, times = travelled_m(data.estimate.poses[:, :3, 3]), data.estimate.times_s
+    rows = [(first, last, name) for name, flagged in data.flagged.items() for first, last in stretches(flagged)]
+    texts = [
+        (
+            name,
+            _span(first + data.first_scan, last + data.first_scan),
+            f"{times[first]:.1f}" if first == last else f"{times[first]:.1f}–{times[last]:.1f}",
+            f"{distance[first]:.0f}" if first == last else f"{distance[first]:.0f}–{distance[last]:.0f}",
+        )
+        for first, last, name in sorted(rows)
+    ]
+    more = len(texts) - _MAX_STRETCHES
+    return texts[:_MAX_STRETCHES] + ([("", f"and {more} more", "", "")] if more > 0 else [])
+
+
+def _span(first: int, last: int) -> str:
+    return f"{first}" if first == last else f"{first}–{last}"
 
 
 def _own_facts(data: ReportData) -> dict[str, str]:
@@ -121,8 +149,8 @@ def _own_facts(data: ReportData) -> dict[str, str]:
     return facts
 
 
-def _tiles(data: ReportData, findings: Findings) -> list[tuple[str, str, str]]:
-    """Return the headline metrics: label, value, unit."""
+def _tiles(data: ReportData, findings: Findings) -> list[tuple[str, str, str, bool]]:
+    """Return the headline metrics: label, value, unit, and whether it compares with the reference."""
     tiles: list[tuple[str, float | None, str]] = []
     own = findings.evaluations.get(data.estimate_name)
     if own is not None:
@@ -141,8 +169,8 @@ def _tiles(data: ReportData, findings: Findings) -> list[tuple[str, str, str]]:
         tiles += [("ATE", own.ate_m, "m"), ("end error", own.end_error_m, "m")]
     if data.timings_s:
         total = sum(np.sum(t) for t in data.timings_s.values())
-        tiles.append(("speed", max(map(len, data.timings_s.values())) / float(total), "scans/s"))
-    return [(label, _digits(value), unit) for label, value, unit in tiles if value is not None]
+        tiles.append((_SPEED, max(map(len, data.timings_s.values())) / float(total), "scans/s"))
+    return [(label, _digits(value), unit, label != _SPEED) for label, value, unit in tiles if value is not None]
 
 
 def _drift(evaluation: Evaluation) -> Drift:
@@ -216,14 +244,6 @@ def _loops_m(loops: Any, path: DrawnPath) -> Any:
     """Return ``(L, 2, 3)`` positions of the loops whose two ends are drawn."""
     drawn = loops[np.isin(loops, path.rows).all(axis=1)]
     return path.positions_m[np.searchsorted(path.rows, drawn)]
-
-
-def _ranges(frames: Any) -> list[str]:
-    """Return frame numbers as text, with consecutive ones joined: ``4``, ``7–9`` …, at most a page."""
-    runs = np.split(frames, np.flatnonzero(np.diff(frames) != 1) + 1) if len(frames) else []
-    texts = [f"{run[0]}" if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs]
-    more = len(texts) - _MAX_RANGES_LISTED
-    return texts[:_MAX_RANGES_LISTED] + ([f"and {more} more"] if more > 0 else [])
 
 
 def _digits(value: float) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import NS_PER_S
@@ -32,6 +33,11 @@ class ReportData:
         timings_s: by stage, ``(M,)`` seconds per scan; stages in the order in which they run.
         ok: ``(N-1,)``; False where the scan could not be used and the step is bridged by the initial pose.
         degenerate: ``(N-1,)``; True where the scan does not constrain every direction of the step.
+        conflicts: by verdict of the innovation gate, rows of the estimate whose scan conflicts with the IMU.
+        map_points: ``(P, 3)`` points of the scans in the estimate's frame, to draw below the path.
+        fixes_m: ``(F, 3)`` GPS fixes in the estimate's frame.
+        reference_doubts: why the reference contradicts itself or other sensors; figures that compare with it are then
+            shown as doubtful.
         first_scan: index of the recording's scan that the first pose of the estimate belongs to.
         loops: ``(L, 2)`` rows of the estimate that loop closures connect.
         facts: short texts for the head by label, such as the sources used.
@@ -50,6 +56,10 @@ class ReportData:
     timings_s: Mapping[str, Array] = field(default_factory=dict)
     ok: NDArray[np.bool_] | None = None
     degenerate: NDArray[np.bool_] | None = None
+    conflicts: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+    map_points: Array | None = None
+    fixes_m: Array | None = None
+    reference_doubts: Sequence[str] = ()
     first_scan: int = 0
     loops: NDArray[np.int64] | None = None
     facts: Mapping[str, str] = field(default_factory=dict)
@@ -76,6 +86,17 @@ class ReportData:
                 raise DataError(f"report: timings_s[{stage!r}] must be one finite number of seconds per scan")
 
     @property
+    def flagged(self) -> dict[str, NDArray[np.int64]]:
+        """Rows of the estimate by what is wrong with their scans, the gravest first."""
+        steps = {"bridged": self.ok, "degenerate": self.degenerate}
+        rows = {
+            name: np.flatnonzero(np.asarray(flags, bool) != (name == "bridged")) + 1
+            for name, flags in steps.items()
+            if flags is not None
+        }
+        return {**rows, **self.conflicts}
+
+    @property
     def period_s(self) -> float | None:
         """Median time between poses; None for a single pose."""
         stamps = self.estimate.stamps_ns
@@ -90,12 +111,16 @@ class DrawnPath:
         rows: ``(M,)`` the trajectory's rows that are drawn; with a reference, those that it has too.
         positions_m: ``(M, 3)`` positions.
         travelled_m, error_m: ``(M,)`` path length of the reference and distance from it; empty without a reference.
+        aligned_error_m: ``(M,)`` the same after rigid alignment of all positions; empty without a reference.
+        T_drawn_world: ``(4, 4)`` from the trajectory's own frame to that of the drawing.
     """
 
     rows: NDArray[np.int64]
     positions_m: Array
     travelled_m: Array
     error_m: Array
+    aligned_error_m: Array
+    T_drawn_world: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,12 +189,13 @@ def _associate(reference: Trajectory | None, trajectory: Trajectory, name: str, 
 
 def _path(trajectory: Trajectory, both: Association | None) -> DrawnPath:
     if both is None:
-        return DrawnPath(np.arange(len(trajectory)), trajectory.from_first().poses[:, :3, 3], np.empty(0), np.empty(0))
-    aligned = align(both.reference, both.estimate, "first").poses
+        none, T = np.empty(0), se3.inverse(trajectory.poses[0])
+        return DrawnPath(np.arange(len(trajectory)), (T @ trajectory.poses)[:, :3, 3], none, none, none, T)
     true = both.reference.poses[:, :3, 3]
-    return DrawnPath(
-        both.estimate_rows, aligned[:, :3, 3], travelled_m(true), np.linalg.norm(aligned[:, :3, 3] - true, axis=1)
-    )
+    at_start, as_whole = (align(both.reference, both.estimate, how).poses for how in ("first", "se3"))
+    off, off_as_whole = (np.linalg.norm(poses[:, :3, 3] - true, axis=1) for poses in (at_start, as_whole))
+    T = at_start[0] @ se3.inverse(both.estimate.poses[0])
+    return DrawnPath(both.estimate_rows, at_start[:, :3, 3], travelled_m(true), off, off_as_whole, T)
 
 
 def _step_errors(data: ReportData, own: Association | None) -> dict[str, tuple[Array, Array]]:
@@ -180,3 +206,11 @@ def _step_errors(data: ReportData, own: Association | None) -> dict[str, tuple[A
             if len(rows):
                 out[name] = (data.estimate.times_s[rows + 1], errors)
     return out
+
+
+def stretches(rows: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """Return the first and the last of each run of consecutive numbers."""
+    if not len(rows):
+        return []
+    parts = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
+    return [(int(part[0]), int(part[-1])) for part in parts]

@@ -9,7 +9,7 @@ import numpy as np
 
 from hybridlio.core.errors import ConfigError, DataError, EstimationError
 from hybridlio.core.estimates import Backend, InitialPoseSource, ResidualSource, State
-from hybridlio.core.sensors import Frame
+from hybridlio.core.sensors import Frame, ImuNoise
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.estimate import Estimate
 from hybridlio.odometry.pipeline import Pipeline, timed
@@ -34,6 +34,8 @@ class Odometry:
         residual: name or object of a residual source.
         backend: name or object of a backend.
         config: settings. Names given as arguments take precedence over those in it.
+        keep_record: whether :meth:`record` is wanted. Without it memory does not grow with the run, once IMU samples
+            have come.
 
     Raises:
         ConfigError: a name is unknown.
@@ -45,6 +47,7 @@ class Odometry:
         residual: str | ResidualSource | None = None,
         backend: str | Backend | None = None,
         config: Config | None = None,
+        keep_record: bool = True,
     ) -> None:
         config = config or Config()
         if not isinstance(config, Config):
@@ -55,6 +58,17 @@ class Odometry:
         self._pipeline: Pipeline | None = None  # made at the first frame, which brings the calibration
         self._recorder = Recorder()
         self._keyframes = LoopKeyframeSelector(config.keyframes)
+        self.keeps_record = keep_record
+
+    @property
+    def last_state(self) -> State | None:
+        """The backend's state at the last scan, with velocity and biases; None before the second scan."""
+        return None if self._pipeline is None else self._pipeline.state
+
+    @property
+    def imu_noise(self) -> ImuNoise | None:
+        """The noise densities that the run uses; None before the first scan."""
+        return None if self._pipeline is None else self._pipeline.imu_noise
 
     def step(self, frame: Frame) -> Estimate:
         """Estimate the frame's pose.
@@ -88,8 +102,9 @@ class Odometry:
             step = pipeline.backend.last_step()
         pipeline.correct(frame, initial, relative, step)
         pose, covariance = pipeline.lidar_pose(pipeline.state)
-        with timed(seconds, "keyframes"):
-            self._keyframes.offer(len(self._recorder), compensated.scan, pose)
+        if self.keeps_record:
+            with timed(seconds, "keyframes"):
+                self._keyframes.offer(len(self._recorder), compensated.scan, pose)
         return self._keep(
             Estimate(frame.index, frame.scan.stamp_ns, pose, covariance, initial, relative, step, seconds, gate), frame
         )
@@ -98,8 +113,13 @@ class Odometry:
         """Return what smoothing and the run's files need of all scans so far, or of the first ``scans``.
 
         Raises:
-            EstimationError: fewer than two frames have been estimated.
+            EstimationError: fewer than two frames have been estimated, or this odometry keeps no record.
         """
+        if not self.keeps_record:
+            raise EstimationError("this odometry keeps no record; make it with keep_record=True")
+        return self._record(scans)
+
+    def _record(self, scans: int | None = None) -> Record:
         pipeline = self._pipeline
         if pipeline is None or pipeline.start is None or pipeline.state is None:
             raise EstimationError("a record needs at least two frames; call step for more")
@@ -177,7 +197,7 @@ class Odometry:
         if pipeline.state is None:
             return start_backend(pipeline, frame)
         if len(frame.imu) and not pipeline.state.has_imu:
-            return take_up_imu(pipeline, self.record(), frame)
+            return take_up_imu(pipeline, self._record(), frame)
         return pipeline.state
 
     def _keep(self, estimate: Estimate, frame: Frame) -> Estimate:
@@ -185,6 +205,9 @@ class Odometry:
         initial, relative = estimate.initial, estimate.relative
         step = None if initial is None or relative is None else (initial, relative)
         self._recorder.add(estimate.stamp_ns, estimate.pose, estimate.covariance, step, frame.imu, frame.gps)
+        state = self.last_state
+        if not self.keeps_record and state is not None and state.has_imu:  # an IMU that starts late needs all steps
+            self._recorder.forget()
         return estimate
 
 

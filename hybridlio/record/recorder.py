@@ -63,6 +63,10 @@ class Recorder:
         self._gps.extend(gps)
         self._recent.append(_ScanEstimate(stamp_ns, pose, covariance, step))  # last, because this completes the scan
 
+    def forget(self) -> None:
+        """Drop everything but the last scan."""
+        self._packed, self._recent, self._imu, self._gps = [], self._recent[-1:], [], []
+
     def record(
         self,
         start: State,
@@ -85,7 +89,7 @@ class Recorder:
             relative=tuple(relative for _, relative in steps),
             # an interrupted `add` may have left samples and fixes of the scan after the last
             imu=concatenate_imu(self._imu).between(start.stamp_ns, last_ns),
-            gps=tuple(fix for fix in self._gps if fix.stamp_ns <= last_ns),
+            gps=tuple(sorted((f for f in self._gps if f.stamp_ns <= last_ns), key=lambda fix: fix.stamp_ns)),
             start=start,
             calibration=calibration,
             imu_noise=noise,

@@ -16,12 +16,13 @@ from hybridlio.core.trajectory_files import write_tum
 from hybridlio.core.version import __version__
 from hybridlio.datasets.protection import check_output
 from hybridlio.evaluation.evaluate import Evaluation, Steps
-from hybridlio.evaluation.report import draw, write_report
+from hybridlio.evaluation.report import picture, write_report
 from hybridlio.evaluation.report_data import Findings, ReportData, analyse
 from hybridlio.odometry.config import Config, config_to_yaml
 from hybridlio.record.record import Record
 from hybridlio.runs import folder as run_folder
 from hybridlio.runs.own_files import check_free
+from hybridlio.runs.report_input import ONLINE, SMOOTHED, report_data, smoothed_report_data
 from hybridlio.runs.run import Run
 from hybridlio.runs.whole_folder import is_held, replaced_folder
 
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from hybridlio.smoothing.smoothed import Smoothed
     from hybridlio.sources.innovation_gate import Verdict
 
-_ONLINE, _SMOOTHED = "odometry", "smoothed"
 _MAX_SCANS_NOTED = 20  # unreadable scans listed in the report; metrics.json has them all
 _LARGE_SHARE = 0.1  # of all scans; more conflicts with the IMU than single bad scans explain
 
@@ -75,18 +75,18 @@ def write_run_files(folder: Path, run: Run, config: Config) -> Findings:
         write_tum(folder / run_folder.REFERENCE, sequence.reference)
     text = config_to_yaml(config)
     write_atomically(folder / run_folder.CONFIG, text)
-    data = report_data(run, config, text)
+    data = report_data(run, config, text, notes(run), forward_speed_length_m(run))
     findings = analyse(data)
     write_pages(folder, data, findings)
-    run_folder.write_metrics(folder, metrics(run, config, findings.evaluations.get(_ONLINE)))
+    doubts = {"reference_doubts": list(data.reference_doubts)}
+    run_folder.write_metrics(folder, metrics(run, config, findings.evaluations.get(ONLINE)) | doubts)
     return findings
 
 
 def write_pages(folder: Path, data: ReportData, findings: Findings) -> None:
     """Write ``report.html``, and the plot of the trajectory as ``trajectory.png``."""
-    drawn = draw(data, findings)
-    write_report(folder / run_folder.REPORT, data, findings, drawn)
-    write_atomically(folder / run_folder.PICTURE, drawn["trajectory"])
+    write_report(folder / run_folder.REPORT, data, findings)
+    write_atomically(folder / run_folder.PICTURE, picture(data, findings))
 
 
 def T_pose_files(run: Run) -> Any:
@@ -125,26 +125,6 @@ def imu_conflicts(run: Run) -> list[str]:
     if conflicts > _LARGE_SHARE * len(run.estimates):
         out.append("many scans conflict with the IMU; its data may be wrong: check T_imu_lidar, units and clock")
     return out
-
-
-def report_data(run: Run, config: Config, config_text: str) -> ReportData:
-    """Return the input of the run's report."""
-    return ReportData(
-        name=run.sequence.name,
-        estimate=run.trajectory,
-        reference=run.sequence.reference,
-        estimate_name=_ONLINE,
-        initial_poses=run.initial_poses,
-        final_poses=run.steps.poses,
-        step_covariances=run.steps.covariances,
-        timings_s=run.timings_s,
-        ok=run.ok,
-        degenerate=run.degenerate,
-        first_scan=run.skipped,
-        facts={"initial pose": config.initial_pose, "residual": config.residual, "backend": config.backend},
-        config=config_text,
-        warnings=notes(run),
-    )
 
 
 def metrics(run: Run, config: Config, evaluation: Evaluation | None) -> dict[str, Any]:
@@ -233,38 +213,15 @@ def _write_smoothed_files(folder: Path, stored: run_folder.StoredRun, record: Re
     run_folder.write_graph(folder, trajectory.poses, edges, len(stored.stamps_before))
     if stored.reference is not None:
         write_tum(folder / run_folder.REFERENCE, stored.reference)
-    findings = analyse(data := _smoothed_report_data(stored, record, smoothed, steps))
+    findings = analyse(data := smoothed_report_data(stored, record, smoothed, steps, loops))
     write_pages(folder, data, findings)
-    run_folder.write_metrics(folder, _smoothed_metrics(stored, smoothed, findings.evaluations.get(_SMOOTHED)))
+    run_folder.write_metrics(folder, _smoothed_metrics(stored, smoothed, findings.evaluations.get(SMOOTHED)))
     return findings
 
 
 def _closed_loops(smoothed: Smoothed) -> tuple[Loop, ...]:
     closed: ClosedLoops | None = smoothed.found.get("loops")
     return () if closed is None else closed.kept
-
-
-def _smoothed_report_data(stored: run_folder.StoredRun, record: Record, smoothed: Smoothed, steps: Steps) -> ReportData:
-    fit: GpsFit | None = smoothed.found.get("gps")
-    closed: ClosedLoops | None = smoothed.found.get("loops")
-    loops = _closed_loops(smoothed)
-    return ReportData(
-        name=stored.metrics["sequence"],
-        estimate=smoothed.trajectory,
-        reference=stored.reference,
-        estimate_name=_SMOOTHED,
-        others={_ONLINE: stored.trajectory},
-        final_poses=steps.poses,
-        step_covariances=steps.covariances,
-        ok=np.array([step.ok for step in record.relative]),
-        degenerate=np.array([len(step.degenerate) > 0 for step in record.relative]),
-        first_scan=len(stored.stamps_before),
-        loops=np.array([(loop.earlier, loop.later) for loop in loops], np.int64).reshape(-1, 2),
-        facts={"smoothed": f"{smoothed.iterations} iterations", "run": stored.path.name}
-        | ({} if closed is None else {"loops": closed.summary()})
-        | ({} if fit is None else {"GPS": fit.summary()}),
-        warnings=stored.metrics["notes"],
-    )
 
 
 def _smoothed_metrics(

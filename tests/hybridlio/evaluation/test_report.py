@@ -1,7 +1,10 @@
+import base64
 import dataclasses
+import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,9 +12,11 @@ import pytest
 from hybridlio.core import se3
 from hybridlio.core.errors import DataError
 from hybridlio.core.trajectory import Trajectory
+from hybridlio.evaluation.charts.path_charts import map_figure
+from hybridlio.evaluation.charts.plotly import Figure, thinned, thinned_peaks
 from hybridlio.evaluation.evaluate import Steps, evaluate
 from hybridlio.evaluation.metrics_table import format_metrics
-from hybridlio.evaluation.report import ReportData, analyse, figures, write_report
+from hybridlio.evaluation.report import ReportData, analyse, charts, write_report
 
 SIGMAS = [*np.radians([0.03, 0.03, 0.05]).tolist(), 0.02, 0.01, 0.02]
 
@@ -90,9 +95,11 @@ def html(data: ReportData, tmp_path_factory: pytest.TempPathFactory) -> str:
 def test_the_page_is_well_formed_and_loads_nothing(html: str) -> None:
     page = Page(html)
     assert page.open == []
-    assert len(page.sources) == 7
-    assert all(source.startswith("data:image/png;base64,iVBOR") for source in page.sources)
-    assert not re.search(r"https?:|url\(|@import|<script|<link", html)
+    assert page.sources == []
+    outside = re.sub(r'<script type="(application/json|text/plain)".*?</script>', "", html, flags=re.DOTALL)
+    assert not re.search(r"https?:|url\(|@import|<link|fetch\(", outside)
+    assert "default-src 'none'" in html
+    assert len(html) < 6e6
 
 
 def test_the_page_contains_the_metrics_of_the_evaluation(data: ReportData, html: str) -> None:
@@ -107,18 +114,23 @@ def test_the_page_contains_the_metrics_of_the_evaluation(data: ReportData, html:
         assert f"<td>{average.t_rel_percent:.3f}</td>" in html
 
 
-def test_the_page_lists_bridged_and_degenerate_scans_warnings_and_settings(html: str) -> None:
-    assert "<b>100, 200–202</b>" in html  # step k leads to scan k + 1
-    assert "<b>301–310</b>" in html
+def rows_of(html: str) -> list[list[str]]:
+    """Return the cells of all rows of tables."""
+    rows = re.findall(r"<tr>(.*?)</tr>", html, flags=re.DOTALL)
+    return [re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row) for row in rows]
+
+
+def test_the_page_lists_bridged_and_degenerate_stretches_warnings_and_settings(html: str) -> None:
+    flagged = [row[:2] for row in rows_of(html) if row[0] in ("bridged", "degenerate")]
+    assert flagged == [["bridged", "100"], ["bridged", "200–202"], ["degenerate", "301–310"]]  # step k leads to k + 1
     for text in ("gap of 0.42 s", "voxel_m: 0.5", "preintegration", "before smoothing", "numpy"):
         assert text in html
 
 
 def test_listed_scans_are_numbered_as_in_the_recording(data: ReportData, tmp_path: Path) -> None:
     write_report(tmp_path / "r.html", dataclasses.replace(data, first_scan=7))
-    html = (tmp_path / "r.html").read_text()
-    assert "<b>107, 207–209</b>" in html
-    assert "<b>308–317</b>" in html
+    listed = [row[1] for row in rows_of((tmp_path / "r.html").read_text()) if row[0] in ("bridged", "degenerate")]
+    assert listed == ["107", "207–209", "308–317"]
 
 
 def test_names_are_escaped(html: str) -> None:
@@ -132,9 +144,24 @@ def test_inconsistent_covariances_get_a_verdict(data: ReportData, tmp_path: Path
     assert re.search(r"<td>σ (2\.9\d?|3|3\.\d+) times too small</td>", (tmp_path / "r.html").read_text())
 
 
-EVERY_FIGURE = {"trajectory", "drift", "steps", "timing", "nees", "sigma_steps", "sigma_poses"}
+def test_nothing_in_the_data_ends_a_script(data: ReportData, tmp_path: Path) -> None:
+    hostile = "</script><img src=x onerror=alert(1)><b>"
+    named = dataclasses.replace(data, name=hostile, estimate_name=hostile, warnings=[hostile], facts={hostile: hostile})
+    write_report(tmp_path / "r.html", named)
+    html = (tmp_path / "r.html").read_text()
+    assert "<img" not in html
+    assert html.count("<script") == html.count("</script>") == 3
+    assert json.loads(figures_of(html))["map"]["data"]
+
+
+def figures_of(html: str) -> str:
+    (found,) = re.findall(r'id="figures">(.*?)</script>', html, flags=re.DOTALL)
+    return found
+
+
+EVERY_FIGURE = {"map", "space", "timeline", "drift", "steps", "timing", "nees", "sigma_steps", "sigma_poses"}
 GONE_WITH = {
-    "reference": EVERY_FIGURE - {"trajectory", "timing"},
+    "reference": EVERY_FIGURE - {"map", "space", "timeline", "timing"},
     "initial_poses": set(),
     "final_poses": {"nees", "sigma_steps"},
     "step_covariances": {"nees", "sigma_steps"},
@@ -145,17 +172,17 @@ GONE_WITH = {
 
 @pytest.mark.parametrize("absent", GONE_WITH)
 def test_missing_data_remove_only_the_figures_that_need_them(data: ReportData, absent: str) -> None:
-    assert set(figures(data, analyse(data))) == EVERY_FIGURE
+    assert set(charts(data, analyse(data))) == EVERY_FIGURE
     less = dataclasses.replace(data, **{absent: None})
-    assert set(figures(less, analyse(less))) == EVERY_FIGURE - GONE_WITH[absent]
+    assert set(charts(less, analyse(less))) == EVERY_FIGURE - GONE_WITH[absent]
 
 
 def test_an_estimate_alone_has_a_report(data: ReportData, tmp_path: Path) -> None:
     write_report(tmp_path / "r.html", ReportData("bare", data.estimate))
     text = (tmp_path / "r.html").read_text()
     assert Page(text).open == []
-    assert re.findall("<h2>(.*?)</h2>", text) == ["Trajectory", "Versions"]
-    assert "There is no reference" in text
+    assert re.findall("<h2>(.*?)</h2>", text) == ["Where it went"]
+    assert "There is no reference" in " ".join(text.split())
 
 
 @pytest.mark.parametrize(
@@ -175,14 +202,89 @@ def test_a_reference_at_other_times_is_a_warning(data: ReportData, tmp_path: Pat
     assert "only 0 poses at common times" in (tmp_path / "r.html").read_text()
 
 
-def test_the_trajectory_figure_shows_the_data(data: ReportData) -> None:
-    figure = figures(data, analyse(data))["trajectory"]
-    lines = {line.get_label(): line.get_xydata() for line in figure.axes[0].lines}
+def values_of(numbers: dict[str, str]) -> np.ndarray:
+    """Return the numbers of a trace."""
+    values = np.frombuffer(base64.b64decode(numbers["bdata"]), "<f4").astype(np.float64)
+    return values.reshape([int(n) for n in numbers["shape"].split(",")]) if "shape" in numbers else values
+
+
+def trace(figure: Figure, name: str) -> dict[str, Any]:
+    (found,) = [trace for trace in figure["data"] if trace["name"] == name]
+    return found
+
+
+def xy(figure: Figure, name: str) -> np.ndarray:
+    found = trace(figure, name)
+    return np.column_stack([values_of(found[axis]) for axis in "xy"])
+
+
+def test_the_map_shows_the_data(data: ReportData) -> None:
+    figure = charts(data, analyse(data))["map"]
     assert data.reference is not None
-    np.testing.assert_allclose(lines["reference"], data.reference.poses[:, :2, 3])
+    assert data.estimate.covariances is not None
+    np.testing.assert_allclose(xy(figure, "reference"), data.reference.poses[:, :2, 3], atol=1e-4)
     laid = data.reference.poses[0] @ data.estimate.poses
-    np.testing.assert_allclose(lines["smoothed"], laid[:, :2, 3], atol=1e-9)
-    np.testing.assert_allclose(lines["bridged scan"], laid[[100, 200, 201, 202], :2, 3], atol=1e-9)
+    np.testing.assert_allclose(xy(figure, "smoothed"), laid[:, :2, 3], atol=1e-4)
+    np.testing.assert_allclose(xy(figure, "bridged"), laid[[100, 200, 201, 202], :2, 3], atol=1e-4)
+    hover = values_of(trace(figure, "smoothed")["customdata"])
+    off = np.linalg.norm(laid[:, :3, 3] - data.reference.poses[:, :3, 3], axis=1)
+    np.testing.assert_allclose(hover[:, 0], data.estimate.times_s, atol=1e-4)
+    np.testing.assert_allclose(
+        hover[:, 3] ** 2, data.estimate.covariances[:, 3:, 3:].trace(axis1=1, axis2=2), rtol=1e-4
+    )
+    np.testing.assert_allclose(hover[:, 4], off, atol=1e-4)
+
+
+def test_ellipses_hold_the_reference_in_95_percent_of_runs() -> None:
+    inside = []
+    for seed in range(40):
+        data = dataclasses.replace(run(n=250, seed=seed), others={})
+        assert data.reference is not None
+        outlines = np.split(xy(map_figure(data, analyse(data)), "95 % of position"), range(34, 34 * 24, 34))
+        end, true = outlines[-1][:33], data.reference.poses[-1, :2, 3]
+        corners, to_true = np.diff(end, axis=0), true - end[:-1]
+        turns = corners[:, 0] * to_true[:, 1] - corners[:, 1] * to_true[:, 0]
+        inside.append(len(set(np.sign(turns))) == 1)  # the point is on the same side of every edge
+    assert 0.85 <= np.mean(inside) <= 1.0
+
+
+def test_points_of_the_scans_lie_below_the_path(data: ReportData) -> None:
+    rng = np.random.default_rng(3)
+    with_points = dataclasses.replace(data, map_points=rng.uniform(-50, 50, (5000, 3)))
+    (image,) = charts(with_points, analyse(with_points))["map"]["layout"]["images"]
+    assert data.reference is not None
+    centre = (data.reference.poses[0] @ [0, 0, 0, 1])[:2]
+    found = np.array([image["x"] + image["sizex"] / 2, image["y"] - image["sizey"] / 2])
+    np.testing.assert_allclose(found, centre, atol=3.0)
+
+
+def test_the_timeline_shows_both_alignments(data: ReportData) -> None:
+    assert data.reference is not None
+    evaluation = evaluate(data.reference, data.estimate)
+    figure = charts(data, analyse(data))["timeline"]
+    start, whole = (values_of(trace(figure, f"error, aligned {how}")["y"]) for how in ("at the start", "as a whole"))
+    assert start[0] == pytest.approx(0, abs=1e-6)
+    assert start[-1] == pytest.approx(evaluation.end_error_m, abs=1e-4)
+    assert np.sqrt((whole**2).mean()) == pytest.approx(evaluation.ate_m, rel=0.1)  # ATE aligns positions alone
+
+
+def test_long_runs_stay_small_and_keep_their_peaks() -> None:
+    rng = np.random.default_rng(1)
+    values = rng.normal(size=100_000)
+    values[77_777] = 50
+    kept = thinned_peaks(values, 1000)
+    assert len(kept) <= 1000
+    assert 77_777 in kept
+    assert {0, 99_999} <= set(thinned(100_000, 1000).tolist())
+
+
+def test_a_reference_that_contradicts_itself_greys_its_figures(data: ReportData, tmp_path: Path) -> None:
+    doubts = ["The reference contradicts the forward speed."]
+    write_report(tmp_path / "r.html", dataclasses.replace(data, reference_doubts=doubts))
+    html = (tmp_path / "r.html").read_text()
+    assert html.index(doubts[0]) < html.index('class="tiles"')
+    assert html.count('class="tile grey"') == 4  # all but the speed
+    assert 'class="tile"><span>speed' in html
 
 
 def test_the_error_for_arrays_of_wrong_shape_names_them(data: ReportData) -> None:

@@ -18,8 +18,9 @@ from hybridlio.odometry.config import Config, load_config
 from hybridlio.odometry.odometry import Odometry
 from hybridlio.record.record import Record
 from hybridlio.runs import folder as run_folder
+from hybridlio.runs.report_input import report_data
 from hybridlio.runs.run import Run, run_odometry
-from hybridlio.runs.write import report_data, write_run
+from hybridlio.runs.write import write_run
 
 CONFIG = Config(residual="none")
 T_CAMERA_LIDAR = se3.exp([1.2, -1.2, 1.2, 0.1, -0.2, 0.3])
@@ -133,7 +134,7 @@ def test_scans_before_the_first_usable_one_have_rows_with_the_covariance_of_an_u
         return sequence.load_scan(k)
 
     run = run_odometry(replace(sequence, load_scan=load), Odometry(config=CONFIG))
-    assert report_data(run, CONFIG, "").first_scan == 3
+    assert report_data(run, CONFIG, "", [], None).first_scan == 3
     write_run(tmp_path, run, CONFIG)
     whole = read_tum(tmp_path / "poses_tum.txt")
     assert whole.stamps_ns.tolist() == sequence.stamps_ns.tolist()

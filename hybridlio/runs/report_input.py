@@ -1,0 +1,135 @@
+"""The input of a run's report, from the run or from its folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, get_args
+
+import numpy as np
+
+from hybridlio.core import se3
+from hybridlio.core.arrays import Array, Index
+from hybridlio.core.trajectory import Trajectory
+from hybridlio.evaluation.evaluate import Steps
+from hybridlio.evaluation.reference_check import reference_doubts
+from hybridlio.evaluation.report_data import ReportData
+from hybridlio.odometry.config import Config
+from hybridlio.record.loop_keyframes import LoopKeyframes
+from hybridlio.record.record import Record
+from hybridlio.runs.folder import KEYFRAMES, StoredRun
+from hybridlio.runs.run import Run
+from hybridlio.sources.innovation_gate import Verdict
+
+if TYPE_CHECKING:
+    from hybridlio.smoothing.gps_options import GpsFit
+    from hybridlio.smoothing.loops import ClosedLoops, Loop
+    from hybridlio.smoothing.smoothed import Smoothed
+
+ONLINE, SMOOTHED = "odometry", "smoothed"
+_NO_CONFLICT = ("untested", "accepted")
+
+
+def report_data(
+    run: Run, config: Config, config_text: str, notes: Sequence[str], forward_speed_length_m: float | None
+) -> ReportData:
+    """Return the input of the run's report.
+
+    Args:
+        run: the run, complete or not.
+        config: its settings.
+        config_text: the settings as YAML.
+        notes: what a reader should know first.
+        forward_speed_length_m: path length of the IMU by the vehicle's own forward speed, if known.
+    """
+    record, trajectory = run.record, run.trajectory
+    return ReportData(
+        name=run.sequence.name,
+        estimate=trajectory,
+        reference=run.sequence.reference,
+        estimate_name=ONLINE,
+        initial_poses=run.initial_poses,
+        final_poses=run.steps.poses,
+        step_covariances=run.steps.covariances,
+        timings_s=run.timings_s,
+        ok=run.ok,
+        degenerate=run.degenerate,
+        conflicts=_conflicts(run),
+        map_points=None if record is None else _map_points(record, trajectory),
+        reference_doubts=_reference_doubts(run, forward_speed_length_m),
+        first_scan=run.skipped,
+        facts={"initial pose": config.initial_pose, "residual": config.residual, "backend": config.backend},
+        config=config_text,
+        warnings=notes,
+    )
+
+
+def smoothed_report_data(
+    stored: StoredRun, record: Record, smoothed: Smoothed, steps: Steps, loops: Sequence[Loop]
+) -> ReportData:
+    """Return the input of the report of a smoothed run.
+
+    Args:
+        stored: the run before smoothing.
+        record: of the run.
+        smoothed: the result.
+        steps: the smoothed relative poses.
+        loops: the loops that were closed.
+    """
+    fit: GpsFit | None = smoothed.found.get("gps")
+    closed: ClosedLoops | None = smoothed.found.get("loops")
+    return ReportData(
+        name=stored.metrics["sequence"],
+        estimate=smoothed.trajectory,
+        reference=stored.reference,
+        estimate_name=SMOOTHED,
+        others={ONLINE: stored.trajectory},
+        final_poses=steps.poses,
+        step_covariances=steps.covariances,
+        ok=np.array([step.ok for step in record.relative]),
+        degenerate=np.array([len(step.degenerate) > 0 for step in record.relative]),
+        map_points=_map_points(record, smoothed.trajectory, stored),
+        fixes_m=None if fit is None else _fixes(record, fit),
+        reference_doubts=stored.metrics.get("reference_doubts", ()),
+        first_scan=len(stored.stamps_before),
+        loops=np.array([(loop.earlier, loop.later) for loop in loops], np.int64).reshape(-1, 2),
+        facts={"smoothed": f"{smoothed.iterations} iterations", "run": stored.path.name}
+        | ({} if closed is None else {"loops": closed.summary()})
+        | ({} if fit is None else {"GPS": fit.summary()}),
+        warnings=stored.metrics["notes"],
+    )
+
+
+def _conflicts(run: Run) -> dict[str, Index]:
+    """Return the rows of the estimates whose scan conflicts with the IMU, by verdict of the innovation gate."""
+    verdicts: list[Verdict] = [v for v in get_args(Verdict) if v not in _NO_CONFLICT]
+    rows = {str(v): np.array(run.frames_with(v), np.int64) - run.skipped for v in verdicts}
+    return {verdict: found for verdict, found in rows.items() if len(found)}
+
+
+def _map_points(record: Record, trajectory: Trajectory, stored: StoredRun | None = None) -> Array | None:
+    """Return the points ``(P, 3)`` of the loop keyframes in the trajectory's frame; None if there are none."""
+    keyframes = record.keyframes if stored is None else _stored_keyframes(stored)
+    if keyframes is None or not len(keyframes):
+        return None
+    rows = keyframes.rows.tolist()
+    return np.concatenate([se3.transform(trajectory.poses[row], keyframes.points(k)) for k, row in enumerate(rows)])
+
+
+def _stored_keyframes(stored: StoredRun) -> LoopKeyframes | None:
+    path = stored.path / KEYFRAMES
+    return LoopKeyframes.load(path) if path.is_file() else None
+
+
+def _fixes(record: Record, fit: GpsFit) -> Array:
+    """Return the fixes ``(F, 3)`` that smoothing used, in the trajectory's frame."""
+    positions = np.array([fix.position_m for fix in record.gps]).reshape(-1, 3)[fit.used]
+    return np.asarray(se3.transform(se3.inverse(fit.T_enu_world), positions))
+
+
+def _reference_doubts(run: Run, forward_speed_length_m: float | None) -> list[str]:
+    reference = run.sequence.reference
+    if reference is None:
+        return []
+    poses = reference.poses[run.skipped : run.done] @ se3.inverse(run.sequence.calibration.T_imu_lidar)
+    length_m = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
+    return reference_doubts(reference, length_m, forward_speed_length_m)
