@@ -8,7 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import bags
 import pytest
+from streams import thinned
+
+import hybridlio as hl
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -75,6 +79,16 @@ def test_a_finished_run_is_smoothed_and_its_error_falls(folder):
     before, after = (float(number) for number in re.findall(r"error (\S+) -> (\S+) in", text)[0])
     assert after < before
     assert (folder / "odometry.npz").is_file()
+
+
+def test_a_bag_is_streamed_at_real_speed(tiny_drive, tmp_path):
+    messages, drive = bags.Messages(True), hl.open_sequence(tiny_drive).part(0, 12)
+    scans = (thinned(drive, 4).load_scan(k) for k in range(len(drive)))
+    end_ns = int(drive.stamps_ns[-1]) + 10**7
+    content = bags.drive_messages(messages, scans, drive.imu.between(0, end_ns), drive.calibration.T_imu_lidar)
+    text = run_example("stream_bag.py", bags.write(tmp_path / "bag", messages, content, "mcap"))
+    assert "12 estimates of 12 scans" in text
+    assert 0 < float(re.findall(r"median (\d+) ms", text)[0]) < 5000
 
 
 def test_gps_with_an_outage_is_fused_and_georeferenced(folder):
