@@ -53,8 +53,11 @@ class ClockOffset:
             ``Exp(rotation) @ R_imu_lidar``.
         rotation_sigma_rad: ``(3,)``.
         steps: number of steps that were compared.
-        unexplained: squared residuals over squared turns, both without their means; 0 is a perfect fit.
+        unexplained: variance of the residuals over that of the turns, the harmonic mean of the three axes: 0 is a
+            perfect fit about any axis, as open ground leaves the yaw of scans unknown and a plane drive has only yaw.
         unexplained_at_zero: the same without moving the stamps.
+        stated_rotation_ratio: variance of the residuals by the stated mounting over that by the estimated one, the mean
+            of the axes.
         turned_rad: standard deviation of the lidar's turns over a step.
     """
 
@@ -67,6 +70,7 @@ class ClockOffset:
     unexplained: float
     unexplained_at_zero: float
     turned_rad: float
+    stated_rotation_ratio: float
 
     @property
     def is_determined(self) -> bool:
@@ -109,6 +113,13 @@ def find_clock_offset(
     fit = _Fit(turns, imu, R_imu_lidar, noise or ImuNoise())
     start_s = fit.search(largest_s)
     return None if start_s is None else fit.refine(start_s, largest_s)
+
+
+def coarse_clock_offset(turns: Turns, imu: ImuSamples, largest_s: float) -> float | None:
+    """Return the offset to 10 ms, whatever the mounting and the gyroscope's unit; None with too few samples."""
+    if len(imu) < 2 or len(turns) < _MIN_STEPS:
+        return None
+    return _Fit(turns, imu, np.eye(3), ImuNoise()).search(largest_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +174,7 @@ class _Fit:
             starts, ends = self._starts - offset, self._ends - offset
             whole = self._path.covers(starts, ends)
             if whole.sum() >= _MIN_STEPS:
-                gyro = np.linalg.norm(self._path.turns(starts[whole], ends[whole]), axis=1) / spans[whole]
+                gyro = np.linalg.norm(self._path.integrals(starts[whole], ends[whole]), axis=1) / spans[whole]
                 correlations[k] = _correlation(_clipped(gyro), speeds[whole])
         return float(grid[correlations.argmax()]) if np.isfinite(correlations).any() else None
 
@@ -190,7 +201,7 @@ class _Fit:
         return ClockOffset(
             float(x[0]), float(sigmas[0]), x[1:4], x[4:], sigmas[4:], int(kept.sum()),
             self._unexplained(x, kept), self._unexplained(at_zero, kept & self._whole(0.0)),
-            float(np.sqrt(self._u[kept].var(axis=0).sum())),
+            float(np.sqrt(self._u[kept].var(axis=0).sum())), self._stated_rotation_ratio(x, kept),
         )  # fmt: skip
 
     def _whole(self, offset: float) -> Mask:
@@ -219,12 +230,15 @@ class _Fit:
         J[:, :, 4:] = se3.hat(turned)  # Exp(φ + dφ)·u ≈ Exp(φ)·u - hat(Exp(φ)·u)·dφ
         return J
 
+    def _stated_rotation_ratio(self, x: Array, rows: Mask) -> float:
+        stated, estimated = (self._residuals(y, rows).var(axis=0) for y in (np.r_[x[:4], np.zeros(3)], x))
+        return float((stated / np.maximum(estimated, _LEAST_SIGMA_RAD**2)).mean())
+
     def _unexplained(self, x: Array, rows: Mask) -> float:
         if not rows.any():
             return np.inf
-        residuals, turned = self._residuals(x, rows), self._u[rows]
-        spread = ((turned - turned.mean(axis=0)) ** 2).sum()
-        return float(((residuals - residuals.mean(axis=0)) ** 2).sum() / max(spread, 1e-12))
+        ratios = self._residuals(x, rows).var(axis=0) / np.maximum(self._u[rows].var(axis=0), 1e-12)
+        return float(3 / (1 / np.maximum(ratios, 1e-9)).sum())
 
 
 def _clipped(rates: Array) -> Array:

@@ -84,6 +84,7 @@ class GyroPath:
             R[shift:] = R[:-shift] @ R[shift:]
             shift *= 2
         self._R = R
+        self._integral = np.concatenate([np.zeros((1, 3)), np.cumsum(means * self._steps_s[:, None], axis=0)])
 
     def covers(self, starts_s: Array, ends_s: Array) -> Mask:
         """Return ``(N,)`` whether samples without a gap surround each interval."""
@@ -96,11 +97,26 @@ class GyroPath:
         """Return rotation vectors ``(N, 3)`` over the intervals, in the IMU frame at their starts."""
         return se3.so3_log(np.swapaxes(self._at(starts_s), -1, -2) @ self._at(ends_s))
 
+    def integrals(self, starts_s: Array, ends_s: Array) -> Array:
+        """Return the rates' integrals ``(N, 3)`` over the intervals, axis by axis.
+
+        Unlike rotations they have no bound, so they suit rates that may be in another unit.
+        """
+        return self._integral_at(ends_s) - self._integral_at(starts_s)
+
+    def _integral_at(self, times_s: Array) -> Array:
+        k = self._interval(times_s)
+        return self._integral[k] + self._since(k, times_s)
+
     def _interval(self, times_s: Array) -> Stamps:
         return np.clip(np.searchsorted(self._times_s, times_s, side="right") - 1, 0, len(self._steps_s) - 1)
 
     def _at(self, times_s: Array) -> Array:
         k = self._interval(times_s)
+        return np.asarray(self._R[k] @ se3.so3_exp(self._since(k, times_s)))
+
+    def _since(self, k: Stamps, times_s: Array) -> Array:
+        """Return the rates' integrals ``(N, 3)`` from samples ``k`` to times before the next ones."""
         into = (times_s - self._times_s[k])[:, None]
         slope = (self._rates[k + 1] - self._rates[k]) / self._steps_s[k, None]
-        return np.asarray(self._R[k] @ se3.so3_exp(self._rates[k] * into + slope * into**2 / 2))
+        return np.asarray(self._rates[k] * into + slope * into**2 / 2)

@@ -47,6 +47,7 @@ def batch(
     config: common.ConfigFile = None,
     frames: common.Frames = None,
     vertical_angle: common.VerticalAngle = None,
+    check: common.Check = True,
     jobs: Annotated[
         int | None, typer.Option("-j", "--jobs", min=1, help="Number of parallel runs; default: one per core.")
     ] = None,
@@ -75,7 +76,7 @@ def batch(
     found = find_recordings(data, sequence, reader, raw_root, frames, vertical_angle, topics)
     options = BatchOptions(
         jobs=jobs, threads=threads, engine=engine, scheduler=scheduler, overwrite=overwrite,
-        adapt_config=initial_pose is None and config is None,
+        adapt_config=initial_pose is None and config is None, check=check,
     )  # fmt: skip
     with progress("batch", "recordings") as report:
         done = run_batch(found, out, settings, options, report)

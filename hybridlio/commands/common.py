@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, ParamSpec
 
 import typer
 
-from hybridlio.commands.terminal import print_message, set_up_logging
+from hybridlio.commands.terminal import print_message, progress, set_up_logging
 from hybridlio.core.errors import ConfigError, DataError, HybridLioError
 from hybridlio.datasets.rosbag.choices import BagTopics, option_of
 from hybridlio.odometry.registry import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
@@ -85,6 +85,12 @@ VerticalAngle = Annotated[
 Rate = Annotated[
     float | None,
     typer.Option("--rate", metavar="HZ", help="Scans per second, for a folder of scans without a file of stamps."),
+]
+Check = Annotated[
+    bool,
+    typer.Option(
+        "--check/--no-check", help="Compare the IMU with the scans first: clocks, units, mounting (a few seconds)."
+    ),
 ]
 Frames = Annotated[str | None, typer.Option("--frames", metavar="A:B", help="Use scans A to B-1 only, counted from 0.")]
 InitialPoseName = Annotated[
@@ -218,6 +224,16 @@ def open_data(
         rate_hz=rate_hz,
     )
     return part_of(whole, frames)
+
+
+def check_data(recording: Sequence, check: bool) -> Sequence:
+    """Return the recording with its IMU compared with its scans, and corrected; unchanged without ``check``."""
+    if not check:
+        return recording
+    from hybridlio.runs.recording_check import check_recording
+
+    with progress("checking the IMU") as report:
+        return check_recording(recording, report)
 
 
 def load_settings(config: Path | None, **names: str | None) -> Config:

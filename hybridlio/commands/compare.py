@@ -46,6 +46,7 @@ def compare(
     frames: common.Frames = None,
     vertical_angle: common.VerticalAngle = None,
     rate: common.Rate = None,
+    check: common.Check = True,
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", metavar="DIR", help="Write compare.json and compare.md to this folder."),
@@ -66,6 +67,7 @@ def compare(
         settings,
     )
     recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle, topics, rate)
+    recording = common.check_data(recording, check)
     with nullcontext() if out is None else claimed(out, COMPARISON, data):  # fails before the runs, not after them
         with progress("comparing") as report:
             comparison = compare_configs(recording, configs, report)

@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 import textwrap
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from hybridlio.commands import common
 from hybridlio.commands.common import guarded
-from hybridlio.commands.terminal import print_result
+from hybridlio.commands.terminal import print_result, progress
 from hybridlio.datasets.rosbag.choices import NO_CHOICE, BagTopics
+
+if TYPE_CHECKING:
+    from hybridlio.datasets.sequence import Sequence
 
 _WIDTH, _INDENT = 80, 14  # columns of a plain terminal, and of the labels
 
@@ -25,6 +28,7 @@ def info(
     reader: common.ReaderName = None,
     raw_root: common.RawRoot = None,
     rate: common.Rate = None,
+    check: common.Check = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
     topics: BagTopics = NO_CHOICE,
     _verbosity: common.Verbose = 0,
@@ -39,6 +43,8 @@ def info(
         _print_topics(path, found)  # before an error on which of them to use
     recording = common.open_data(data, sequence, reader, raw_root, None, None, topics, rate)
     summary = {"path": str(path), "reader": name, "topics": found, **summarise(recording)}
+    if check:
+        _add_check(summary, recording)
     if as_json:
         print_result(json.dumps(summary, indent=2, ensure_ascii=False))
         return
@@ -46,6 +52,23 @@ def info(
         wrapped = textwrap.wrap(text, _WIDTH - _INDENT, break_long_words=False, break_on_hyphens=False) or [""]
         for row, line in enumerate(wrapped):
             print_result(f"{label if row == 0 else '':<{_INDENT}}{line}")
+
+
+def _add_check(summary: dict[str, Any], recording: Sequence) -> None:
+    """Add the comparison of IMU and scans: the offset of the clocks, and notes."""
+    from hybridlio.runs.recording_check import compare_imu, is_comparable
+
+    found = None
+    if is_comparable(recording):
+        with progress("checking the IMU") as report:
+            found = compare_imu(recording, report)
+    if found is None:
+        return
+    if (offset := found.offset) is not None:
+        figures = {"offset_s": round(offset.offset_s, 6), "sigma_s": round(offset.sigma_s, 6)}
+        summary["imu_clock"] = figures | {"is_significant": offset.is_significant}
+    for kind, texts in (("wrong", found.wrong), ("corrected", found.corrected), ("doubtful", found.doubtful)):
+        summary["notes"] += [f"{kind}: {text}" for text in texts]
 
 
 def _topics(path: Path) -> list[dict[str, Any]]:
@@ -77,6 +100,9 @@ def _lines(summary: dict[str, Any]) -> list[tuple[str, str]]:
     if imu is not None:
         force, rate = imu["median_force_m_s2"], imu["largest_rate_rad_s"]
         lines += [("", f"median specific force {force:.2f} m/s², up to {rate:.2f} rad/s")]
+    if (clock := summary.get("imu_clock")) is not None:
+        applied = "runs move the stamps by it" if clock["is_significant"] else "runs take the stamps as they are"
+        lines += [("", f"clock offset {1e3 * clock['offset_s']:+.1f} ± {1e3 * clock['sigma_s']:.1f} ms, {applied}")]
     lines += [("gps", "none" if gps is None else f"{gps['count']} fixes, {_rate(gps)}, {_clock(gps)}")]
     lines += [("reference", "none" if reference is None else f"poses over {reference['length_m']:.1f} m")]
     for row, numbers in enumerate(summary["T_imu_lidar"] or []):

@@ -38,6 +38,7 @@ def odometry(
     frames: common.Frames = None,
     vertical_angle: common.VerticalAngle = None,
     rate: common.Rate = None,
+    check: common.Check = True,
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", metavar="RUN", help="The run folder; default runs/<sequence>-<date-time>."),
@@ -67,6 +68,7 @@ def odometry(
     adapted = adapt_config(recording, chosen, is_explicit=initial_pose is not None or config is not None)
     if adapted != chosen:
         chosen, estimator = adapted, Odometry(config=adapted)
+    recording = common.check_data(recording, check)
     with new_run_folder(recording.name, out, overwrite, data, resume=resume) as folder:
         run = _run(partial_folder(folder), recording, chosen, estimator, resume)
         _finish(folder, run, chosen, is_latest=out is None)

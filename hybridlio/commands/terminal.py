@@ -21,8 +21,8 @@ _WIDEST_TABLE = 240  # columns; more than any table here needs
 
 
 def print_result(text: str) -> None:
-    """Print a line to stdout without wrapping or markup."""
-    Console().print(strip_control(text), markup=False, highlight=False, soft_wrap=True)
+    """Print a line to stdout without markup; on a terminal it wraps between words, elsewhere not at all."""
+    _print(Console(), Text(strip_control(text)))
 
 
 def print_table(table: Table) -> None:
@@ -34,7 +34,15 @@ def print_table(table: Table) -> None:
 
 def print_message(text: str, style: str = "red") -> None:
     """Print a line to stderr; red, as an error, unless ``style`` is given."""
-    _stderr().print(Text(strip_control(text), style=style), soft_wrap=True)
+    _print(_stderr(), Text(strip_control(text), style=style))
+
+
+def _print(console: Console, text: Text) -> None:
+    """Print text; on a terminal wrapped between words, with longer words (paths) whole, elsewhere without wrapping."""
+    if console.is_terminal:
+        console.print(text, overflow="ignore", crop=False)
+    else:
+        console.print(text, soft_wrap=True)
 
 
 def print_warning(text: str) -> None:
@@ -54,7 +62,7 @@ def set_up_logging(verbosity: int) -> None:
 
 
 class _Handler(logging.Handler):
-    """Print records as ``warning: …``, above a progress bar if one is shown."""
+    """Print records as ``warning: …`` or with a note's kind, ``corrected: …``, above a progress bar if one is shown."""
 
     def __init__(self, verbosity: int) -> None:
         super().__init__()
@@ -62,8 +70,9 @@ class _Handler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         logger_name = f" ({record.name})" if self._verbosity > 1 else ""
+        label = getattr(record, "kind", record.levelname.lower())  # a note's kind says more than its level
         style = {logging.WARNING: "yellow", logging.ERROR: "red"}.get(record.levelno, "dim")
-        print_message(f"{record.levelname.lower()}: {record.getMessage()}{logger_name}", style)
+        print_message(f"{label}: {record.getMessage()}{logger_name}", "none" if label == "corrected" else style)
 
 
 @contextmanager

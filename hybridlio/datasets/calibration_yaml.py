@@ -13,7 +13,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.files import read_yaml
 from hybridlio.core.lidar_models import LIDAR_MODELS, LidarModel
-from hybridlio.core.sensors import MAX_RANGE_M, NS_PER_S, Calibration, ImuNoise
+from hybridlio.core.sensors import MAX_RANGE_M, Calibration, ImuNoise
 from hybridlio.core.setting_checks import SettingError
 from hybridlio.datasets.points.bin_layout import BinLayout, stated_layout
 from hybridlio.datasets.points.point_format import Box, StatedFormat
@@ -42,7 +42,7 @@ class StatedCalibration:
         calibration: the extrinsics.
         lidar: the lidar's model.
         imu_noise: the IMU's noise densities.
-        imu_time_offset_ns: to add to the IMU's stamps to bring them to the scans' clock.
+        imu_time_offset_s: to add to the IMU's stamps to bring them to the scans' clock.
         rate_hz: scans per second, for a folder without stamps.
         layout: the columns of ``.bin`` scans.
         format: what is stated about the points.
@@ -52,7 +52,7 @@ class StatedCalibration:
     calibration: Calibration = field(default_factory=Calibration)
     lidar: LidarModel | None = None
     imu_noise: ImuNoise | None = None
-    imu_time_offset_ns: int = 0
+    imu_time_offset_s: float | None = None
     rate_hz: float | None = None
     layout: BinLayout | None = None
     format: StatedFormat = field(default_factory=StatedFormat)
@@ -69,7 +69,8 @@ def read_calibration_yaml(path: Path, needs_imu: bool = False) -> StatedCalibrat
     * ``antenna_imu_m``: the GPS antenna in the IMU frame, three numbers;
     * ``lidar``: a name of :data:`hybridlio.core.lidar_models.LIDAR_MODELS`, or a mapping of ``model``, ``min_range_m``
       and ``max_range_m``; points outside stated ranges are left out;
-    * ``imu_time_offset_s``: seconds to add to the IMU's stamps to bring them to the scans' clock;
+    * ``imu_time_offset_s``: seconds to add to the IMU's stamps to bring them to the scans' clock; without it the
+      offset is found before a run;
     * ``imu_noise``: noise densities by the names of :class:`hybridlio.core.sensors.ImuNoise`;
     * ``frames``, ``imu_frame`` and ``lidar_frame``: in place of ``T_imu_lidar``, a list of transforms between frames as
       in a TF tree, each ``parent``, ``child`` and the child's pose in the parent, and the names of the sensors' frames;
@@ -116,19 +117,20 @@ def _stated(content: dict[str, Any]) -> StatedCalibration:
         stated.add("T_imu_lidar")
     T_camera_lidar = read("T_camera_lidar", parse_transform, None)
     lidar, limits_m = _lidar("lidar", content["lidar"]) if content.get("lidar") is not None else (None, None)
-    offset_s = read(
-        "imu_time_offset_s", lambda key, value: _number(key, value, -_MAX_TIME_OFFSET_S, _MAX_TIME_OFFSET_S), 0.0
-    )
     return StatedCalibration(
         calibration=Calibration(T_imu_lidar, T_camera_lidar, read("antenna_imu_m", _three_numbers, None)),
         lidar=lidar,
         imu_noise=read("imu_noise", _imu_noise, None),
-        imu_time_offset_ns=round(offset_s * NS_PER_S),
+        imu_time_offset_s=read("imu_time_offset_s", _time_offset_s, None),
         rate_hz=read("rate_hz", lambda key, value: _number(key, value, 0, MAX_RATE_HZ), None),
         layout=read("columns", lambda _, value: stated_layout(value), None),
         format=StatedFormat(read("point_times", _point_times, None), limits_m, read("vehicle", _vehicle, None)),
         keys=frozenset(stated),
     )
+
+
+def _time_offset_s(key: str, value: Any) -> float:
+    return _number(key, value, -_MAX_TIME_OFFSET_S, _MAX_TIME_OFFSET_S)
 
 
 def _number(key: str, value: Any, above: float, most: float) -> float:

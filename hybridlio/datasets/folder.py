@@ -83,7 +83,7 @@ def open_folder(
     stated = read_calibration_yaml(folder / "calibration.yaml", needs_imu=len(imu) > 0)
     stamps, paths = _stamped(folder, _scan_files(folder), stated.rate_hz if rate_hz is None else rate_hz, notes)
     if len(imu):
-        imu = on_scans_clock(imu, stated.imu_time_offset_ns, notes)
+        imu = on_scans_clock(imu, stated.imu_time_offset_s, notes)
         note_mounting(imu, stated.calibration.T_imu_lidar, notes)
     else:
         notes.add(f"no inertial data: {folder / 'imu.csv'} does not exist")
@@ -101,6 +101,7 @@ def open_folder(
         gps=gps,
         lidar=stated.lidar,
         imu_noise=stated.imu_noise,
+        imu_time_offset_s=stated.imu_time_offset_s,
         notes=tuple(notes.texts),
     )
 
@@ -148,6 +149,6 @@ def _stamped(
     keep = usable_scans(stamps, files[0])
     if len(keep) < len(paths):
         first = paths[int(np.setdiff1d(np.arange(len(paths)), keep)[0])].name
-        notes.add(f"dropped {len(paths) - len(keep)} scans whose stamps repeat or go backwards, first {first}")
+        notes.corrected(f"dropped {len(paths) - len(keep)} scans whose stamps repeat or go backwards, first {first}")
     note_gaps(stamps[keep], "scans", notes, SCAN_GAP_FACTOR)
     return stamps[keep], tuple(paths[k] for k in keep)

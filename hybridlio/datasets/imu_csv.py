@@ -109,12 +109,12 @@ def _in_si_units(path: Path, values: Array, columns: ImuColumns, notes: Notes) -
     for unit, size in (("g", 1.0), ("mg", 1000.0)):
         if not any(stated[3:]) and ONE_G[0] * size < force < ONE_G[1] * size:
             factors[3:] = STANDARD_GRAVITY_M_S2 / size
-            notes.add(
+            notes.corrected(
                 f"{path}: the median specific force is {force:.3g}: read in {unit}; columns in m/s² have 9.8 there"
             )
     if not any(stated[:3]) and rate > _NO_RATE_RAD_S:
         factors[:3] = np.pi / 180
-        notes.add(
+        notes.corrected(
             f"{path}: angular velocities reach {rate:.0f}: read in °/s, as that many rad/s exceed any gyroscope's range"
         )
     return values * factors
@@ -136,7 +136,7 @@ def clean_imu(source: str, stamps: Stamps, values: Array, notes: Notes) -> ImuSa
     if not finite.any():
         raise DataError(f"{source}: no row of finite values")
     if not finite.all():
-        notes.add(
+        notes.corrected(
             f"{source}: dropped {int((~finite).sum())} rows that are not finite, first row {int(finite.argmin())}"
         )
     stamps, values = stamps[finite], values[finite]

@@ -12,12 +12,12 @@ _MAX_LEVER_ARM_M = 20.0  # from IMU to lidar on any vehicle; more is another uni
 _MAX_UPSIDE_DOWN = -0.5  # cosine of the angle between the specific force and the lidar's z axis: 120°, no hill
 
 
-def on_scans_clock(imu: ImuSamples, offset_ns: int, notes: Notes) -> ImuSamples:
+def on_scans_clock(imu: ImuSamples, offset_s: float | None, notes: Notes) -> ImuSamples:
     """Return the samples with their stamps moved by the stated offset of the clocks."""
-    if not offset_ns:
+    if not offset_s:
         return imu
-    notes.found(f"IMU stamps are moved by {offset_ns / NS_PER_S:+.6f} s, as calibration.yaml states")
-    return ImuSamples(imu.stamps_ns + offset_ns, imu.gyro_rad_s, imu.accel_m_s2)
+    notes.found(f"IMU stamps are moved by {offset_s:+.6f} s, as calibration.yaml states")
+    return ImuSamples(imu.stamps_ns + round(offset_s * NS_PER_S), imu.gyro_rad_s, imu.accel_m_s2)
 
 
 def note_mounting(imu: ImuSamples, T_imu_lidar: Array, notes: Notes) -> None:

@@ -153,7 +153,7 @@ def _without_spikes(sequence: Sequence) -> Sequence:
         return sequence
     notes = Notes(sequence.name, list(sequence.notes))
     after_s = (left_out_ns[0] - sequence.stamps_ns[0]) / NS_PER_S
-    notes.add(
+    notes.corrected(
         f"dropped {counted(len(left_out_ns), 'IMU sample')} far from the neighbouring ones, the first {after_s:.2f} s "
         "after the first scan"
     )

@@ -36,6 +36,8 @@ class Sequence:
         forward_speed_m_s: ``(N,)`` forward speed at the scans from the vehicle's navigation system, or None; a check
             of a trajectory's length if reference positions are poor.
         imu_noise: the IMU's noise densities, or None if the recording does not give them.
+        imu_time_offset_s: seconds that were added to the IMU's stamps to bring them to the scans' clock: stated by the
+            recording's calibration, or found (:func:`hybridlio.runs.recording_check.check_recording`); None if neither.
         notes: what the reader found unusual (gaps, dropped stamps, substitutes); also logged when opening.
         source: how to open the recording again; None for one that was made in memory.
 
@@ -55,6 +57,7 @@ class Sequence:
     pose_file_frame: str = "lidar"
     forward_speed_m_s: Array | None = None
     imu_noise: ImuNoise | None = None
+    imu_time_offset_s: float | None = None
     notes: tuple[str, ...] = ()
     source: Source | None = None
 

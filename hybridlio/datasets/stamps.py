@@ -133,7 +133,7 @@ def sorted_unique(stamps: Stamps, what: str, notes: Notes) -> NDArray[np.intp]:
     _, first = np.unique(stamps, return_index=True)
     repeats = len(stamps) - len(first)
     if backwards or repeats:
-        notes.add(
+        notes.corrected(
             f"{what}: of {len(stamps)} stamps {backwards} go backwards and {repeats} repeat; sorted, repeats dropped"
         )
     return first

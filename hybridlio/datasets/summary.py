@@ -9,6 +9,7 @@ import numpy as np
 from hybridlio.core.arrays import Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import NS_PER_S, Scan
+from hybridlio.datasets.notes import labelled
 from hybridlio.datasets.points.point_format import sampled
 from hybridlio.datasets.sequence import Sequence
 
@@ -35,7 +36,7 @@ def summarise(sequence: Sequence) -> dict[str, Any]:
             "initial_pose": "preintegration of the IMU" if len(imu) else "constant velocity, without an IMU",
             "motion_compensation": "by the points' times" if has_times else "none: the points have no times",
         },
-        "notes": list(sequence.notes),
+        "notes": labelled(sequence.notes),
     }
 
 

@@ -41,6 +41,7 @@ class BatchOptions:
         engine, scheduler: see :func:`hybridlio.runs.engines.engine`.
         overwrite: run recordings again that have a run already.
         adapt_config: run recordings without IMU data with initial poses by constant velocity.
+        check: compare the IMU with the scans first (:func:`hybridlio.runs.recording_check.check_recording`).
     """
 
     jobs: int | None = None
@@ -49,6 +50,7 @@ class BatchOptions:
     scheduler: str | None = None
     overwrite: bool = False
     adapt_config: bool = True
+    check: bool = True
 
 
 def run_batch(
@@ -86,7 +88,7 @@ def run_batch(
     check_output(out, *(recording.path for recording in recordings))
     BATCH.check(out)  # before an engine is started
     parallel, threads = _workers(options, len(recordings))
-    jobs = [Job(r, out / r.name, config, threads, options.adapt_config) for r in recordings]
+    jobs = [Job(r, out / r.name, config, threads, options.adapt_config, options.check) for r in recordings]
     complete = {job.recording for job in jobs if _is_complete(job, options.overwrite)}
     missing = [job for job in jobs if job.recording not in complete]
     for job in missing:

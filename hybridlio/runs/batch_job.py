@@ -30,7 +30,7 @@ class Job:
         folder: its run folder.
         config: the settings.
         threads: maximum number of threads of the run.
-        adapt_config: see :class:`BatchOptions`.
+        adapt_config, check: see :class:`BatchOptions`.
     """
 
     recording: Recording
@@ -38,6 +38,7 @@ class Job:
     config: Config
     threads: int
     adapt_config: bool
+    check: bool = True
 
     @property
     def description(self) -> dict[str, Any]:
@@ -89,10 +90,13 @@ def _run(job: Job, folder: Path) -> None:
     from hybridlio.odometry.odometry import Odometry
     from hybridlio.runs.keeper import Keeper
     from hybridlio.runs.kept import resume_if_same
+    from hybridlio.runs.recording_check import check_recording
     from hybridlio.runs.run import adapt_config, finish_run
     from hybridlio.runs.write import write_run_files
 
     sequence = job.recording.open()
+    if job.check:
+        sequence = check_recording(sequence)
     config = adapt_config(sequence, job.config, is_explicit=not job.adapt_config)
     limited = engines.with_thread_limit(config, job.threads)
     run, length = resume_if_same(folder, sequence, config, lambda: Odometry(config=limited))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from hybridlio.core.version import __version__
+from hybridlio.datasets.notes import labelled
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.odometry.config import Config
 
@@ -25,7 +26,7 @@ def header_of(sequence: Sequence, config: Config) -> dict[str, Any]:
         "imu_noise": sequence.imu_noise,
         "reference": sequence.reference,
         "pose_file_frame": sequence.pose_file_frame,
-        "notes": list(sequence.notes),
+        "notes": labelled(sequence.notes),
     }
 
 

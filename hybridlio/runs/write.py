@@ -14,6 +14,7 @@ from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.tables import counted
 from hybridlio.core.trajectory_files import write_tum
 from hybridlio.core.version import __version__
+from hybridlio.datasets.notes import labelled
 from hybridlio.datasets.protection import check_output
 from hybridlio.evaluation.evaluate import Evaluation, Steps
 from hybridlio.evaluation.report import picture, write_report
@@ -97,7 +98,7 @@ def T_pose_files(run: Run) -> Any:
 
 def notes(run: Run) -> list[str]:
     """Return what a reader of the results should know first, such as scans that could not be used."""
-    out = list(run.sequence.notes)
+    out = labelled(run.sequence.notes)
     if run.stopped is not None:
         cause = "interrupted" if isinstance(run.stopped, KeyboardInterrupt) else f"stopped by an error ({run.stopped})"
         out.append(f"{cause} after {run.done} of {len(run.sequence)} scans")
@@ -148,6 +149,7 @@ def metrics(run: Run, config: Config, evaluation: Evaluation | None) -> dict[str
         "degenerate": (np.flatnonzero(run.degenerate) + run.skipped + 1).tolist(),
         "unreadable": {str(k): why for k, why in run.unreadable.items()},
         "notes": notes(run),
+        "imu_time_offset_s": run.sequence.imu_time_offset_s,
         "path_length_m": run.trajectory.length_m,
         "forward_speed_length_m": forward_speed_length_m(run),
         "imu_path_length_m": imu_path_length_m(run),

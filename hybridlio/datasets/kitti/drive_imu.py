@@ -56,7 +56,7 @@ def drive_imu(drive: Path, oxts: OxtsRows | None, notes: Notes) -> ImuSamples:
 def _without_lag(rows: OxtsRows, notes: Notes) -> ImuSamples:
     lag_ns = rows.gyro_lag_ns
     if lag_ns:
-        notes.add(f"angular rates lag the attitudes of the same rows by {lag_ns / 1e6:.0f} ms; shifted back")
+        notes.corrected(f"angular rates lag the attitudes of the same rows by {lag_ns / 1e6:.0f} ms; shifted back")
     return rows.imu(lag_ns)
 
 
@@ -72,7 +72,7 @@ def _filled(rows: OxtsRows, slow_rows: OxtsRows | None, notes: Notes) -> ImuSamp
     use = distance > _FILL_NS
     if not use.any():
         return fast
-    notes.add(f"{int(use.sum())} samples of the slow navigation rows fill holes and ends of the 100 Hz recording")
+    notes.corrected(f"{int(use.sum())} samples of the slow navigation rows fill holes and ends of the 100 Hz recording")
     stamps = np.concatenate([fast.stamps_ns, slow.stamps_ns[use]])
     order = np.argsort(stamps)
     gyro = np.concatenate([fast.gyro_rad_s, slow.gyro_rad_s[use]])[order]

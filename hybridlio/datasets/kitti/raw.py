@@ -149,7 +149,7 @@ def _scans(drive: Path, notes: Notes) -> tuple[Index, Stamps, tuple[Path, ...]]:
     keep = usable_scans(lines[numbers], drive / "velodyne_points/timestamps.txt")
     if len(keep) < len(numbers):
         dropped = np.setdiff1d(numbers, numbers[keep])
-        notes.add(f"dropped {len(dropped)} scans whose stamps repeat or go backwards, first number {dropped[0]}")
+        notes.corrected(f"dropped {len(dropped)} scans whose stamps repeat or go backwards, first number {dropped[0]}")
     numbers = numbers[keep]
     note_gaps(lines[numbers], "scans", notes, SCAN_GAP_FACTOR)
     return numbers, lines[numbers], tuple(paths[k] for k in keep)

@@ -111,7 +111,7 @@ def sequence_of(found: Recording, notes: Notes, vertical_angle_deg: float | None
     mounting = _mounting(found, stated, notes)
     imu = found.imu
     if len(imu):
-        imu = on_scans_clock(imu, stated.imu_time_offset_ns, notes)
+        imu = on_scans_clock(imu, stated.imu_time_offset_s, notes)
         note_mounting(imu, mounting.T_imu_lidar, notes)
     note_coverage(imu.stamps_ns, stamps, "inertial data", notes)
     points = StatedFormat(stated.format.times or found.times, stated.format.limits_m)
@@ -126,6 +126,7 @@ def sequence_of(found: Recording, notes: Notes, vertical_angle_deg: float | None
         reference=reference,
         lidar=stated.lidar or found.lidar,
         imu_noise=stated.imu_noise,
+        imu_time_offset_s=stated.imu_time_offset_s,
         notes=tuple(notes.texts),
     )
 
@@ -139,7 +140,7 @@ def _usable(found: Recording, notes: Notes) -> tuple[Stamps, tuple[Path, ...]]:
     keep = usable_scans(stamps, found.paths[0].parent)
     if len(keep) < len(stamps):
         first = found.paths[int(np.setdiff1d(np.arange(len(stamps)), keep)[0])].name
-        notes.add(f"dropped {len(stamps) - len(keep)} scans whose stamps repeat or go backwards, first {first}")
+        notes.corrected(f"dropped {len(stamps) - len(keep)} scans whose stamps repeat or go backwards, first {first}")
     note_gaps(stamps[keep], "scans", notes, SCAN_GAP_FACTOR)
     return stamps[keep], tuple(found.paths[k] for k in keep)
 

@@ -72,7 +72,7 @@ def stamps_of(log: Log, topic: str, notes: Notes) -> tuple[Stamps, Mask]:
         notes.add(f"{topic}: the headers' stamps are zero; times of receipt are used, which vary by milliseconds")
         return received, np.ones(len(received), dtype=bool)
     if not known.all():
-        notes.add(f"{topic}: dropped {counted(int((~known).sum()), 'message')} without a stamp")
+        notes.corrected(f"{topic}: dropped {counted(int((~known).sum()), 'message')} without a stamp")
     delay_s = float(np.median(received[known] - header[known])) / NS_PER_S
     if abs(delay_s) > _MAX_DELAY_S:
         notes.add(f"{topic}: stamps are {delay_s:.3f} s before the times of receipt; stamps are used")
@@ -102,7 +102,7 @@ def imu_samples(log: Log, topic: str, notes: Notes) -> ImuSamples:
     force = np.linalg.norm(values[:, 3:], axis=1)
     median = float(np.median(force[np.isfinite(force)])) if np.isfinite(force).any() else 0.0
     if ONE_G[0] < median < ONE_G[1]:
-        notes.add(f"{topic}: the median specific force is {median:.2f}, so it is in g; multiplied by 9.80665")
+        notes.corrected(f"{topic}: the median specific force is {median:.2f}, so it is in g; multiplied by 9.80665")
         values[:, 3:] *= STANDARD_GRAVITY_M_S2
     return clean_imu(topic, stamps[known], values[known], notes)
 

@@ -108,7 +108,7 @@ def _open(path: Path, wanted: BagTopics, vertical_angle_deg: float | None) -> Se
     imu = _imu(chosen.get("imu"), contents.logs, notes)
     calibration = mounting.calibration(stated, has_imu=len(imu) > 0, has_gps="gps" in chosen)
     if len(imu):
-        imu = on_scans_clock(imu, stated.imu_time_offset_ns, notes)
+        imu = on_scans_clock(imu, stated.imu_time_offset_s, notes)
         note_mounting(imu, calibration.T_imu_lidar, notes)
     note_coverage(imu.stamps_ns, scans.stamps_ns, "inertial data", notes)
     gps = measurements.gps_fixes(contents.logs["gps"], chosen["gps"].name, notes) if "gps" in chosen else ()
@@ -124,6 +124,7 @@ def _open(path: Path, wanted: BagTopics, vertical_angle_deg: float | None) -> Se
         gps=gps,
         lidar=stated.lidar,
         imu_noise=stated.imu_noise,
+        imu_time_offset_s=stated.imu_time_offset_s,
         notes=tuple(notes.texts),
     )
 
@@ -177,7 +178,9 @@ def _scans(bag: Bag, topic: Topic, log: Log, notes: Notes) -> BagScans:
     rows = np.flatnonzero(known)
     rows = rows[usable_scans(stamps[rows], bag.path)]
     if len(rows) < known.sum():
-        notes.add(f"{topic.name}: dropped {int(known.sum()) - len(rows)} scans whose stamps repeat or go backwards")
+        notes.corrected(
+            f"{topic.name}: dropped {int(known.sum()) - len(rows)} scans whose stamps repeat or go backwards"
+        )
     note_gaps(stamps[rows], topic.name, notes, SCAN_GAP_FACTOR)
     received = np.array(log.received_ns, dtype=np.int64)
     return BagScans(bag.path, topic.name, stamps[rows], rows, received, any(log.header_ns), bag)

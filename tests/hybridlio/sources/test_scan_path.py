@@ -1,0 +1,32 @@
+"""The quick path through scans."""
+
+import numpy as np
+from handheld import as_sequence, carried
+
+from hybridlio.core import se3
+from hybridlio.core.sensors import Calibration, ImuSamples, Scan
+from hybridlio.sources.scan_path import scan_paths
+
+
+def test_the_turns_of_a_path_are_those_of_the_lidar(rng: np.random.Generator):
+    walk = carried(rng, seconds=4.0, turning=0.6)
+    scans = [as_sequence(rng, walk).load_scan(k) for k in range(len(walk.path))]
+    (path,) = scan_paths(((scan, ImuSamples.empty()) for scan in scans), Calibration())
+    np.testing.assert_array_equal(path.stamps_ns, walk.path.stamps_ns)
+    steps, true = (se3.between(poses[:-1], poses[1:]) for poses in (path.poses, walk.path.poses))
+    errors = se3.so3_log(se3.between(steps, true)[:, :3, :3])
+    assert np.median(np.linalg.norm(errors, axis=1)) < 2e-3
+
+
+def test_a_new_path_begins_after_a_scan_that_does_not_fit(rng: np.random.Generator):
+    walk = carried(rng, seconds=3.0, turning=0.6)
+    sequence = as_sequence(rng, walk)
+    scans = [sequence.load_scan(k) for k in range(len(walk.path))]
+    scans[12] = Scan(scans[12].stamp_ns, np.empty((0, 3), np.float32))
+    paths = scan_paths(((scan, ImuSamples.empty()) for scan in scans), Calibration())
+    assert len(paths) == 2
+    assert len(paths[0]) == 12
+
+
+def test_no_scans_give_no_path():
+    assert scan_paths([], Calibration()) == []
