@@ -66,8 +66,8 @@ def _with_threads(tree: dict[str, object], threads: int) -> dict[str, object]:
     }
 
 
-def kiss_icp(sequence: Sequence, threads: int) -> Step:
-    """Make KISS-ICP with its defaults for a range of 100 m.
+def kiss_icp(sequence: Sequence, threads: int, max_range_m: float = 100.0) -> Step:
+    """Make KISS-ICP with its defaults for a largest range: voxels of a hundredth of it.
 
     It compensates motion, to the end of the sweep, only where points carry times.
     """
@@ -76,7 +76,8 @@ def kiss_icp(sequence: Sequence, threads: int) -> Step:
 
     config = KISSConfig()
     config.data.deskew = sequence[0].scan.time_offsets_ns is not None
-    config.mapping.voxel_size = 1.0
+    config.data.max_range = max_range_m
+    config.mapping.voxel_size = max_range_m / 100
     config.registration.max_num_threads = threads
     system = KissICP(config)
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import open3d as o3d
 import pytest
+from integration import integrate
 from scipy.spatial.transform import Rotation
 
 from hybridlio.core.sensors import NS_PER_S, ImuNoise
@@ -14,7 +15,6 @@ from hybridlio.simulation.platforms.lidars import SCANNERS
 from hybridlio.simulation.platforms.recording import PlatformRecording, plan
 from hybridlio.simulation.platforms.scenes.table import SCENES
 from hybridlio.simulation.sensors.imu import ideal_imu
-from tests.helpers.integration import integrate
 
 CASES = [*((name, scene.platform) for name, scene in SCENES.items()), ("campus", "drone")]
 

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from integration import integrate
 from scipy.spatial.transform import Rotation
 
 from hybridlio.core.sensors import ImuNoise
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.plan import plan
 from hybridlio.simulation.sensors.imu import add_noise, ideal_imu
-from tests.helpers.integration import integrate
 
 SILENT = ImuNoise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
