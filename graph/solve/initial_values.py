@@ -16,6 +16,7 @@ from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, list_keys
 from hybridlio.graph.model.measurements import Factor
 from hybridlio.graph.solve.chordal import chordal_poses
+from hybridlio.graph.solve.online_start import follow_factors
 from hybridlio.graph.solve.settings import INITIAL_METHODS
 
 _FIXES_TO_ALIGN = 3  # positions that determine a rigid transform, if they are not on one line
@@ -31,7 +32,8 @@ def choose_start(data: GraphData, initial: str) -> Array:
         data: the graph.
         initial: ``given``; one of :data:`INITIAL_METHODS`; or ``auto``, the start of smallest error among the given
             values, chordal ones, and chordal ones without the factors that have a robust kernel. Given values that
-            already fit well are taken without a search.
+            already fit well are taken without a search. Where parts of the graph are joined by inertial samples alone,
+            the start follows all factors, as an online solver's does.
 
     Raises:
         GraphError: values are missing and cannot be found.
@@ -55,7 +57,7 @@ def choose_start(data: GraphData, initial: str) -> Array:
             starts.append(find_initial_values(part, "chordal", edges if part is data else None))
         except GraphError:  # a part that only inertial factors or given values place
             if given is None:
-                raise
+                starts.append(follow_factors(part))
     return starts[0] if len(starts) == 1 else min(starts, key=lambda poses: _chi2(data, poses, edges))
 
 

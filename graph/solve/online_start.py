@@ -12,10 +12,12 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
+from hybridlio.graph.model.keys import list_keys
 from hybridlio.graph.model.measurements import OBSERVATIONS, Factor
 from hybridlio.graph.solve.builder import Builder
 from hybridlio.graph.solve.changes import Changes
 from hybridlio.graph.solve.landmark_factors import insert_landmarks, point_in_pose_frame
+from hybridlio.graph.solve.nonlinear import poses_of
 
 
 def determines_new_poses(data: GraphData, changes: Changes, with_velocity: set[int]) -> bool:
@@ -66,6 +68,18 @@ class _Reach:
         return index < self._first_new or index in self.poses
 
 
+def follow_factors(data: GraphData) -> Array:
+    """Return coordinates ``(N, 7)`` or ``(N, 3)`` of all poses of a graph, as the first update of an online solver.
+
+    They follow between-factors and inertial samples from priors, fixed poses and given initial values.
+
+    Raises:
+        GraphError: no factor leads to a pose and it has no initial value; names it.
+    """
+    changes = Changes(range(len(data)), slice(0, len(data.edges)), dict(data.other_factors), [], list(data.fixed), [])
+    return OnlineStart(data, changes, None, set(), set(), set()).poses()
+
+
 class OnlineStart:
     """Initial values of new variables: along the new factors from estimated poses, else as given by the user.
 
@@ -108,17 +122,19 @@ class OnlineStart:
         """
         inertial = self._changes.of_kind("imu")
         self._pass_biases_on(inertial)
-        self._follow_edges()
-        for factor in inertial:
-            self._predict(factor)
-        self._follow_edges()
-        self._use_given()
+        self._follow(inertial)
+        self._use_given(inertial)
         values = gtsam.Values()
         for index, pose in sorted(self._poses.items()):
             values.insert(X(index), pose)
         self._insert_motion(values, inertial)
         insert_landmarks(values, self._new_landmarks())
         return values
+
+    def poses(self) -> Array:
+        """Return the coordinates ``(N, 7)`` or ``(N, 3)`` of all new poses; errors as for :meth:`values`."""
+        values = self.values()
+        return poses_of(values, self._data.dimension)
 
     def _new_landmarks(self) -> dict[int, Array]:
         """Return the points of new landmarks, by index, where their first observation sees them."""
@@ -144,6 +160,14 @@ class OnlineStart:
             kind = "Pose3" if self._data.dimension == 3 else "Pose2"
             return getattr(self._solver, f"calculateEstimate{kind}")(X(index))
         return self._poses.get(index)
+
+    def _follow(self, inertial: list[Factor]) -> None:
+        """Place new poses along edges and samples, until neither leads further."""
+        known = -1
+        while known < (known := len(self._poses)):
+            self._follow_edges()
+            for factor in inertial:
+                self._predict(factor)
 
     def _follow_edges(self) -> None:
         """Place new poses along new edges from known ones, until no edge leads further."""
@@ -185,17 +209,21 @@ class OnlineStart:
                     self._velocities[index] = factor.measured
         return self._velocities.get(index)
 
-    def _use_given(self) -> None:
-        """Place the new poses that no factor led to by their priors or given initial values."""
-        missing = [index for index in self._changes.poses if index not in self._poses]
+    def _use_given(self, inertial: list[Factor]) -> None:
+        """Place the new poses that no factor led to by their priors or given initial values, priors first."""
         priors = {self._data.index[f.keys[0]]: f.measured for f in self._changes.of_kind("prior")}
-        for index in missing:
+        fixed = (self._data.index[key] for key in self._changes.fixed)
+        for index in [*priors, *fixed, *self._changes.poses]:
+            if index in self._poses or index < self._changes.poses.start:
+                continue
             (key,) = self._data.keys_at([index])
             at = priors.get(index, self._data.initial_value(key))
-            if at is None:
-                raise GraphError(f"no factor places pose {key}; give an initial value")
-            self._poses[index] = co.gtsam_poses(at[None])[0]
-            self._follow_edges()
+            if at is not None:
+                self._poses[index] = co.gtsam_poses(at[None])[0]
+                self._follow(inertial)
+        missing = [index for index in self._changes.poses if index not in self._poses]
+        if missing:
+            raise GraphError(f"no factor places pose {list_keys(self._data.keys_at(missing))}; give an initial value")
 
     def _insert_motion(self, values: gtsam.Values, inertial: list[Factor]) -> None:
         """Insert the velocities and biases that new factors bring."""

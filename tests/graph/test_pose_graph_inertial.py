@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hybridlio.core import se3
+from hybridlio.core.motion_limits import GRAVITY_M_S2
 from hybridlio.core.sensors import ImuNoise, ImuSamples
 from hybridlio.graph import PoseGraph
 
@@ -139,3 +140,17 @@ def test_unobserved_biases_stay_at_zero():
     graph.add_zero_velocity(0)
     accel, gyro = graph.optimize().bias(0)
     np.testing.assert_allclose(np.r_[accel, gyro], np.zeros(6), atol=1e-6)
+
+
+def test_a_chain_that_samples_alone_join_is_solved_alike_in_batch_and_online():
+    graph, stamps_ns = PoseGraph(), np.arange(11) * 10_000_000
+    graph.add_prior(0, np.eye(4), sigmas=1e-3)
+    graph.add_velocity(0, [1.0, 0, 0], sigmas=0.01)
+    for k in range(5):  # a turn to the left at 1 m/s and 0.5 rad/s
+        gyro, accel = np.tile([0, 0, 0.5], (11, 1)), np.tile([0, 0.5, GRAVITY_M_S2], (11, 1))
+        graph.add_pose(k + 1)
+        graph.add_imu(k, k + 1, ImuSamples(k * 100_000_000 + stamps_ns, gyro, accel))
+    batch, online = graph.optimize(), graph.online()
+    online.update()
+    np.testing.assert_allclose(batch.pose(5), online.pose(5), atol=1e-6)
+    np.testing.assert_allclose(batch.pose(5)[:3, 3], [np.sin(0.25) * 2, 2 - 2 * np.cos(0.25), 0], atol=1e-3)
