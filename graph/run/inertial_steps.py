@@ -18,22 +18,22 @@ class InertialSteps:
 
     Args:
         calibration: its ``T_imu_lidar`` is used.
-        noise: of the IMU.
+        noise: of the IMU; may be changed from step to step.
     """
 
     def __init__(self, calibration: Calibration, noise: ImuNoise) -> None:
         self.T_imu_lidar = calibration.T_imu_lidar
-        self._noise = noise
+        self.noise = noise
         self._inputs: tuple[object, ...] | None = None
         self._preintegrated: gtsam.PreintegratedCombinedMeasurements | None = None
         self._predicted: RelativePose | None = None
 
     def preintegrated(self, frame: Frame, state: State) -> gtsam.PreintegratedCombinedMeasurements | None:
         """Return the preintegrated samples, or None where they do not cover the step from ``state`` to the scan."""
-        inputs = _inputs(frame, state)
+        inputs = (self.noise, *_inputs(frame, state))
         if inputs != self._inputs:
             usable = state.has_imu and covers(frame.imu, state.stamp_ns, frame.scan.stamp_ns)
-            self._preintegrated = preintegrate(frame.imu, state, self._noise) if usable else None
+            self._preintegrated = preintegrate(frame.imu, state, self.noise) if usable else None
             self._inputs, self._predicted = inputs, None
         return self._preintegrated
 

@@ -20,6 +20,7 @@ from hybridlio.record import plain_values
 from hybridlio.record.loop_keyframes import LoopKeyframeSelector
 from hybridlio.record.record import Record
 from hybridlio.record.recorder import Recorder
+from hybridlio.sources.imu_trust import without_imu
 
 # The first pose defines the frame, so it is exact. GTSAM and the file formats need a positive definite covariance;
 # 1e-6 rad and m are far below any sensor's noise.
@@ -91,16 +92,19 @@ class Odometry:
         seconds: dict[str, float] = {}
         is_first_step = pipeline.state is None
         before = self._state_before(frame, pipeline)
+        recorded, frame = frame, pipeline.usable(frame)
         with timed(seconds, "initial pose"):
             initial = pipeline.predict(frame, before)
         compensated, relative = pipeline.refine(frame, initial, before, seconds)
         if is_first_step:
             compensated, relative = repeat_first_step(pipeline, frame, (compensated, relative), before)
         with timed(seconds, "graph"):
-            relative, gate = pipeline.apply_gate(frame, initial, relative, before)
+            relative, gate = pipeline.apply_gate(recorded, initial, relative, before)
+            frame = frame if gate.uses_imu else without_imu(frame)
             pipeline.state = pipeline.backend.update(frame, relative)
             step = pipeline.backend.last_step()
         pipeline.correct(frame, initial, relative, step)
+        pipeline.learn(frame, gate)
         pose, covariance = pipeline.lidar_pose(pipeline.state)
         if self.keeps_record:
             with timed(seconds, "keyframes"):
@@ -124,7 +128,7 @@ class Odometry:
         if pipeline is None or pipeline.start is None or pipeline.state is None:
             raise EstimationError("a record needs at least two frames; call step for more")
         keyframes = self._keyframes.keyframes()
-        return self._recorder.record(pipeline.start, pipeline.calibration, pipeline.imu_noise, keyframes, scans)
+        return self._recorder.record(pipeline.start, pipeline.calibration, pipeline.trust.noise, keyframes, scans)
 
     def state(self, row: int = 0) -> dict[str, Any] | None:
         """Return what :meth:`resume` needs besides the frames and estimates: the state of the front end.
@@ -177,9 +181,11 @@ class Odometry:
     def _repeat(self, pipeline: Pipeline, frame: Frame, estimate: Estimate) -> float:
         """Give a step to the backend and the initial-pose source again; return how far its pose is from the stored."""
         assert estimate.relative is not None
+        frame = frame if estimate.gate.uses_imu else without_imu(frame)
         initial = pipeline.predict(frame, self._state_before(frame, pipeline))
         pipeline.state = pipeline.backend.update(frame, estimate.relative)
         pipeline.correct(frame, initial, estimate.relative, pipeline.backend.last_step())
+        pipeline.learn(frame, estimate.gate)
         return float(np.abs(pipeline.lidar_pose(pipeline.state)[0] - estimate.pose).max())
 
     def _start(self, first: Frame) -> Pipeline:
@@ -190,7 +196,7 @@ class Odometry:
     def _make_pipeline(self, first: Frame) -> Pipeline:
         setup = Setup.from_frame(self._config, first)
         implementations = make_implementations(self._chosen, setup)
-        return Pipeline(first, setup.calibration, setup.imu_noise, *implementations, setup.predict_from_imu)
+        return Pipeline(first, setup, *implementations)
 
     def _state_before(self, frame: Frame, pipeline: Pipeline) -> State:
         """Return the state at the last scan. Start the backend first, or restart it at the first IMU samples."""

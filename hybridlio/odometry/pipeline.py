@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
+import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.estimates import Backend, InitialPoseSource, RelativePose, ResidualSource, State, TakesBack
-from hybridlio.core.sensors import Calibration, Frame, ImuNoise
+from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise
 from hybridlio.odometry.compensation import MotionCompensation
+from hybridlio.sources.imu_trust import ImuTrust, without_imu
 from hybridlio.sources.innovation_gate import GateResult, InnovationGate
+
+if TYPE_CHECKING:
+    from hybridlio.odometry.setup import Setup
+
+_log = logging.getLogger(__name__)
+
+_CONTRADICTS = (
+    "frame %d: the IMU's %s contradict the scans, which move on smoothly; its samples are left out until they agree "
+    "again. If this happens often, check T_imu_lidar, units and clock"
+)
 
 
 @dataclass(eq=False)
@@ -22,30 +35,45 @@ class Pipeline:
 
     Attributes:
         first: the first frame.
-        calibration: the extrinsics.
-        imu_noise: the IMU's noise densities.
+        setup: sensors and preintegration.
         initial_pose, residual, backend: implementations of the three seams.
-        predict_from_imu: predicts the step to a frame from its samples and the state before, for the gate.
         compensation: motion compensation.
         gate: compares relative poses with the IMU.
+        trust: how far the IMU is believed.
         start: state at the first scan that the backend started from; None until the second frame.
         state: the backend's state at the last scan; None until the second frame has been added.
     """
 
     first: Frame
-    calibration: Calibration
-    imu_noise: ImuNoise
+    setup: Setup
     initial_pose: InitialPoseSource
     residual: ResidualSource
     backend: Backend
-    predict_from_imu: Callable[[Frame, State], RelativePose | None]
     compensation: MotionCompensation = field(init=False)
-    gate: InnovationGate = field(default_factory=InnovationGate)
+    gate: InnovationGate = field(init=False)
+    trust: ImuTrust = field(init=False)
     start: State | None = None
     state: State | None = None
+    _has_warned: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
         self.compensation = MotionCompensation(self.calibration, self.imu_noise)
+        self.gate = InnovationGate(isinstance(self.residual, TakesBack))
+        self.trust = ImuTrust(self.imu_noise)
+
+    @property
+    def calibration(self) -> Calibration:
+        """The extrinsics."""
+        return self.setup.calibration
+
+    @property
+    def imu_noise(self) -> ImuNoise:
+        """The IMU's noise densities as stated or assumed."""
+        return self.setup.imu_noise
+
+    def usable(self, frame: Frame) -> Frame:
+        """Return the frame, without its inertial samples if the IMU is left out at present."""
+        return without_imu(frame) if self.trust.left_out else frame
 
     def predict(self, frame: Frame, state: State) -> RelativePose:
         """Return the initial relative pose of the step to ``frame``.
@@ -84,15 +112,35 @@ class Pipeline:
     def apply_gate(
         self, frame: Frame, initial: RelativePose, measured: RelativePose, state: State
     ) -> tuple[RelativePose, GateResult]:
-        """Down-weight or reject a relative pose that contradicts the IMU; the initial pose bridges a rejected one.
+        """Compare a relative pose with the IMU and leave out, or weigh less, whichever is wrong.
 
         The prediction is the IMU's whatever the initial-pose source, so that every source is gated alike.
+
+        Args:
+            frame: with the step's samples, even if they are left out at present.
+            initial: initial relative pose, which bridges a rejected scan.
+            measured: the residual source's relative pose.
+            state: the backend's state at the scan before.
         """
-        predicted = self.predict_from_imu(frame, state) if state.has_imu else None
-        relative, result = self.gate.apply(measured, predicted, initial)
-        if result.verdict == "rejected" and isinstance(self.residual, TakesBack):
+        predicted = self.setup.predict_from_imu(frame, state) if state.has_imu else None
+        dt_s = (frame.scan.stamp_ns - state.stamp_ns) / NS_PER_S
+        relative, result = self.gate.apply(measured, predicted, initial, dt_s, self.trust.left_out)
+        if result.takes_back and isinstance(self.residual, TakesBack):
             self.residual.take_back(initial)
         return relative, result
+
+    def learn(self, frame: Frame, result: GateResult) -> None:
+        """Let the trust in the IMU follow the gate's result of the step to ``frame``."""
+        was_left_out = self.trust.left_out
+        self.trust.learn(result, frame.scan.stamp_ns)
+        self.setup.use_noise(self.trust.noise)
+        if self.trust.left_out and not was_left_out:
+            which = (
+                "angular rates" if result.parts is not None and result.parts[0] > result.parts[1] else "accelerations"
+            )
+            level = logging.INFO if self._has_warned else logging.WARNING
+            self._has_warned = True
+            _log.log(level, _CONTRADICTS, frame.index, which)
 
     def correct(self, frame: Frame, initial: RelativePose, relative: RelativePose, step: RelativePose) -> None:
         """Let the initial-pose source learn from the backend's step, unless the step is only its own prediction."""

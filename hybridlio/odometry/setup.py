@@ -50,6 +50,10 @@ class Setup:
 
         return InertialSteps(self.calibration, self.imu_noise)
 
+    def use_noise(self, noise: ImuNoise) -> None:
+        """Preintegrate with this noise from now on."""
+        self.inertial_steps.noise = noise
+
     def predict_from_imu(self, frame: Frame, state: State) -> RelativePose | None:
         """Return the step from ``state`` to ``frame`` by the IMU; None if its samples do not cover it."""
         return self.inertial_steps.predicted(frame, state)

@@ -229,8 +229,8 @@ def _advance(run: Run, k: int, keeper: Keeps | None) -> None:
         return
     run.reading_s.append(read_s)
     run.estimates.append(estimate)
-    if estimate.gate.verdict in ("down-weighted", "rejected", "relocated"):
-        nis, verdict = estimate.gate.nis, estimate.gate.verdict
+    nis, verdict = estimate.gate.nis, estimate.gate.verdict
+    if nis is not None and nis > GATE_NIS:
         _log.info("frame %d: %s: innovation against the IMU has χ² = %.0f (gate %.0f)", k, verdict, nis, GATE_NIS)
     elif estimate.relative is not None and not estimate.relative.ok and k not in run.unreadable:
         _log.info("frame %d: bridged by the initial pose: %s", k, _bridging_reason(estimate.relative.details))

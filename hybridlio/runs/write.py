@@ -118,11 +118,12 @@ def imu_conflicts(run: Run) -> list[str]:
         "rejected": "rejected: they conflict with the IMU, which bridges them",
         "relocated": "used to relocate in the map after repeated rejections; the jump is not in the trajectory",
         "down-weighted": "down-weighted: they differ from the IMU by more than their covariances",
-        "trusted again": "accepted although they conflict with the IMU, after too many rejections in a row",
+        "undecided": "left out, with the IMU, as either may be wrong; the next scan decides",
+        "IMU left out": "used without the IMU, which contradicted the smooth motion that scans show",
     }
     counts = {action: len(run.frames_with(cast("Verdict", verdict))) for verdict, action in actions.items()}
     out = [f"{counted(count, 'scan')} {action}" for action, count in counts.items() if count]
-    conflicts = len(run.frames_with("rejected")) + len(run.frames_with("trusted again"))
+    conflicts = len(run.frames_with("rejected")) + len(run.frames_with("IMU left out"))
     if conflicts > _LARGE_SHARE * len(run.estimates):
         out.append("many scans conflict with the IMU; its data may be wrong: check T_imu_lidar, units and clock")
     return out
@@ -145,7 +146,8 @@ def metrics(run: Run, config: Config, evaluation: Evaluation | None) -> dict[str
         "rejected": run.frames_with("rejected"),
         "down_weighted": run.frames_with("down-weighted"),
         "relocated": run.frames_with("relocated"),
-        "trusted_again": run.frames_with("trusted again"),
+        "undecided": run.frames_with("undecided"),
+        "imu_left_out": run.frames_with("IMU left out"),
         "degenerate": (np.flatnonzero(run.degenerate) + run.skipped + 1).tolist(),
         "unreadable": {str(k): why for k, why in run.unreadable.items()},
         "notes": notes(run),

@@ -1,8 +1,12 @@
-"""The innovation gate: compares each relative pose with the IMU's prediction and limits the effect of wrong ones.
+"""The innovation gate: compares each relative pose with the IMU's prediction and decides which of the two is wrong.
 
 The test statistic is the normalised innovation squared (NIS): the squared difference of measurement and prediction
 under the sum of their covariances (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and
 Navigation" (2001), §5.4.2). Where both covariances are right it is χ² distributed with six degrees of freedom.
+
+A difference alone does not tell which side is wrong. The scans do, because each is registered to the map by itself:
+if the path that they found is smooth while the IMU contradicts two steps of it in a row, the IMU is wrong. If the path
+jumps, or moves on beside its jump as the IMU predicts, the scan is.
 """
 
 from __future__ import annotations
@@ -16,8 +20,9 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.motion_limits import UNKNOWN_TRANSLATION_SIGMA_M
+from hybridlio.sources.motion_change import MotionChange
 
-Verdict = Literal["untested", "accepted", "down-weighted", "rejected", "relocated", "trusted again"]
+Verdict = Literal["untested", "accepted", "undecided", "IMU left out", "down-weighted", "rejected", "relocated"]
 
 GATE_NIS = 27.86  # 99.99 % quantile of χ² with six degrees of freedom: one right measurement in 10,000 is above
 GROSS_NIS = 10 * GATE_NIS  # a right pose stays below even with covariances 10 times too small; above, the pose is wrong
@@ -35,18 +40,34 @@ class GateResult:
 
             * ``untested``: passed on; there is no usable prediction, or the run is in its first steps.
             * ``accepted``: passed on; the innovation is within the gate.
+            * ``undecided``: replaced by the bridge, whose covariance spans both; the IMU's samples are left out too.
+              The residual source is asked to take the scan back; the next scan decides.
+            * ``IMU left out``: passed on without the IMU's samples, which contradict the scans or did so lately.
             * ``down-weighted``: passed on with a covariance inflated until the innovation is at the gate.
             * ``rejected``: replaced by the bridge; the residual source is asked to take the scan back.
             * ``relocated``: replaced by the bridge after too many rejections in a row, but the residual source
               continues from where it found the scan.
-            * ``trusted again``: passed on although outside the gate, after a relocation that did not help.
         nis: normalised innovation squared; None where untested.
+        parts: of rotation and translation alone, each divided by its three degrees of freedom.
     """
 
     verdict: Verdict
     nis: float | None = None
+    parts: tuple[float, float] | None = None
+
+    @property
+    def uses_imu(self) -> bool:
+        """Whether the step's samples may go into the graph."""
+        return self.verdict not in ("undecided", "IMU left out")
+
+    @property
+    def takes_back(self) -> bool:
+        """Whether the residual source is to continue as if the scan had failed."""
+        return self.verdict in ("undecided", "rejected")
 
 
+# Verdicts after which the next scan is expected to continue this scan's motion; after others, that of the scan before
+_MOVES_ON = ("untested", "accepted", "undecided", "IMU left out")
 UNTESTED = GateResult("untested")
 
 
@@ -88,20 +109,32 @@ def _nis(innovation: Array, covariance: Array) -> float:
 
 
 class InnovationGate:
-    """Tests each step's relative pose against the IMU's prediction and counts rejections in a row.
+    """Tests each step's relative pose against the IMU's prediction.
 
-    After :data:`MAX_REJECTIONS` rejections, the position in the map may be lost. The next relative pose is then a jump
-    in the map, not a motion, and is rejected too; those after it agree with the IMU again. If they do not, the IMU may
-    be wrong: relative poses then pass until one is within the gate, so that the graph can correct the IMU's biases or
-    the speed.
+    After :data:`MAX_REJECTIONS` rejections in a row, the position in the map may be lost. The next relative pose is
+    then a jump in the map, not a motion, and is rejected too; those after it agree with the IMU again. If they do not,
+    the IMU is left out.
+
+    Args:
+        takes_back: whether the residual source can take a scan back, so that the path continues by the bridge.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, takes_back: bool = True) -> None:
+        self._takes_back = takes_back
         self._steps = 0
         self._rejected_in_a_row = 0
+        self._undecided = False
+        self._motion = MotionChange()
+        # the last scan, where it was found, in the pose that the source's path has for it; None if they are the same
+        self._found: Array | None = None
 
     def apply(
-        self, measured: RelativePose, predicted: RelativePose | None, bridge: RelativePose
+        self,
+        measured: RelativePose,
+        predicted: RelativePose | None,
+        bridge: RelativePose,
+        dt_s: float,
+        leaves_out_imu: bool = False,
     ) -> tuple[RelativePose, GateResult]:
         """Return the relative pose that the backend is to use, and the gate's result.
 
@@ -109,26 +142,90 @@ class InnovationGate:
             measured: the residual source's relative pose.
             predicted: the IMU's; None where there is no inertial data.
             bridge: the relative pose that replaces a rejected one.
+            dt_s: duration of the step.
+            leaves_out_imu: the IMU is not to be used; only its innovation is wanted.
         """
         self._steps += 1
-        if predicted is None or self._steps <= WARM_UP_STEPS or not _comparable(measured, predicted):
+        own = measured
+        if self._found is not None:
+            own = replace(measured, pose=se3.between(self._found, measured.pose))
+        if leaves_out_imu:
+            tested = predicted if _comparable(own, predicted) else None
+            nis = None if tested is None else normalised_innovation_squared(own, tested)
+            relative, result = measured, GateResult("IMU left out", nis)
+        else:
+            relative, result = self._tested(measured, own, predicted, bridge, dt_s)
+        if measured.ok and result.verdict in _MOVES_ON:
+            # the IMU confirms the path: then the step to this scan is from the bridge, not from a scan found wrongly
+            step = measured.pose if result.verdict == "accepted" else own.pose
+            is_typical = self._found is None and result.verdict in ("untested", "accepted")
+            self._motion.learn(step, dt_s, is_typical)
+        taken_back = result.takes_back and self._takes_back
+        self._found = se3.between(bridge.pose, measured.pose) if taken_back else None
+        return relative, result
+
+    def _tested(
+        self,
+        measured: RelativePose,
+        own: RelativePose,
+        predicted: RelativePose | None,
+        bridge: RelativePose,
+        dt_s: float,
+    ) -> tuple[RelativePose, GateResult]:
+        """As :meth:`apply`; ``own`` is the step from where the last scan was found to where this one is."""
+        was_undecided, self._undecided = self._undecided, False
+        if self._steps <= WARM_UP_STEPS or not _comparable(measured, predicted):
             return measured, UNTESTED
-        nis = normalised_innovation_squared(measured, predicted)
+        assert predicted is not None
+        nis, parts = normalised_innovation_squared(measured, predicted), _parts(measured, predicted)
         if nis <= GATE_NIS:
             self._rejected_in_a_row = 0
-            return measured, GateResult("accepted", nis)
-        if self._rejected_in_a_row > MAX_REJECTIONS:
-            return measured, GateResult("trusted again", nis)
+            return measured, GateResult("accepted", nis, parts)
+        contradicts_path = normalised_innovation_squared(own, predicted) > GATE_NIS
+        smooth = self._motion.continues(own.pose, dt_s) and contradicts_path
+        if self._rejected_in_a_row > MAX_REJECTIONS or (smooth and was_undecided):
+            return measured, GateResult("IMU left out", nis, parts)
+        if smooth:
+            self._undecided = True
+            return _either(measured, bridge, nis), GateResult("undecided", nis, parts)
         if nis <= GROSS_NIS:
-            return measured.wider(inflation_to_gate(measured, predicted)), GateResult("down-weighted", nis)
+            return _scattered(measured, inflation_to_gate(measured, predicted)), GateResult("down-weighted", nis, parts)
         self._rejected_in_a_row += 1
-        verdict: Verdict = "relocated" if self._rejected_in_a_row > MAX_REJECTIONS else "rejected"
-        details = {**measured.details, "nis": nis}
-        return replace(bridge, ok=False, drift=None, earlier_scans=(), details=details), GateResult(verdict, nis)
+        if self._rejected_in_a_row > MAX_REJECTIONS:
+            return _bridged(measured, bridge, nis, drift=None), GateResult("relocated", nis, parts)
+        return _bridged(measured, bridge, nis, measured.drift), GateResult("rejected", nis, parts)
 
 
-def _comparable(measured: RelativePose, predicted: RelativePose) -> bool:
+def _bridged(measured: RelativePose, bridge: RelativePose, nis: float, drift: Array | None) -> RelativePose:
+    """Return the bridge. With ``drift``, the source's path continues by it, and loses nothing: the next scan is
+    registered to the same map."""
+    return replace(bridge, ok=False, drift=drift, earlier_scans=(), details={**measured.details, "nis": nis})
+
+
+def _either(measured: RelativePose, bridge: RelativePose, nis: float) -> RelativePose:
+    """Return the bridge with a covariance that spans the measured pose too."""
+    difference = _innovation(bridge, measured)
+    wide = replace(bridge, covariance=bridge.covariance + np.outer(difference, difference))
+    return _bridged(measured, wide, nis, measured.drift)
+
+
+def _scattered(measured: RelativePose, times: float) -> RelativePose:
+    """Return the relative pose with a larger scatter. Its drift stays: the next scan finds the map where it was."""
+    wide = measured.wider(times)
+    return wide if measured.drift is None else replace(wide, drift=measured.drift)
+
+
+def _parts(measured: RelativePose, predicted: RelativePose) -> tuple[float, float]:
+    innovation, total = _innovation(measured, predicted), measured.covariance + predicted.covariance
+    rotation, translation = slice(0, 3), slice(3, 6)
+    return (
+        _nis(innovation[rotation], total[rotation, rotation]) / 3,
+        _nis(innovation[translation], total[translation, translation]) / 3,
+    )
+
+
+def _comparable(measured: RelativePose, predicted: RelativePose | None) -> bool:
     """Whether both are measurements, independent of each other, and the IMU knows its speed well enough to judge."""
-    if not predicted.ok or not measured.ok or measured.from_imu:
+    if predicted is None or not predicted.ok or not measured.ok or measured.from_imu:
         return False
     return predicted.translation_sigma_m <= UNKNOWN_TRANSLATION_SIGMA_M

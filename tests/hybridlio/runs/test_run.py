@@ -220,7 +220,7 @@ def test_a_malformed_or_empty_range_is_an_error(text, error, sequence):
 def test_many_conflicts_with_the_imu_add_a_note_to_check_its_data(whole):
     estimates = list(whole.estimates)
     for count, has_hint in ((1, False), (5, True)):
-        doubted = [replace(e, gate=GateResult("trusted again", 1e3)) for e in estimates[-count:]]
+        doubted = [replace(e, gate=GateResult("IMU left out", 1e3)) for e in estimates[-count:]]
         lines = notes(replace(whole, estimates=[*estimates[:-count], *doubted]))
         assert f"{count} scan" in lines[0]
         assert ("check T_imu_lidar, units and clock" in lines[-1]) == has_hint

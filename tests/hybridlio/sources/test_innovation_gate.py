@@ -27,6 +27,7 @@ from hybridlio.sources.scan_matching import ScanMatching
 
 STEP = se3.exp(np.array([0.01, -0.02, 0.05, 1.0, 0.1, -0.02]))
 COVARIANCE = np.diag(np.r_[np.full(3, 1e-3), np.full(3, 0.01)] ** 2)
+DT_S = 0.1
 IMU = RelativePose(STEP, COVARIANCE, "preintegration", from_imu=True)
 
 
@@ -39,8 +40,9 @@ def off_by(sigmas: float, axis: int = 3, **changes: object) -> RelativePose:
 
 def started() -> InnovationGate:
     gate = InnovationGate()
+    far = replace(IMU, pose=off_by(100).pose)
     for _ in range(WARM_UP_STEPS):
-        assert gate.apply(off_by(100), IMU, IMU)[1].verdict == "untested"
+        assert gate.apply(off_by(0.0), far, far, DT_S)[1].verdict == "untested"
     return gate
 
 
@@ -73,22 +75,22 @@ def test_a_covariance_within_the_gate_is_not_inflated():
 
 def test_a_step_is_accepted_down_weighted_or_rejected_by_its_innovation():
     gate = started()
-    taken, result = gate.apply(measured := off_by(3.0), IMU, IMU)
+    taken, result = gate.apply(measured := off_by(3.0), IMU, IMU, DT_S)
     assert (taken, result.verdict) == (measured, "accepted")
     earlier = EarlierScanPose(7, STEP, COVARIANCE)
-    far = off_by(10.0, drift=0.1 * COVARIANCE, earlier_scans=(earlier,))
-    taken, result = gate.apply(far, IMU, IMU)
+    far = off_by(14.0, drift=0.1 * COVARIANCE, earlier_scans=(earlier,))
+    taken, result = gate.apply(far, IMU, IMU, DT_S)
     assert result.verdict == "down-weighted"
-    assert result.nis == pytest.approx(100.0)
+    assert result.nis == pytest.approx(196.0)
     times = inflation_to_gate(far, IMU)
     for mine, theirs in (
         (taken.covariance, far.covariance),
-        (taken.drift, far.drift),
         (taken.earlier_scans[0].covariance, COVARIANCE),
     ):
         np.testing.assert_allclose(mine, times * theirs)
+    np.testing.assert_array_equal(taken.drift, far.drift)  # the next scan finds the map where it was
     np.testing.assert_allclose(taken.pose, far.pose, atol=1e-12)
-    taken, result = gate.apply(off_by(20.0, earlier_scans=(earlier,)), IMU, IMU)
+    taken, result = gate.apply(off_by(20.0, earlier_scans=(earlier,)), IMU, IMU, DT_S)
     assert result.verdict == "rejected"
     assert (taken.ok, taken.source, taken.earlier_scans, taken.drift) == (False, "preintegration", (), None)
     assert taken.details["nis"] > GROSS_NIS
@@ -108,7 +110,7 @@ def test_a_step_is_accepted_down_weighted_or_rejected_by_its_innovation():
 def test_nothing_is_tested_without_a_prediction_and_a_measurement(
     measured: RelativePose, predicted: RelativePose | None
 ):
-    taken, result = started().apply(measured, predicted, IMU)
+    taken, result = started().apply(measured, predicted, IMU, DT_S)
     assert taken is measured
     assert result.verdict == "untested"
     assert result.nis is None
@@ -116,27 +118,61 @@ def test_nothing_is_tested_without_a_prediction_and_a_measurement(
 
 def at_the_limit_of_rejections() -> InnovationGate:
     gate = started()
-    verdicts = [gate.apply(off_by(50), IMU, IMU)[1].verdict for _ in range(MAX_REJECTIONS)]
+    verdicts = [gate.apply(off_by(50), IMU, IMU, DT_S)[1].verdict for _ in range(MAX_REJECTIONS)]
     assert verdicts == ["rejected"] * MAX_REJECTIONS
     return gate
 
 
 def test_after_a_few_rejections_the_map_is_relocated_and_the_jump_left_out_of_the_path():
     gate = at_the_limit_of_rejections()
-    taken, result = gate.apply(off_by(50), IMU, IMU)
+    taken, result = gate.apply(off_by(50), IMU, IMU, DT_S)
     assert result.verdict == "relocated"
     assert (taken.ok, taken.source) == (False, "preintegration")
     np.testing.assert_array_equal(taken.pose, STEP)
-    assert gate.apply(off_by(0.5), IMU, IMU)[1].verdict == "accepted"
-    assert gate.apply(off_by(50), IMU, IMU)[1].verdict == "rejected"
+    assert gate.apply(off_by(0.5), IMU, IMU, DT_S)[1].verdict == "accepted"
+    assert gate.apply(off_by(50), IMU, IMU, DT_S)[1].verdict == "rejected"
 
 
-def test_scans_that_keep_contradicting_the_imu_are_trusted_until_one_agrees():
+def test_scans_that_jump_again_and_again_end_with_the_imu_left_out():
     gate = at_the_limit_of_rejections()
-    verdicts = [gate.apply(off_by(50), IMU, IMU)[1].verdict for _ in range(4)]
-    assert verdicts == ["relocated"] + ["trusted again"] * 3
-    assert gate.apply(off_by(0.5), IMU, IMU)[1].verdict == "accepted"
-    assert gate.apply(off_by(50), IMU, IMU)[1].verdict == "rejected"
+    verdicts = [gate.apply(off_by(50), IMU, IMU, DT_S)[1].verdict for _ in range(4)]
+    assert verdicts == ["relocated"] + ["IMU left out"] * 3
+    assert gate.apply(off_by(0.5), IMU, IMU, DT_S)[1].verdict == "accepted"
+    assert gate.apply(off_by(50), IMU, IMU, DT_S)[1].verdict == "rejected"
+
+
+def wrong_imu(by_rad: float) -> RelativePose:
+    return replace(IMU, pose=STEP @ se3.exp([0, 0, by_rad, 0, 0, 0]))
+
+
+def test_an_imu_that_contradicts_two_smooth_steps_is_left_out():
+    gate, imu = started(), wrong_imu(0.02)
+    gate.apply(RelativePose(STEP, COVARIANCE, "test"), IMU, IMU, DT_S)
+    drift = 0.1 * COVARIANCE
+    first, undecided = gate.apply(RelativePose(STEP, COVARIANCE, "test", drift=drift), imu, imu, DT_S)
+    assert (undecided.verdict, undecided.uses_imu, undecided.takes_back) == ("undecided", False, True)
+    assert (first.ok, first.source) == (False, "preintegration")
+    np.testing.assert_array_equal(first.drift, drift)  # the path goes on through the map
+    assert np.sqrt(first.covariance[2, 2]) > 0.02  # spans both
+    corrected = RelativePose(se3.between(imu.pose, STEP) @ STEP, COVARIANCE, "test")  # from the bridge to the next scan
+    taken, result = gate.apply(corrected, imu, imu, DT_S)
+    assert (result.verdict, result.uses_imu, taken) == ("IMU left out", False, corrected)
+
+
+def test_a_single_wrong_step_does_not_put_the_imu_out():
+    gate = started()
+    gate.apply(RelativePose(STEP, COVARIANCE, "test"), IMU, IMU, DT_S)
+    assert gate.apply(off_by(7.0), IMU, IMU, DT_S)[1].verdict == "undecided"
+    assert gate.apply(off_by(0.5), IMU, IMU, DT_S)[1].verdict == "accepted"
+    assert gate.apply(off_by(7.0), IMU, IMU, DT_S)[1].verdict == "undecided"
+
+
+def test_an_imu_that_is_left_out_is_still_compared():
+    gate = started()
+    taken, result = gate.apply(measured := off_by(20.0), IMU, IMU, DT_S, leaves_out_imu=True)
+    assert (taken, result.verdict) == (measured, "IMU left out")
+    assert result.nis == pytest.approx(400.0)
+    assert gate.apply(measured, None, IMU, DT_S, leaves_out_imu=True)[1].nis is None
 
 
 # ---------------------------------------------------------------------------------------------------- in a drive
