@@ -51,8 +51,9 @@ class Setup:
         return InertialSteps(self.calibration, self.imu_noise)
 
     def use_noise(self, noise: ImuNoise) -> None:
-        """Preintegrate with this noise from now on."""
-        self.inertial_steps.noise = noise
+        """Preintegrate with this noise from now on. Without inertial data so far, nothing is loaded for it."""
+        if "inertial_steps" in vars(self):
+            self.inertial_steps.noise = noise
 
     def predict_from_imu(self, frame: Frame, state: State) -> RelativePose | None:
         """Return the step from ``state`` to ``frame`` by the IMU; None if its samples do not cover it."""
