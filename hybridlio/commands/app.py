@@ -16,6 +16,7 @@ from hybridlio.commands.georeference import georeference
 from hybridlio.commands.info import info
 from hybridlio.commands.map import map_
 from hybridlio.commands.odometry import odometry
+from hybridlio.commands.report import report
 from hybridlio.commands.simulate import simulate
 from hybridlio.commands.smooth import smooth
 from hybridlio.commands.train import train
@@ -46,6 +47,20 @@ def main(
     """Lidar-inertial odometry: estimates a trajectory with covariances, a pose graph and a report from a recording."""
 
 
-for _command in (simulate, info, odometry, smooth, georeference, batch, compare, evaluate, train, ablate, config, view):
+for _command in (
+    simulate,
+    info,
+    odometry,
+    smooth,
+    georeference,
+    batch,
+    compare,
+    evaluate,
+    report,
+    train,
+    ablate,
+    config,
+    view,
+):
     app.command()(_command)
 app.command("map")(map_)

@@ -42,7 +42,7 @@ def evaluate(
     from hybridlio.evaluation.evaluate import evaluate as evaluate_trajectory
     from hybridlio.evaluation.metrics_table import metrics_table
 
-    true, estimated, steps = _load(estimate, reference)
+    true, estimated, steps = load_pair(estimate, reference)
     result = evaluate_trajectory(true, estimated, lengths_m=_parse_lengths(lengths), steps=steps)
     if as_json:
         print_result(json.dumps(result.to_json_dict(), indent=2, ensure_ascii=False))
@@ -52,7 +52,7 @@ def evaluate(
         print_warning(warning)
 
 
-def _load(estimate: Path, reference: Path | None) -> tuple[Trajectory, Trajectory, Steps | None]:
+def load_pair(estimate: Path, reference: Path | None) -> tuple[Trajectory, Trajectory, Steps | None]:
     """Return the reference, the estimate and, for a run folder, the estimate's steps."""
     import numpy as np
 
