@@ -69,8 +69,7 @@ def report(
 def _names(paths: list[Path]) -> list[str]:
     """Return a name for each path: its own, with that of the folder above where two are alike."""
     own = [path.resolve().name for path in paths]
-    names = [
-        name if own.count(name) == 1 else f"{path.resolve().parent.name}/{name}"
-        for name, path in zip(own, paths, strict=True)
-    ]
+    folders = [path.resolve().parent.name for path in paths]
+    pairs = zip(folders, own, strict=True)
+    names = [name if own.count(name) == 1 else f"{folder}/{name}" for folder, name in pairs]
     return [name if names.count(name) == 1 else f"{name} ({k + 1})" for k, name in enumerate(names)]
