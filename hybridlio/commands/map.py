@@ -81,7 +81,7 @@ def map_(
     """Write the map of a run: its scans as one coloured cloud, without moving objects."""
     from hybridlio.mapping.build import map_tiles
     from hybridlio.mapping.settings import MapSettings
-    from hybridlio.runs.map_source import open_map_source
+    from hybridlio.runs.results.map_source import open_map_source
 
     settings = MapSettings(voxel, min_range, max_range, remove_moving=not keep_moving, normals=normals or mesh)
     output = _Output(out, colour, None if tiles is None else f".{tiles.lstrip('.')}", mesh)

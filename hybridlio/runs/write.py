@@ -23,7 +23,7 @@ from hybridlio.odometry.config import Config, config_to_yaml
 from hybridlio.record.record import Record
 from hybridlio.runs import folder as run_folder
 from hybridlio.runs.own_files import check_free
-from hybridlio.runs.report_input import ONLINE, SMOOTHED, report_data, smoothed_report_data
+from hybridlio.runs.results.report_input import ONLINE, SMOOTHED, report_data, smoothed_report_data
 from hybridlio.runs.run import Run
 from hybridlio.runs.whole_folder import is_held, replaced_folder
 

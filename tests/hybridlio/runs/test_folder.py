@@ -18,7 +18,7 @@ from hybridlio.odometry.config import Config, load_config
 from hybridlio.odometry.odometry import Odometry
 from hybridlio.record.record import Record
 from hybridlio.runs import folder as run_folder
-from hybridlio.runs.report_input import report_data
+from hybridlio.runs.results.report_input import report_data
 from hybridlio.runs.run import Run, run_odometry
 from hybridlio.runs.write import write_run
 

@@ -1,0 +1,1 @@
+"""What commands make of runs: the input of reports and of maps."""
