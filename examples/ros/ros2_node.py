@@ -8,6 +8,7 @@ run with ROS 2.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 from typing import Any
@@ -75,9 +76,8 @@ def main() -> None:
     executor = MultiThreadedExecutor(num_threads=2)
     executor.add_node(node)
     try:
-        executor.spin()
-    except KeyboardInterrupt:
-        pass
+        with contextlib.suppress(KeyboardInterrupt):
+            executor.spin()
     finally:
         node.bridge.close()
         rclpy.try_shutdown()
