@@ -17,18 +17,18 @@ from hybridlio.calibration.imu_check import ImuCheck, check_imu
 from hybridlio.core.errors import DataError
 from hybridlio.core.progress import Progress
 from hybridlio.core.sensors import NS_PER_S, ImuSamples, Scan
-from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.sources.scan_path import scan_paths
+from hybridlio.sources.scan_path import ScanPath, best_paths, scan_paths
 
 LARGEST_OFFSET_S = 0.2  # drivers that stamp on arrival are late by less; larger offsets are of clocks never set
 # Four stretches of ten seconds at 10 Hz: the offset is then known to 0.5 ms in ordinary driving, as the gyroscope's
 # noise allows. Two are enough to see that the clocks agree (benchmarks/clock_offsets.py has accuracy and time).
 _STRETCHES, _FIRST_STRETCHES, _STRETCH_SCANS = 4, 2, 100
+_ABOUT_NS = NS_PER_S // 40  # a quarter of a scan before and after its stamp
 _QUIET_SCANS = 15  # of a stretch, among which it begins at the one that turns least
 _LEAST_SCANS = 60  # in a recording, for 50 steps that the samples cover
-_POINTS = 30_000  # of each scan; more make the turns no more accurate
+_POINTS = 30_000
 _MAX_PASSES = 3  # of scans that need motion compensation, which depends on the offset; the error falls tenfold a pass
 _SETTLED_S = 5e-4
 _LARGEST_RATE_RAD_S = 6.0  # of 95 % of samples; rates beyond are of another unit and no help to compensate scans
@@ -72,7 +72,7 @@ def compare_imu(sequence: Sequence, progress: Progress | None = None) -> ImuChec
     recording = _Loaded(sequence, progress)
     rates = np.linalg.norm(sequence.imu.gyro_rad_s, axis=1)
     compensating = sequence.imu if np.quantile(rates, 0.95) < _LARGEST_RATE_RAD_S else ImuSamples.empty()
-    paths: list[Trajectory] = []
+    paths: list[ScanPath] = []
     check, before_s = None, 0.0
     for _ in range(_MAX_PASSES):
         paths = recording.paths(slice(None, _FIRST_STRETCHES), compensating)
@@ -101,7 +101,7 @@ class _Loaded:
         """Whether motion compensation, and so the offset of the clocks, changes the scans."""
         return any(scan.time_offsets_ns is not None for stretch in self._stretches for scan in stretch)
 
-    def paths(self, stretches: slice, compensating: ImuSamples) -> list[Trajectory]:
+    def paths(self, stretches: slice, compensating: ImuSamples) -> list[ScanPath]:
         """Return the lidar's paths through some stretches, compensated by the gyroscope if it has samples."""
         calibration = self._sequence.calibration
         return [
@@ -110,12 +110,12 @@ class _Loaded:
             for path in scan_paths(self._with_samples(stretch, compensating), calibration)
         ]
 
-    def check(self, paths: list[Trajectory]) -> ImuCheck | None:
+    def check(self, paths: list[ScanPath]) -> ImuCheck | None:
         """Return the comparison of the samples with paths."""
-        if sum(map(len, paths)) < _LEAST_SCANS:
+        right = best_paths(paths)
+        if sum(map(len, right)) < _LEAST_SCANS:
             return None
-        in_order = sorted(paths, key=lambda path: int(path.stamps_ns[0]))
-        return check_imu(in_order, self._sequence.imu, self._sequence.calibration.T_imu_lidar, LARGEST_OFFSET_S)
+        return check_imu(right, self._sequence.imu, self._sequence.calibration.T_imu_lidar, LARGEST_OFFSET_S)
 
     def _with_samples(self, scans: list[Scan], imu: ImuSamples) -> Iterator[tuple[Scan, ImuSamples]]:
         for scan in scans:
@@ -182,5 +182,5 @@ def _thinned(scan: Scan) -> Scan:
 def _during(scan: Scan, imu: ImuSamples) -> ImuSamples:
     times = scan.time_offsets_ns
     if times is None or not len(times):
-        return ImuSamples.empty()
+        return imu.between(scan.stamp_ns - _ABOUT_NS, scan.stamp_ns + _ABOUT_NS)
     return imu.between(scan.stamp_ns + int(times.min()), scan.stamp_ns + int(times.max()))

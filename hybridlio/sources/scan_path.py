@@ -31,7 +31,7 @@ _LEAST_MEASURED = 5_000  # a quarter of scan matching's, for the same reason
 _KERNEL = 0.25
 # A path slides along a road or turns too little while most points still match, but they lie farther from the surfaces:
 # by 1.6 to 2.5 times on the drive with hard driving. Where all is well the distances vary by 15 %.
-_LOST_RATIO, _SETTLED_SCANS = 1.5, 10
+_LOST_RATIO, _SETTLED_SCANS, _JUDGING_SCANS = 1.5, 10, 30
 _FIRST_REPETITIONS = 2  # of the first step, when its speed is known and both scans are compensated with it
 
 
@@ -56,16 +56,22 @@ class ScanPath:
         """The lidar's poses so far, in the frame of the first scan."""
         return Trajectory(np.array(self._stamps, np.int64), np.array(self._poses).reshape(-1, 4, 4))
 
+    @property
+    def sigma_m(self) -> float:
+        """Median over the scans of their points' standard deviation from the map; 0 for none."""
+        return float(np.median(self._sigmas_m)) if self._sigmas_m else 0.0
+
     def add(self, scan: Scan, sweep_imu: ImuSamples) -> bool:
         """Register the next scan, and return whether it fits; otherwise the path is as before.
 
         Args:
             scan: after the last one.
-            sweep_imu: samples during its sweep, on its clock, free of bias; may be empty.
+            sweep_imu: samples about its stamp, during its sweep if its points have times, on its clock and free of
+                bias; may be empty.
         """
         if self._first is None:
             self._first = scan, sweep_imu
-            self._settings = _settings_for(scan)
+            self._settings = _scaled_settings(scan)
             return self._start(np.eye(4), scan.stamp_ns + NS_PER_S)
         if len(self._poses) > 1:
             dt, before = scan.stamp_ns - self._stamps[-1], self._stamps[-1] - self._stamps[-2]
@@ -78,7 +84,9 @@ class ScanPath:
             step = self._poses.pop()
             self._stamps.pop()
         assert step is not None
-        return self._register(scan, sweep_imu, step)
+        fits = self._register(scan, sweep_imu, step)
+        self._settings = _coarser(self._settings)
+        return fits
 
     def _start(self, step: Array, end_ns: int) -> bool:
         """Make a map of the first scan alone, compensated for its motion to the next one."""
@@ -98,6 +106,10 @@ class ScanPath:
             return None
         dt_s = (scan.stamp_ns - start_ns) / NS_PER_S
         starts = motions(settings.start_speeds_m_s, settings.start_rates_deg_s, dt_s)
+        if len(sweep_imu):  # of all candidates the best, if the gyroscope is right; else one of those above is
+            rates = (sweep_imu.gyro_rad_s @ self._calibration.T_imu_lidar[:3, :3]).mean(axis=0)
+            turn = se3.make(se3.so3_exp(rates * dt_s), np.zeros(3))
+            starts += [step @ turn for step in motions(settings.start_speeds_m_s, (0.0,), dt_s)]
         return best_start(surface, thinned.source, thinned.points, starts, settings.registration)
 
     def _register(self, scan: Scan, sweep_imu: ImuSamples, step: Array) -> bool:
@@ -107,7 +119,7 @@ class ScanPath:
             return False
         start, kernel_m = self._poses[-1] @ step, _KERNEL * settings.registration.max_distance_m
         found = register(surface, thinned.source, start, settings.registration, kernel_m)
-        usual_m = float(np.median(self._sigmas_m)) if len(self._sigmas_m) >= _SETTLED_SCANS else np.inf
+        usual_m = self.sigma_m if len(self._sigmas_m) >= _SETTLED_SCANS else np.inf
         if found.matched < settings.min_matched or found.sigma_m > _LOST_RATIO * usual_m:
             return False
         self._sigmas_m.append(found.sigma_m)
@@ -128,11 +140,15 @@ class ScanPath:
         return thin(scan, self._settings)
 
 
-def _settings_for(scan: Scan) -> ScanMatchingSettings:
-    """Return the settings at the scale of the scene, which changes little within a stretch."""
+def _scaled_settings(scan: Scan) -> ScanMatchingSettings:
+    """Return scan matching's settings at the scale of the scene, which changes little within a stretch."""
     scale = SceneScale(ScanMatchingSettings())
     scale.observe(thin(scan, scale.settings).view_m)
-    fine = scale.settings
+    return scale.settings
+
+
+def _coarser(fine: ScanMatchingSettings) -> ScanMatchingSettings:
+    """Return the settings for all but the first step, whose search needs more points."""
     return replace(
         fine,
         map_voxel_m=_COARSER_MAP * fine.map_voxel_m,
@@ -141,17 +157,27 @@ def _settings_for(scan: Scan) -> ScanMatchingSettings:
     )
 
 
-def scan_paths(scans: Iterable[tuple[Scan, ImuSamples]], calibration: Calibration) -> list[Trajectory]:
-    """Return the lidar's path through scans; a new one begins after each scan that does not fit.
+def scan_paths(scans: Iterable[tuple[Scan, ImuSamples]], calibration: Calibration) -> list[ScanPath]:
+    """Return the lidar's path through scans, two or more in each; a new one begins after each scan that does not fit.
 
     Args:
         scans: in order of time, each with the samples during its sweep, which may be empty.
         calibration: of the IMU.
     """
-    paths, path = [], ScanPath(calibration)
+    paths = [ScanPath(calibration)]
     for scan, sweep_imu in scans:
-        if not path.add(scan, sweep_imu):
-            paths.append(path.trajectory)
-            path = ScanPath(calibration)
-            path.add(scan, sweep_imu)
-    return [found for found in (*paths, path.trajectory) if len(found) > 1]
+        if not paths[-1].add(scan, sweep_imu):
+            paths.append(ScanPath(calibration))
+            paths[-1].add(scan, sweep_imu)
+    return [path for path in paths if len(path.trajectory) > 1]
+
+
+def best_paths(paths: Iterable[ScanPath]) -> list[Trajectory]:
+    """Return the paths of one recording, without those whose scans lie far from their maps, after a false first fit.
+
+    Such a path goes on as consistently as a right one, at another speed or turning all the time.
+    """
+    known = [path for path in paths if path.sigma_m > 0]
+    least_m = min((path.sigma_m for path in known if len(path.trajectory) >= _JUDGING_SCANS), default=np.inf)
+    right = [path for path in known if path.sigma_m < _LOST_RATIO * least_m]
+    return sorted((path.trajectory for path in right), key=lambda path: int(path.stamps_ns[0]))

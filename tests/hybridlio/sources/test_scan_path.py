@@ -5,13 +5,14 @@ from handheld import as_sequence, carried
 
 from hybridlio.core import se3
 from hybridlio.core.sensors import Calibration, ImuSamples, Scan
-from hybridlio.sources.scan_path import scan_paths
+from hybridlio.sources.scan_path import best_paths, scan_paths
 
 
 def test_the_turns_of_a_path_are_those_of_the_lidar(rng: np.random.Generator):
     walk = carried(rng, seconds=4.0, turning=0.6)
     scans = [as_sequence(rng, walk).load_scan(k) for k in range(len(walk.path))]
-    (path,) = scan_paths(((scan, ImuSamples.empty()) for scan in scans), Calibration())
+    (found,) = scan_paths(((scan, ImuSamples.empty()) for scan in scans), Calibration())
+    path = found.trajectory
     np.testing.assert_array_equal(path.stamps_ns, walk.path.stamps_ns)
     steps, true = (se3.between(poses[:-1], poses[1:]) for poses in (path.poses, walk.path.poses))
     errors = se3.so3_log(se3.between(steps, true)[:, :3, :3])
@@ -25,8 +26,21 @@ def test_a_new_path_begins_after_a_scan_that_does_not_fit(rng: np.random.Generat
     scans[12] = Scan(scans[12].stamp_ns, np.empty((0, 3), np.float32))
     paths = scan_paths(((scan, ImuSamples.empty()) for scan in scans), Calibration())
     assert len(paths) == 2
-    assert len(paths[0]) == 12
+    assert len(paths[0].trajectory) == 12
 
 
 def test_no_scans_give_no_path():
     assert scan_paths([], Calibration()) == []
+
+
+def test_a_path_that_began_with_a_false_fit_is_left_out(rng: np.random.Generator):
+    walk = carried(rng, seconds=4.0, turning=0.6)
+    sequence = as_sequence(rng, walk)
+    scans = [(sequence.load_scan(k), ImuSamples.empty()) for k in range(len(walk.path))]
+    (right,) = scan_paths(scans, Calibration())
+    blurred = [
+        (Scan(s.stamp_ns, s.points + rng.normal(0, 0.06, s.points.shape).astype(np.float32)), i) for s, i in scans
+    ]
+    wrong = scan_paths(blurred, Calibration())
+    (kept,) = best_paths([*wrong, right])
+    np.testing.assert_array_equal(kept.poses, right.trajectory.poses)
