@@ -24,9 +24,11 @@ from hybridlio.graph.run.factor_groups import (
     PossibleOutlier,
     squared_residuals,
 )
+from hybridlio.smoothing.verdict import KindFit
 
 ROBUST_METHODS = (*KERNELS, "gnc")
 _MAX_STEPS = 100  # a bound on loops that end by themselves: 1.4^100 graduates residuals of 10^7 standard deviations
+_LEAST_WEIGHT = 0.5  # of a measurement that counts as accepted: one at the kernel's width keeps a quarter to a half
 _CONVERGED_RATIO = 0.99  # of the error to the previous one: weights do not depend on the last percent
 
 Solve = Callable[[gtsam.NonlinearFactorGraph, gtsam.Values], gtsam.Values]
@@ -102,6 +104,18 @@ class AddedGroups:
     def start_next_from(self, values: gtsam.Values) -> None:
         """Take the solution of this round as the start of the next."""
         self._previous = values
+
+    def fits(self, values: gtsam.Values) -> list[KindFit]:
+        """Return how the measurements of each group fit a solution, without those that are rejected."""
+        out = []
+        for group, part, method, weights in zip(self._groups, self._parts, self._methods, self._weights, strict=True):
+            chi2 = squared_residuals(part.possible_outliers, values)
+            if method is not None and method != "gnc":
+                weights = kernel_weights(part.possible_outliers, method, chi2)
+            rows = zip(part.possible_outliers, chi2, weights, strict=True)
+            fits = [(m.name, float(x), len(m.covariance)) for m, x, weight in rows if weight > _LEAST_WEIGHT]
+            out.append(KindFit.of(group.name, fits))
+        return out
 
     def results(self, values: gtsam.Values, states: list[State], isam: gtsam.ISAM2) -> dict[str, Any]:
         """Return each group's result in the solved graph, by the group's name."""

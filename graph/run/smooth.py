@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,7 @@ from hybridlio.graph.base.preintegration import covers, preintegrate
 from hybridlio.graph.run import factors
 from hybridlio.graph.run.factor_groups import FactorGroup
 from hybridlio.graph.run.gps_factors import GpsGroup
+from hybridlio.graph.run.kind_fits import kind_fits
 from hybridlio.graph.run.loop_factors import LoopClosures
 from hybridlio.graph.run.ordering import chain_order
 from hybridlio.graph.run.robust import AddedGroups, check_robust_method
@@ -30,9 +32,12 @@ from hybridlio.graph.run.scan_numbers import ScanNumbers
 from hybridlio.record.record import Record
 from hybridlio.smoothing.gps_options import GpsOptions
 from hybridlio.smoothing.smoothed import Smoothed
+from hybridlio.smoothing.verdict import Verdict
 
 if TYPE_CHECKING:
     from hybridlio.smoothing.loop_closure import LoopSettings
+
+_log = logging.getLogger(__name__)
 
 _MAX_ITERATIONS = 50  # a bound against endless descent; Smoothed.converged says whether it was reached
 _ITERATIONS_A_STEP = 4  # while outliers are rejected: each step of GNC repeats until it converges anyway
@@ -81,6 +86,7 @@ def _optimise(record: Record, added: AddedGroups, report: Progress) -> Smoothed:
     for number in range(_ROUNDS):
         report("optimising", number, _ROUNDS)
         graph, values = _build(record, states)
+        own = graph.size()
         graph, values = added.add_to(graph, values, states, _few_iterations)
         error_before = graph.error(values) if error_before is None else error_before
         optimiser = _optimiser(graph, values)
@@ -90,7 +96,17 @@ def _optimise(record: Record, added: AddedGroups, report: Progress) -> Smoothed:
     isam = bayes_tree(graph, values)
     covariances = pose_covariances(isam, np.array([state.T_world_imu for state in states]), report)
     found = added.results(values, states, isam)
-    return _smoothed(record, states, covariances, error_before or 0.0, optimiser, found)
+    verdict = Verdict.of(kind_fits(graph, own, values, added))
+    for doubt in verdict.doubts:
+        _log.warning("smoothing: %s", doubt)
+    smoothed = _smoothed(record, states, covariances, error_before or 0.0, optimiser, found)
+    return replace(smoothed, verdict=verdict, **(_own_trajectory(record) if verdict.refused else {}))
+
+
+def _own_trajectory(record: Record) -> dict[str, Any]:
+    """Return the odometry's own poses and steps, in place of a solution that contradicts them."""
+    steps = np.array([step.covariance for step in record.relative])
+    return {"trajectory": record.online, "step_covariances": steps}
 
 
 def _with_loops(

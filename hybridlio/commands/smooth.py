@@ -11,7 +11,7 @@ import typer
 from hybridlio.commands.common import Verbose, guarded
 from hybridlio.commands.gps_options import Antenna, MaxShift, Outages, gps_options
 from hybridlio.commands.terminal import print_message, print_result, print_table, print_warning, progress
-from hybridlio.core.errors import ConfigError
+from hybridlio.core.errors import ConfigError, EstimationError
 
 if TYPE_CHECKING:
     from hybridlio.evaluation.report_data import Findings
@@ -75,6 +75,8 @@ def smooth(
     options = gps and gps_options(antenna, max_shift, outage, start_ns)
     with new_run_folder(stored.metrics["sequence"], folder, overwrite or out is None):
         smoothed = _smooth(record, loops, options, robust)
+        if smoothed.verdict.refused:
+            raise EstimationError("; ".join(smoothed.verdict.doubts))
         findings = write_smoothed(folder, stored, record, smoothed)
     _print_result(folder, stored.metrics["sequence"], smoothed, findings)
 
@@ -91,6 +93,7 @@ def _print_result(folder: Path, sequence: str, smoothed: Smoothed, findings: Fin
         print_result(f"GPS: {fit.summary()}")
         if fit.is_doubtful:
             print_warning("most GPS fixes are rejected; check their sigma, the antenna position and --max-shift")
+    print_result(smoothed.verdict.summary())
     if not smoothed.converged:
         print_warning("the optimiser stopped at its iteration limit, before it converged")
     if findings.evaluations:

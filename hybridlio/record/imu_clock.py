@@ -41,26 +41,31 @@ def on_poses_clock(
         trajectory: lidar poses of any odometry.
         imu: the samples; may be empty.
         calibration: ``T_imu_lidar``.
-        stated_s: seconds to add to the samples' stamps; by default found from the rotations.
+        stated_s: seconds to add to the samples' stamps; by default found from the rotations. A stated offset is
+            applied, and noted as doubtful where the rotations contradict it.
     """
     if stated_s is not None:
-        moved = ImuSamples(imu.stamps_ns + round(stated_s * NS_PER_S), imu.gyro_rad_s, imu.accel_m_s2)
-        return OnPosesClock(moved, stated_s)
+        imu = ImuSamples(imu.stamps_ns + round(stated_s * NS_PER_S), imu.gyro_rad_s, imu.accel_m_s2)
     R_imu_lidar = calibration.T_imu_lidar[:3, :3]
     found = find_clock_offset(Turns.of(trajectory), imu, R_imu_lidar, LARGEST_OFFSET_S)
     if found is None:
-        return OnPosesClock(imu)
-    if not found.is_significant:
+        return OnPosesClock(imu, stated_s or 0.0)
+    if stated_s is not None or not found.is_significant:
         notes = _doubts(found)
         for note in notes:
             _log.warning(note)
-        return OnPosesClock(imu, notes=notes)
+        return OnPosesClock(imu, stated_s or 0.0, notes)
     note = f"IMU clock: stamps moved by {found}, found from the rotations of odometry and gyroscope"
     _log.warning(note)
     return OnPosesClock(found.applied_to(imu), found.offset_s, (note,))
 
 
 def _doubts(found: ClockOffset) -> tuple[str, ...]:
+    if found.is_significant:
+        return (
+            f"the rotations of odometry and gyroscope show a further offset of the clocks of {found}: check "
+            "imu_time_offset_s",
+        )
     if not found.contradicts:
         return ()
     return (

@@ -236,7 +236,7 @@ def _smoothed_metrics(
     kept = ("recording", "hybridlio", "sequence", "pose_file_frame", "T_camera_lidar", "frames", "frames_done", "notes")
     figures = {name: stored.metrics[name] for name in kept if name in stored.metrics}
     figures |= {name: getattr(smoothed, name) for name in ("error_before", "error_after", "iterations", "converged")}
-    figures |= {"path_length_m": smoothed.trajectory.length_m}
+    figures |= {"path_length_m": smoothed.trajectory.length_m, "verdict": smoothed.verdict.to_json_dict()}
     if closed is not None:
         figures |= {"loops": closed.to_json_dict(len(stored.stamps_before))}
     if fit is not None:

@@ -7,6 +7,7 @@ from typing import Any
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.trajectory import Trajectory
+from hybridlio.smoothing.verdict import Verdict
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -26,6 +27,8 @@ class Smoothed:
         found: results of the further measurements, by the name of their group: ``loops``
             (:class:`hybridlio.smoothing.loops.ClosedLoops`), ``gps``
             (:class:`hybridlio.smoothing.gps_options.GpsFit`).
+        verdict: how well each kind of measurement fits. If it is refused, trajectory and step covariances are those of
+            the odometry.
     """
 
     trajectory: Trajectory
@@ -39,6 +42,7 @@ class Smoothed:
     iterations: int
     converged: bool
     found: dict[str, Any] = field(default_factory=dict)
+    verdict: Verdict = field(default_factory=lambda: Verdict(()))
 
     def __repr__(self) -> str:
         end = "converged" if self.converged else "not converged"

@@ -93,9 +93,10 @@ def smoothed_report_data(
         first_scan=len(stored.stamps_before),
         loops=np.array([(loop.earlier, loop.later) for loop in loops], np.int64).reshape(-1, 2),
         facts={"smoothed": f"{smoothed.iterations} iterations", "run": stored.path.name}
+        | {"fit": smoothed.verdict.summary()}
         | ({} if closed is None else {"loops": closed.summary()})
         | ({} if fit is None else {"GPS": fit.summary()}),
-        warnings=stored.metrics["notes"],
+        warnings=[*stored.metrics["notes"], *smoothed.verdict.doubts],
     )
 
 
