@@ -71,11 +71,7 @@ TABLE = [
         UNKNOWN_SIGMA_M=("0.5", "1000.0"),
         _HALF=("0.0", "2.0"),
     ),
-    *_in(
-        "hybridlio/core/motion_limits.py",
-        (f"{REGISTRATION}information.py",),
-        MEASUREMENT_FLOOR_SIGMAS=("np.zeros(6)", "np.full(6, 0.1)"),
-    ),
+    *_in("hybridlio/core/motion_limits.py", INFORMATION, MEASUREMENT_FLOOR_SIGMAS=("np.zeros(6)", "np.full(6, 0.1)")),
     *_in(
         "hybridlio/registration/icp.py",
         ICP,
@@ -203,6 +199,10 @@ TABLE = [
         _HYSTERESIS=("0.5", "4.0"),
         _NEW_SHARE=("0.01", "1.0"),
         _LEAST_NOISE_SCALE=("0.01", "1.0"),
+        _FEW_POINTS=("300", "30000"),
+        _ENOUGH_POINTS=("450", "450000"),
+        _MOSTLY_SINGLE=("0.01", "2.0"),
+        _FINEST_STEP=("1", "12"),
     ),
 ]
 

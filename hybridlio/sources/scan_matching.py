@@ -65,6 +65,8 @@ class ScanMatching:
             DataError: it has too few points.
         """
         scan = self._thin(frame.scan)
+        while self._rescale(frame.scan, scan):  # until its settings are its own; later ones follow scan by scan
+            scan = thin(frame.scan, self._settings)
         if len(scan.points) < self._settings.min_points:
             raise DataError(
                 f"frame {frame.index}: only {len(scan.points)} points between {self._settings.min_range_m:.2g} "
@@ -95,10 +97,16 @@ class ScanMatching:
     def _thin(self, scan: Scan) -> ThinnedScan:
         """Thin a scan at the scene's scale, which it may change; the map then goes on at the new one."""
         thinned = thin(scan, self._settings)
-        while len(scan) >= self._settings.min_points and self._scale.observe(thinned.view_m):
+        return thin(scan, self._settings) if self._rescale(scan, thinned) else thinned
+
+    def _rescale(self, scan: Scan, thinned: ThinnedScan) -> bool:
+        """Let the scale of the scene follow the scan; return whether it has changed."""
+        if len(scan) < self._settings.min_points:
+            return False
+        changed = self._scale.observe(thinned.view_m, len(thinned.points), len(scan))
+        if changed:
             self._map.rescale(self._settings.local_map)
-            thinned = thin(scan, self._settings)
-        return thinned
+        return changed
 
     def take_back(self, initial: RelativePose) -> None:
         """Discard the last match: the path continues by ``initial``, and the scan does not enter the map."""

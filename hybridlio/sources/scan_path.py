@@ -143,7 +143,8 @@ class ScanPath:
 def _scaled_settings(scan: Scan) -> ScanMatchingSettings:
     """Return scan matching's settings at the scale of the scene, which changes little within a stretch."""
     scale = SceneScale(ScanMatchingSettings())
-    scale.observe(thin(scan, scale.settings).view_m)
+    thinned = thin(scan, scale.settings)
+    scale.observe(thinned.view_m, len(thinned.points), len(scan))
     return scale.settings
 
 

@@ -20,11 +20,26 @@ DEFAULTS = ScanMatchingSettings()
 UNSURE = np.diag(np.r_[np.full(3, 0.01), np.full(3, 0.05)] ** 2)
 
 
+AMPLE = (6000, 100_000)  # points after averaging over voxels, and measured ones, of a 64-beam scan of a road
+
+
 def settings_after(*views_m: float, given: ScanMatchingSettings = DEFAULTS) -> ScanMatchingSettings:
     scale = SceneScale(given)
     for view_m in views_m:
-        scale.observe(view_m)
+        scale.observe(view_m, *AMPLE)
     return scale.settings
+
+
+def street_seen_by(points_at_default: int, measured: int, scans: int = 20) -> tuple[SceneScale, list[bool]]:
+    """A street of which finer voxels leave more points, in proportion to the inverse of their side's power 1.5."""
+    scale = SceneScale(DEFAULTS)
+    changes = [observe_street(scale, points_at_default, measured) for _ in range(scans)]
+    return scale, changes
+
+
+def observe_street(scale: SceneScale, points_at_default: int, measured: int) -> bool:
+    factor = scale.settings.map_voxel_m / DEFAULTS.map_voxel_m
+    return scale.observe(20.0, min(int(points_at_default * factor**-1.5), measured), measured)
 
 
 # ------------------------------------------------------------------------------------------------- what follows
@@ -61,6 +76,36 @@ def test_a_scale_that_is_given_stays():
     assert settings_after(2.3, given=replace(DEFAULTS, scene_scale=1.0)).map_voxel_m == DEFAULTS.map_voxel_m
 
 
+# ------------------------------------------------------------------------------------------------- density
+
+
+@pytest.mark.parametrize("points", [3400, 12_000], ids=["16 beams", "64 beams"])
+def test_scans_of_roads_keep_their_voxels(points: int):
+    assert street_seen_by(points, 25_000)[0].settings == DEFAULTS
+
+
+def test_a_narrow_lidar_gets_voxels_that_leave_enough_points():
+    """Of 17,000 points that a field of view of 70° has in a street, 1,500 are left by the voxels for 360°."""
+    settings = street_seen_by(1500, 17_000)[0].settings
+    assert 1500 * (DEFAULTS.map_voxel_m / settings.map_voxel_m) ** 1.5 > 4000
+    assert settings.map_voxel_m >= 0.14
+    assert settings.source_voxel_m / settings.map_voxel_m == pytest.approx(1.0 / 0.6)
+    assert settings.registration == DEFAULTS.registration
+
+
+def test_voxels_are_no_finer_than_the_measured_points():
+    """A scan of 1,000 points has no more, however fine the voxels."""
+    assert street_seen_by(900, 1000)[0].settings == DEFAULTS
+
+
+def test_voxels_become_coarser_again_where_points_are_many():
+    scale, changes = street_seen_by(1500, 17_000)
+    assert changes[10:] == [False] * 10
+    for _ in range(20):
+        observe_street(scale, 10_000, 100_000)
+    assert scale.settings == DEFAULTS
+
+
 # ------------------------------------------------------------------------------------------------- over time
 
 
@@ -80,8 +125,8 @@ def test_the_scale_does_not_flicker_at_a_boundary(rng: np.random.Generator):
     """Views that differ by ±10 % about any view change the scale once at most."""
     for view_m in np.geomspace(1.5, 12.0, 20):
         scale = SceneScale(DEFAULTS)
-        scale.observe(float(view_m))
-        changes = sum(scale.observe(float(v)) for v in view_m * np.exp(0.1 * rng.standard_normal(200)))
+        scale.observe(float(view_m), *AMPLE)
+        changes = sum(scale.observe(float(v), *AMPLE) for v in view_m * np.exp(0.1 * rng.standard_normal(200)))
         assert changes <= 1
 
 
