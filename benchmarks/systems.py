@@ -100,15 +100,15 @@ def rko_lio(sequence: Sequence, threads: int) -> Step:
 
     system = LIO(LIOConfig(deskew=sequence[0].scan.time_offsets_ns is not None, max_num_threads=threads))
     T_imu_lidar = se3.orthonormalise(sequence.calibration.T_imu_lidar)
-    last_imu_ns = -(2**62)
+    fed = 0
 
     def step(frame: Frame) -> Answer:
-        nonlocal last_imu_ns
-        imu, scan = frame.imu, frame.scan
-        for stamp, accel, gyro in zip(imu.stamps_ns.tolist(), imu.accel_m_s2, imu.gyro_rad_s, strict=True):
-            if stamp > last_imu_ns:  # consecutive frames share the sample on their border
-                system.add_imu_measurement(accel, gyro, stamp)
-                last_imu_ns = stamp
+        nonlocal fed
+        imu, scan = sequence.imu, frame.scan
+        # as its own pipeline does: all samples up to the end of the sweep, which may be after the scan's stamp
+        first, fed = fed, int(np.searchsorted(imu.stamps_ns, _end_of_sweep_ns(frame), side="right"))
+        for k in range(first, fed):
+            system.add_imu_measurement(imu.accel_m_s2[k], imu.gyro_rad_s[k], int(imu.stamps_ns[k]))
         offsets = np.zeros(len(scan), np.int64) if scan.time_offsets_ns is None else scan.time_offsets_ns
         times = scan.stamp_ns + offsets
         if scan.time_offsets_ns is None:

@@ -24,17 +24,22 @@ def simulate(
     driving: Annotated[str, typer.Option(help="calm, or hard: brakes late and takes bends fast.")] = "calm",
     scene: Annotated[
         str,
-        typer.Option(help="A road: town, corridor or field; or a scene for other platforms: office, stairs or campus."),
+        typer.Option(
+            help="A road: town, corridor or field; or a scene for other platforms: office, "
+            "stairs, house, warehouse, garage, forest, tunnel, mine or campus."
+        ),
     ] = "town",
     platform: Annotated[
         str | None,
         typer.Option(
-            help="What carries the sensors in those scenes: handheld, drone or car; by default the usual one."
+            help="The carrier in those scenes: handheld, quadruped, robot, drone or car; by default the usual one."
         ),
     ] = None,
     lidar: Annotated[
         str | None,
-        typer.Option(help="On roads hdl-64e, 32-beam or 16-beam; else os0, vlp-16, mid360 or rosette."),
+        typer.Option(
+            help="Roads: hdl-64e, 32-beam or 16-beam; else os0, os1, pandar, hdl-64e, vlp-16, mid360 or rosette."
+        ),
     ] = None,
     imu: Annotated[
         str | None, typer.Option(help="In those scenes: consumer-mems (default), industrial or tactical.")

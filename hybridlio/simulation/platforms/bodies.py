@@ -54,6 +54,16 @@ BODIES: dict[str, Body] = {
         *(1.4, 1.2, 0.35, 1.35),
         step_hz=1.8, bounce_m=0.025, sway_m=0.02, step_rad=0.025, tremor_rad=0.004, look_rad=(0.6, 0.2), lever_m=0.15,
     ),
+    "quadruped": Body(
+        "a dog-like robot that trots",
+        *(1.1, 1.5, 0.3, 0.6),
+        step_hz=3.4, bounce_m=0.010, sway_m=0.008, step_rad=0.03, tremor_rad=0.005, tremor_hz=(7.0, 13.0),
+    ),
+    "robot": Body(
+        "a wheeled ground robot",
+        *(1.3, 0.5, 0.6, 0.7),
+        tremor_rad=0.002, tremor_hz=(2.0, 8.0), lever_m=0.3,
+    ),
     "drone": Body(
         "flies between obstacles, with turns of several 100 °/s",
         *(5.0, 5.0, 3.0, 1.5),

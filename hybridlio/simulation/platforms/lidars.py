@@ -78,6 +78,15 @@ SCANNERS: dict[str, Scanner] = {
         "64 beams × 1024, ±45°, like Ouster's OS0",
         LidarModel("os0", _even(45.0, -45.0, 64), 1024, 0.3, 75.0, 0.015, 0.02),
     ),
+    "os1": _spinning(
+        "64 beams × 1024, ±22.5°, like Ouster's OS1",
+        LidarModel("os1", _even(22.5, -22.5, 64), 1024, 0.5, 120.0, 0.015, 0.02),
+    ),
+    "pandar": _spinning(
+        "32 beams × 2000, +15° to -16°, like Hesai's PandarXT-32",
+        LidarModel("pandar", _even(15.0, -16.0, 32), 2000, 0.05, 120.0, 0.01, 0.02),
+    ),
+    "hdl-64e": _spinning("64 beams × 1875, +2° to -24°, like Velodyne's HDL-64E", LIDAR_MODELS["hdl-64e"]),
     "vlp-16": _spinning("16 beams × 1800, ±15°, like Velodyne's VLP-16", LIDAR_MODELS["16-beam"]),
     "mid360": Scanner(
         "360° × 59°, not repetitive, 20,000 points, like Livox's Mid-360",

@@ -6,7 +6,7 @@ The path is sampled here and becomes a quintic spline, of which all truth and al
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -76,6 +76,7 @@ def body_poses(scene: Scene, body: Body, times_s: Array, start_moving: bool, rng
 
     The mount is level and x looks ahead when the body stands.
     """
+    body = replace(body, speed_m_s=min(body.speed_m_s, scene.speed_m_s))
     way = _Way.of(scene, body, body.speed_m_s * (times_s[-1] - times_s[0]) + 5.0)
     awake = np.ones(len(times_s)) if start_moving else ndtr((times_s - _REST_S - 2 * _START_S) / (_START_S / 2))
     s, effort = _travelled(way, body, times_s, awake, rng)

@@ -13,6 +13,10 @@ from hybridlio.commands.app import app
 from hybridlio.core.lidar_models import LIDAR_MODELS
 from hybridlio.datasets.registry import READERS
 from hybridlio.odometry.registry import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES
+from hybridlio.simulation.platforms.bodies import BODIES
+from hybridlio.simulation.platforms.imu_grades import IMU_GRADES
+from hybridlio.simulation.platforms.lidars import SCANNERS
+from hybridlio.simulation.platforms.scenes.table import SCENES
 
 HEAVY = {"torch", "gtsam", "open3d", "matplotlib", "small_gicp", "scipy", "numpy", "pydantic"}
 INTERRUPTED = """
@@ -67,7 +71,7 @@ def test_help_and_version_load_no_heavy_library(words, project_root):
     [
         ("odometry", {**INITIAL_POSE_SOURCES, **RESIDUAL_SOURCES, **BACKENDS, **READERS}),
         ("compare", {**INITIAL_POSE_SOURCES, **RESIDUAL_SOURCES, **BACKENDS}),
-        ("simulate", LIDAR_MODELS),
+        ("simulate", {**LIDAR_MODELS, **SCENES, **BODIES, **SCANNERS, **IMU_GRADES}),
     ],
 )
 def test_help_lists_all_choices(command, names):

@@ -21,12 +21,14 @@ class Scene:
         way: ``(N, 3)`` corners of the way, on the floor. It is as long as was asked for, or closed.
         closed: whether the way ends where it begins.
         headroom_m: height of the lowest ceiling over the way; infinite outdoors.
+        speed_m_s: limit for fast bodies.
     """
 
     mesh: Mesh
     way: Array
     closed: bool
     headroom_m: float = np.inf
+    speed_m_s: float = np.inf
 
     def rays(self) -> RayScene:
         """Build the ray-casting scene."""
