@@ -57,6 +57,7 @@ $(READY): pyproject.toml constraints.txt scripts/system-libraries.sh | $(RUN)
 	@bash scripts/system-libraries.sh $(RUN)
 	@echo 'installing hybridlio and what it needs into $(VENV) (a few minutes, once)'
 	@$(RUN) -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test]'
+	@$(RUN) -m pip install -qq --disable-pip-version-check -c constraints.txt --no-deps ouster-sdk more-itertools
 	@touch $@
 
 $(DOCS_READY): $(READY)

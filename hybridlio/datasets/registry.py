@@ -18,6 +18,7 @@ from hybridlio.datasets.imu_faults import without_spikes
 from hybridlio.datasets.kitti import odometry, raw
 from hybridlio.datasets.kitti.vertical_angle import check_angle
 from hybridlio.datasets.notes import Notes
+from hybridlio.datasets.packets import ouster, velodyne
 from hybridlio.datasets.published.recording import Layout
 from hybridlio.datasets.published.table import PUBLISHED
 from hybridlio.datasets.rosbag import reader as rosbag
@@ -74,6 +75,12 @@ READERS: dict[str, Reader] = {  # tried in this order, layouts that are special 
     ),
     "folder": Reader(
         folder.LAYOUT, folder.find, lambda p, o: folder.open_folder(p, o.raw_root, o.vertical_angle_deg, o.rate_hz)
+    ),
+    "ouster": Reader(
+        ouster.LAYOUT, ouster.find, lambda p, o: ouster.open_recording(p, o.vertical_angle_deg), ouster.SUFFIXES
+    ),
+    "velodyne": Reader(
+        velodyne.LAYOUT, velodyne.find, lambda p, o: velodyne.open_capture(p, o.vertical_angle_deg), velodyne.SUFFIXES
     ),
     "rosbag": Reader(
         rosbag.LAYOUT,

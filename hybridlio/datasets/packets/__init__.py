@@ -1,0 +1,1 @@
+"""Readers of lidars' raw packets, by the vendors' libraries, which are extras."""

@@ -1,0 +1,108 @@
+"""Captures of raw packets, on real ones: points, times and IMU as the vendors' libraries decode them."""
+
+from __future__ import annotations
+
+import pickle
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybridlio.core.errors import DataError
+from hybridlio.datasets import open_sequence
+from hybridlio.datasets.registry import locate
+
+
+@pytest.fixture
+def lidars(shared_data: Path) -> Path:
+    return shared_data / "other_lidars"
+
+
+OUSTER = "OS-1-128_v2.3.0_1024x10_lb_n3.pcap"
+VELODYNE = {"sample_velodyne_vlp16_gps.pcap": (4, 16), "sample_velodyne_hdl32.pcap": (3, 32)}
+
+
+def test_an_ousters_packets_give_the_scans_and_samples_that_were_exported_from_them(lidars: Path) -> None:
+    pytest.importorskip("ouster.sdk")
+    assert locate(lidars / OUSTER)[0] == "ouster"
+    sequence, exported = open_sequence(lidars / OUSTER), open_sequence(lidars / "ouster_os1_128_imu")
+    np.testing.assert_array_equal(sequence.stamps_ns, exported.stamps_ns)
+    np.testing.assert_array_equal(sequence.imu.stamps_ns, exported.imu.stamps_ns)
+    np.testing.assert_allclose(sequence.imu.gyro_rad_s, exported.imu.gyro_rad_s, atol=1e-6)
+    np.testing.assert_allclose(sequence.imu.accel_m_s2, exported.imu.accel_m_s2, atol=1e-5)
+    np.testing.assert_allclose(sequence.calibration.T_imu_lidar, exported.calibration.T_imu_lidar, atol=1e-6)
+    for k in range(3):
+        ours, theirs = sequence[k].scan, exported[k].scan
+        assert len(ours) == len(theirs)
+        order, other = (np.lexsort(scan.points.T) for scan in (ours, theirs))
+        np.testing.assert_allclose(ours.points[order], theirs.points[other], atol=1e-3)
+        assert ours.time_offsets_ns is not None
+        assert theirs.time_offsets_ns is not None
+        assert np.ptp(ours.time_offsets_ns) == np.ptp(theirs.time_offsets_ns)
+
+
+@pytest.mark.parametrize("name", VELODYNE)
+def test_a_velodynes_packets_give_one_scan_a_turn(lidars: Path, name: str) -> None:
+    pytest.importorskip("velodyne_decoder")
+    assert locate(lidars / name)[0] == "velodyne"
+    sequence = open_sequence(lidars / name)
+    scans, beams = VELODYNE[name]
+    assert len(sequence) == scans
+    steps = np.diff(sequence.stamps_ns[:-1]) / 1e9
+    np.testing.assert_allclose(steps, 0.1, atol=0.02)
+    for frame in sequence:
+        x, y, z = frame.scan.points.T
+        elevations = np.degrees(np.arctan2(z, np.hypot(x, y)))
+        assert len(np.unique(np.round(elevations))) <= 2 * beams
+        assert frame.scan.time_offsets_ns is not None
+        assert -0.12e9 < frame.scan.time_offsets_ns.min() < 0
+
+
+@pytest.mark.parametrize("name", [OUSTER, *VELODYNE])
+def test_scans_load_in_any_order_and_in_other_processes(lidars: Path, name: str) -> None:
+    pytest.importorskip("ouster.sdk" if name == OUSTER else "velodyne_decoder")
+    sequence = open_sequence(lidars / name)
+    last = len(sequence) - 1
+    forwards = [sequence[k].scan.points for k in range(len(sequence))]
+    copy = pickle.loads(pickle.dumps(sequence))
+    for k in (last, 0, 1, last):
+        np.testing.assert_array_equal(copy[k].scan.points, forwards[k])
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "remedy"),
+    [
+        (OUSTER, "ouster", "pip install --no-deps ouster-sdk more-itertools"),
+        (next(iter(VELODYNE)), "velodyne_decoder", r"pip install 'hybridlio\[velodyne\]'"),
+    ],
+)
+def test_without_the_library_one_line_says_what_to_install(
+    lidars: Path, monkeypatch: pytest.MonkeyPatch, name: str, module: str, remedy: str
+) -> None:
+    for loaded in [known for known in sys.modules if known.split(".")[0] == module]:
+        monkeypatch.delitem(sys.modules, loaded)
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(DataError, match=remedy) as caught:
+        open_sequence(lidars / name)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", [OUSTER, *VELODYNE])
+def test_a_truncated_capture_gives_the_turns_before_its_end_or_one_error(
+    lidars: Path, tmp_path: Path, name: str
+) -> None:
+    pytest.importorskip("ouster.sdk" if name == OUSTER else "velodyne_decoder")
+    whole = open_sequence(lidars / name)
+    path = tmp_path / name
+    shutil.copyfile(lidars / name, path)
+    for file in lidars.glob("OS*.json"):
+        shutil.copyfile(file, tmp_path / file.name)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    cut = open_sequence(path)
+    assert 0 < len(cut) <= len(whole)
+    np.testing.assert_array_equal(cut[0].scan.points, whole[0].scan.points)
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(DataError, match=name.replace(".", r"\.")):
+        open_sequence(path)
