@@ -21,6 +21,7 @@ _MAX_RATE_RAD_S = 6.0  # 95 % quantile; a turn per second is beyond vehicles and
 _NO_RATE_RAD_S = 35.0  # 95 % quantile: 2000 °/s, the full scale of usual gyroscopes, so the unit is °/s
 ONE_G = (0.8, 1.25)  # of the median force: gravity in g, and some motion
 _STEPS_NS = (500_000, 400_000_000)  # between samples, 2.5 Hz to 2 kHz: units are 1000 apart, so at most one fits
+_IMPOSSIBLE = 1e6  # in m/s² or rad/s, and in units that are mistaken for them: damaged numbers, which would overflow
 _EXPECTED = (
     "a time (stamp_ns, t_s, timestamp …), gx gy gz (rad/s; or gx_deg_s …) and ax ay az (m/s²; or ax_g …), or the names "
     "of ROS or EuRoC"
@@ -97,6 +98,7 @@ def _stamps(path: Path, times: list[int | Decimal], columns: ImuColumns, header:
         raise DataError(f"{path}: a time is beyond the range of int64 nanoseconds; check its unit") from None
 
 
+@np.errstate(over="ignore")  # damaged files hold any number
 def _in_si_units(path: Path, values: Array, columns: ImuColumns, notes: Notes) -> Array:
     """Return the values in rad/s and m/s², where the header gives no unit and the values leave no doubt."""
     finite = values[np.isfinite(values).all(axis=1)]
@@ -132,7 +134,7 @@ def clean_imu(source: str, stamps: Stamps, values: Array, notes: Notes) -> ImuSa
     Raises:
         DataError: no sample is finite.
     """
-    finite = np.isfinite(values).all(axis=1)
+    finite = (np.abs(values) < _IMPOSSIBLE).all(axis=1)  # False for NaN
     if not finite.any():
         raise DataError(f"{source}: no row of finite values")
     if not finite.all():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from bisect import bisect_left
 from collections.abc import Callable
 from decimal import Decimal, InvalidOperation
@@ -34,7 +35,12 @@ def _iso_ns(text: str) -> int:
     if not _YEARS[0] <= int(date[:4]) <= _YEARS[1]:
         raise OverflowError
     east_ns = int(f"{sign}1") * (60 * int(hours) + int(minutes)) * 60 * NS_PER_S if sign != "0" else 0
-    return int(np.datetime64(date.replace(" ", "T"), "ns").astype(np.int64)) - east_ns
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)  # NumPy warns of what it takes for the name of a time zone
+        try:
+            return int(np.datetime64(date.replace(" ", "T"), "ns").astype(np.int64)) - east_ns
+        except UserWarning:
+            raise ValueError from None
 
 
 def seconds_ns(text: str) -> int:

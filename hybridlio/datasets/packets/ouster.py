@@ -5,7 +5,6 @@ Points are in the sensor's frame; where its IMU is comes from the sensor's own m
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +96,7 @@ def open_recording(path: Path, vertical_angle_deg: float | None = None) -> Seque
     with decoding(path):
         imu, T_imu_sensor = _imu(path, notes)
     times = StatedTimes("t", "ns", "stamp")
-    return packet_sequence(path, partial(read_turns), times, imu, T_imu_sensor, notes, vertical_angle_deg)
+    return packet_sequence(path, read_turns, times, imu, T_imu_sensor, notes, vertical_angle_deg)
 
 
 def _imu(path: Path, notes: Notes) -> tuple[ImuSamples, Array]:

@@ -19,7 +19,7 @@ from hybridlio.datasets.imu_mounting import note_mounting, on_scans_clock
 from hybridlio.datasets.kitti.vertical_angle import raised
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.points.fields import Columns
-from hybridlio.datasets.points.point_format import PointFormat, StatedFormat, learn_format
+from hybridlio.datasets.points.point_format import PointFormat, learn_format
 from hybridlio.datasets.points.point_times import StatedTimes
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.datasets.stamps import SCAN_GAP_FACTOR, note_coverage, note_gaps, usable_scans
@@ -118,14 +118,12 @@ def packet_sequence(
     stated = read_calibration_yaml(path.parent / "calibration.yaml")
     T = stated.calibration.T_imu_lidar if "T_imu_lidar" in stated.keys else T_imu_lidar
     if len(imu):
-        imu = on_scans_clock(imu, stated.imu_time_offset_ns, notes)
+        imu = on_scans_clock(imu, stated.imu_time_offset_s, notes)
         note_mounting(imu, T, notes)
     note_coverage(imu.stamps_ns, stamps, "inertial data", notes)
     scans = StreamedScans(path, turns, stamps, rows)
     points = replace(stated.format, times=stated.format.times or times)
-    scans.format = learn_format(
-        stamps, scans.columns, notes, StatedFormat(points.times, points.limits_m, points.vehicle)
-    )
+    scans.format = learn_format(stamps, scans.columns, notes, points)
     return Sequence(
         name=path.stem,
         stamps_ns=stamps,
@@ -134,5 +132,6 @@ def packet_sequence(
         calibration=Calibration(T, stated.calibration.T_camera_lidar, stated.calibration.antenna_imu_m),
         lidar=stated.lidar,
         imu_noise=stated.imu_noise,
+        imu_time_offset_s=stated.imu_time_offset_s,
         notes=tuple(notes.texts),
     )

@@ -11,15 +11,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.points.tables import read_arrow
 from hybridlio.datasets.published.recording import Layout, Recording
-from hybridlio.datasets.published.text import in_order, numbered_files, stamps_of_names
+from hybridlio.datasets.published.text import in_order, numbered_files, poses_of, stamps_of_names
 
 _POSE = ("qx", "qy", "qz", "qw", "tx_m", "ty_m", "tz_m")
 
@@ -51,10 +49,7 @@ def _poses(file: Path, notes: Notes) -> tuple[Stamps, Array]:
     stamps = columns["timestamp_ns"]
     if stamps.dtype.kind not in "iu" or not len(stamps):
         raise DataError(f"{file}: timestamp_ns must be whole nanoseconds")
-    if not np.isfinite(values).all() or not values[:, :4].any(axis=1).all():
-        raise DataError(f"{file}: expected finite numbers and quaternions that are not zero")
-    poses = se3.make(Rotation.from_quat(values[:, :4]).as_matrix(), values[:, 4:])
-    return in_order(stamps.astype(np.int64), poses, str(file), notes)
+    return in_order(stamps.astype(np.int64), poses_of(values[:, 4:], values[:, :4], str(file)), str(file), notes)
 
 
 LAYOUT = Layout("Argoverse 2: a log's folder with sensors/lidar/", _is_log, _gather)

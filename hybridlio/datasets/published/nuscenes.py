@@ -12,9 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import ImuSamples
@@ -22,7 +20,7 @@ from hybridlio.datasets.imu_csv import clean_imu
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.points.bin_layout import BinLayout
 from hybridlio.datasets.published.recording import Layout, Recording
-from hybridlio.datasets.published.text import US, in_order
+from hybridlio.datasets.published.text import US, in_order, poses_of
 
 _LAYOUT = BinLayout(tuple((name, "<f4") for name in ("x", "y", "z", "intensity", "ring")))
 _TEXTS = ("token", "name", "filename")  # ends of the names of columns that hold texts
@@ -107,9 +105,7 @@ def _pose_by_token(path: Path, tokens: set[Any]) -> dict[Any, Array]:
         if row["token"] not in tokens:
             continue
         quaternion, position = _numbers(path, row["rotation"], 4), _numbers(path, row["translation"], 3)
-        if not quaternion.any():
-            raise DataError(f"{path}: the rotation of {row['token']} is zero")
-        poses[row["token"]] = se3.make(Rotation.from_quat(np.roll(quaternion, -1)).as_matrix(), position)
+        (poses[row["token"]],) = poses_of(position[None], np.roll(quaternion, -1)[None], f"{path}: {row['token']}")
     return poses
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,6 @@ from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.points.bin_layout import BinLayout
 from hybridlio.datasets.points.fields import Columns
 from hybridlio.datasets.points.point_files import open_point_files
-from hybridlio.datasets.points.point_format import StatedFormat
 from hybridlio.datasets.points.point_times import StatedTimes
 from hybridlio.datasets.reference import poses_at
 from hybridlio.datasets.sequence import Sequence
@@ -114,7 +113,7 @@ def sequence_of(found: Recording, notes: Notes, vertical_angle_deg: float | None
         imu = on_scans_clock(imu, stated.imu_time_offset_s, notes)
         note_mounting(imu, mounting.T_imu_lidar, notes)
     note_coverage(imu.stamps_ns, stamps, "inertial data", notes)
-    points = StatedFormat(stated.format.times or found.times, stated.format.limits_m)
+    points = replace(stated.format, times=stated.format.times or found.times)
     scans = open_point_files(paths, stamps, notes, stated.layout or found.layout, points, found.read)
     reference = found.poses and poses_at(stamps, *found.poses, "reference poses", notes)
     return Sequence(

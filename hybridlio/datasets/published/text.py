@@ -15,6 +15,7 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import ImuSamples
 from hybridlio.datasets.imu_csv import clean_imu
 from hybridlio.datasets.notes import Notes
+from hybridlio.datasets.rosbag.transforms import MIN_NORM
 from hybridlio.datasets.stamps import sorted_unique
 
 US = 1000  # nanoseconds
@@ -127,10 +128,21 @@ def read_poses(
         DataError: the table is malformed, or a quaternion is zero.
     """
     times, values = read_table(path, time, range(first, first + 7))
-    if not np.isfinite(values).all() or not values[:, 3:].any(axis=1).all():
-        raise DataError(f"{path}: expected finite numbers and quaternions that are not zero")
-    poses = se3.make(Rotation.from_quat(values[:, 3:]).as_matrix(), values[:, :3])
+    poses = poses_of(values[:, :3], values[:, 3:], str(path))
     return in_order(stamps_of(path, times, unit_ns), poses, str(path), notes)
+
+
+def poses_of(positions: Array, quaternions_xyzw: Array, what: str) -> Array:
+    """Return poses ``(N, 4, 4)`` from positions ``(N, 3)`` and quaternions ``(N, 4)``.
+
+    Raises:
+        DataError: a number is not finite, or a quaternion is zero.
+    """
+    largest = np.abs(quaternions_xyzw).max(axis=1, initial=0)
+    finite = np.isfinite(positions).all() and np.isfinite(quaternions_xyzw).all()
+    if not finite or not ((largest > MIN_NORM) & (largest < 1 / MIN_NORM)).all():
+        raise DataError(f"{what}: expected finite numbers and quaternions that are not zero")
+    return se3.make(Rotation.from_quat(quaternions_xyzw).as_matrix(), positions)
 
 
 def read_matrices(path: Path, notes: Notes, unit_ns: int) -> tuple[Stamps, Array]:

@@ -84,14 +84,14 @@ class Bag:
         """
         self.path, parts = path, bag_files(path)
         self.is_ros2 = parts[0].suffix != ROS_1
-        with readable(path):
-            self._reader = _open(parts)
-        weakref.finalize(self, _close, self._reader)
         self._connections: dict[str, list[Any]] = {}
         self._types: dict[str, str] = {}
-        for connection in self._reader.connections:
-            self._connections.setdefault(connection.topic, []).append(connection)
-            self._types[connection.topic] = connection.msgtype
+        with readable(path):
+            self._reader = _open(parts)
+            weakref.finalize(self, _close, self._reader)
+            for connection in self._reader.connections:
+                self._connections.setdefault(connection.topic, []).append(connection)
+                self._types[connection.topic] = connection.msgtype
         seconds = max(self._reader.duration, 1) / NS_PER_S
         counts = {name: sum(c.msgcount for c in found) for name, found in self._connections.items()}
         self.topics = {

@@ -91,6 +91,7 @@ def note_clocks(lidar: Log, imu: Log, notes: Notes) -> None:
         )
 
 
+@np.errstate(over="ignore")  # damaged files hold any bits
 def imu_samples(log: Log, topic: str, notes: Notes) -> ImuSamples:
     """Return the samples of a log of angular velocity and specific force, sorted; corrections are noted.
 

@@ -15,6 +15,8 @@ from hybridlio.core.errors import DataError
 # joint, or the vehicle's motion.
 _MAX_SHIFT_M, _MAX_TURN_RAD = 1e-3, 2e-3
 
+MIN_NORM = 1e-6  # of a quaternion: a rotation's is 1, and float32 leaves six digits of it
+
 
 @dataclass
 class _Edge:
@@ -94,7 +96,7 @@ def pose_of(translation: Any, rotation: Any, name: str) -> Array:
 
     position = np.array([translation.x, translation.y, translation.z])
     quaternion = np.array([rotation.x, rotation.y, rotation.z, rotation.w])
-    if not np.isfinite([*position, *quaternion]).all() or not quaternion.any():
+    if not np.isfinite([*position, *quaternion]).all() or not MIN_NORM < np.abs(quaternion).max() < 1 / MIN_NORM:
         raise DataError(f"{name}: expected finite numbers and a quaternion that is not zero")
     return se3.make(Rotation.from_quat(quaternion).as_matrix(), position)
 
