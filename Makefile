@@ -7,12 +7,14 @@ DEMO ?= demo
 DEMO_SECONDS ?= 60
 ARGS ?=
 FUZZ ?=
+SOAK ?= soak
+KILLS ?= 60
 
 RUN := $(VENV)/bin/python
 READY := $(VENV)/.stamp-ready
 DOCS_READY := $(VENV)/.stamp-docs
 
-.PHONY: help demo test fuzz lint format types docs clean
+.PHONY: help demo test fuzz lint format types docs soak audit clean
 
 help:
 	@echo 'make demo     simulate a drive, run the odometry, smooth, evaluate, report   (DEMO_SECONDS=60 DEMO=demo)'
@@ -21,6 +23,8 @@ help:
 	@echo 'make lint     ruff: rules and format        make format   apply both'
 	@echo 'make types    mypy, strict, on all packages'
 	@echo 'make docs     build the documentation into site/, strictly'
+	@echo 'make soak     kill six commands at random moments and compare their results   (KILLS=60 SOAK=soak)'
+	@echo 'make audit    known vulnerabilities and licences of the dependencies'
 	@echo 'make clean    remove the environment and everything that was built'
 
 demo: $(READY)
@@ -45,6 +49,14 @@ types: $(READY)
 
 docs: $(DOCS_READY)
 	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet
+
+soak: $(READY)
+	$(RUN) benchmarks/kills.py '$(SOAK)' --kills $(KILLS)
+
+audit: $(READY)
+	@$(RUN) -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[audit]'
+	$(RUN) -m pip_audit --skip-editable --desc off
+	$(RUN) scripts/licences.py
 
 clean:
 	rm -rf $(VENV) build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage

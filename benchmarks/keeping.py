@@ -17,9 +17,9 @@ from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import part_of
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.odometry import Odometry
-from hybridlio.runs.keeper import Keeper
-from hybridlio.runs.kept import resume_run
 from hybridlio.runs.run import Run, finish_run
+from hybridlio.runs.unfinished.keeper import Keeper
+from hybridlio.runs.unfinished.kept import resume_run
 from hybridlio.runs.whole_folder import JOURNAL, STATE
 
 

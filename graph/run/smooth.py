@@ -13,7 +13,7 @@ from gtsam.symbol_shorthand import B, G, V, X
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.errors import GraphError
+from hybridlio.core.errors import ConfigError, GraphError
 from hybridlio.core.estimates import State
 from hybridlio.core.progress import Progress
 from hybridlio.core.trajectory import Trajectory
@@ -70,9 +70,11 @@ def smooth(
     Raises:
         GraphError: the graph cannot be solved.
         EstimationError: too few fixes lie in the run's time.
-        ConfigError: an unknown robust method.
+        ConfigError: an unknown robust method, or something else than a record.
         DataError: loops are asked for, and the record has no keyframes.
     """
+    if not isinstance(record, Record):
+        raise ConfigError(f"smooth takes a Record, got {type(record).__name__}; Record.load(path) reads a run's")
     report, robust = progress or _silent, check_robust_method(robust)  # checked before the long search for loops
     fixes = [GpsGroup(record, gps if isinstance(gps, GpsOptions) else GpsOptions())] if gps else []
     added = AddedGroups([*fixes, *_with_loops(groups, record, loops, report)], robust)

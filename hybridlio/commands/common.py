@@ -93,6 +93,9 @@ Check = Annotated[
     ),
 ]
 Frames = Annotated[str | None, typer.Option("--frames", metavar="A:B", help="Use scans A to B-1 only, counted from 0.")]
+Start = Annotated[int | None, typer.Option("--start", metavar="N", min=0, help="Leave out the first N scans.")]
+ScanCount = Annotated[int | None, typer.Option("--n-scans", "-n", metavar="N", min=1, help="Use N scans at most.")]
+Every = Annotated[int, typer.Option("--every", "--jump", metavar="N", min=1, help="Use one scan in N.")]
 InitialPoseName = Annotated[
     str | None,
     typer.Option("--initial-pose", metavar="NAME", help=f"Source of initial poses: {', '.join(INITIAL_POSE_SOURCES)}."),
@@ -234,6 +237,20 @@ def check_data(recording: Sequence, check: bool) -> Sequence:
 
     with progress("checking the IMU") as report:
         return check_recording(recording, report)
+
+
+def range_of(frames: str | None, start: int | None, count: int | None) -> str | None:
+    """Return the range of scans in which ``--frames``, or ``--start`` and ``--n-scans``, leave the recording.
+
+    Raises:
+        ConfigError: both are given.
+    """
+    if start is None and count is None:
+        return frames
+    if frames is not None:
+        raise ConfigError("--frames and --start or --n-scans choose the scans both; give one of them")
+    first = start or 0
+    return f"{first}:{'' if count is None else first + count}"
 
 
 def load_settings(config: Path | None, **names: str | None) -> Config:

@@ -36,6 +36,9 @@ def odometry(
     backend: common.BackendName = None,
     config: common.ConfigFile = None,
     frames: common.Frames = None,
+    start: common.Start = None,
+    n_scans: common.ScanCount = None,
+    every: common.Every = 1,
     vertical_angle: common.VerticalAngle = None,
     rate: common.Rate = None,
     check: common.Check = True,
@@ -64,7 +67,8 @@ def odometry(
         raise ConfigError("--resume needs -o, the folder of the run that is to go on, and no --overwrite")
     chosen = common.load_settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
     estimator = Odometry(config=chosen)  # report unknown names before the recording is opened
-    recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle, topics, rate)
+    frames = common.range_of(frames, start, n_scans)
+    recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle, topics, rate).every(every)
     adapted = adapt_config(recording, chosen, is_explicit=initial_pose is not None or config is not None)
     if adapted != chosen:
         chosen, estimator = adapted, Odometry(config=adapted)
@@ -76,9 +80,9 @@ def odometry(
 
 def _run(part: Path, recording: Sequence, config: Config, estimator: Odometry, resume: bool) -> Run:
     """Run the odometry, or go on with a run, and keep its estimates in the hidden folder ``part``."""
-    from hybridlio.runs.keeper import Keeper
-    from hybridlio.runs.kept import resume_run
     from hybridlio.runs.run import Run, finish_run
+    from hybridlio.runs.unfinished.keeper import Keeper
+    from hybridlio.runs.unfinished.kept import resume_run
 
     run, length = resume_run(part, recording, config, estimator) if resume else (Run(recording, estimator), 0)
     if resume:

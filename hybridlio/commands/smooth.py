@@ -53,8 +53,8 @@ def smooth(
     from hybridlio.record.loop_keyframes import LoopKeyframes
     from hybridlio.record.record import Record
     from hybridlio.runs.folder import KEYFRAMES, RECORD, SMOOTHED, is_run_folder, read_run
-    from hybridlio.runs.kept import read_unfinished
     from hybridlio.runs.new_folder import new_run_folder
+    from hybridlio.runs.unfinished.kept import read_unfinished
     from hybridlio.runs.whole_folder import JOURNAL, partial_folder
     from hybridlio.runs.write import write_smoothed
 

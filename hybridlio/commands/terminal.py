@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import io
 import logging
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -51,7 +53,13 @@ def print_warning(text: str) -> None:
 
 
 def set_up_logging(verbosity: int) -> None:
-    """Print the library's log to stderr: warnings; from 1 on also information; from 2 on also debugging output."""
+    """Print the library's log to stderr: warnings; from 1 on also information; from 2 on also debugging output.
+
+    What the terminal's encoding lacks, such as the bytes of a name that is not UTF-8, is printed as an escape.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     logger = logging.getLogger("hybridlio")
     for handler in [h for h in logger.handlers if isinstance(h, _Handler)]:
         logger.removeHandler(handler)

@@ -33,6 +33,8 @@ def user_path(path: str | os.PathLike[str]) -> Path:
     Raises:
         DataError: it is no path on any system: it has a NUL character, is too long, or names an unknown user.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise DataError(f"expected a path, got {type(path).__name__} {path!r:.40}")
     text = os.fspath(path)
     if "\0" in text:
         raise DataError(f"{_shortened(text)!r}: a path cannot contain a NUL character")
@@ -145,11 +147,13 @@ def remove_leftovers(path: Path) -> None:
 def write_atomically(path: str | os.PathLike[str], data: bytes | str) -> None:
     """Write ``data`` (text as UTF-8, newlines unchanged) to ``path`` completely or not at all.
 
+    The bytes of a folder's name that are not UTF-8 are written as escapes such as ``\\udcff``, which JSON reads back.
+
     Raises:
         DataError: the place cannot be written to.
     """
     with atomic_path(path) as temporary:
-        temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+        temporary.write_bytes(data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data)
 
 
 def read_yaml(path: str | os.PathLike[str], error: type[HybridLioError] = DataError) -> Any:

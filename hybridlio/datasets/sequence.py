@@ -124,6 +124,27 @@ class Sequence:
             source=None if self.source is None else self.source.part(rows.start, rows.stop),
         )
 
+    def every(self, step: int) -> Sequence:
+        """Return one frame in ``step``, from the first on; all samples and fixes are kept.
+
+        Raises:
+            ConfigError: the step is below 1.
+        """
+        if step < 1:
+            raise ConfigError(f"{self.name}: one scan in {step} is none; take 1 or more")
+        if step == 1:
+            return self
+        rows, reference = slice(None, None, step), self.reference
+        return replace(
+            self,
+            stamps_ns=self.stamps_ns[rows],
+            load_scan=lambda k: self.load_scan(k * step),
+            reference=None if reference is None else Trajectory(reference.stamps_ns[rows], reference.poses[rows]),
+            forward_speed_m_s=None if self.forward_speed_m_s is None else self.forward_speed_m_s[rows],
+            source=None,  # its rows are no range
+            notes=(*self.notes, f"one scan in {step} is used"),
+        )
+
     def _scan(self, k: int) -> Scan:
         """Load scan ``k``. Whatever a library raises about a damaged file becomes a DataError, so a run bridges it."""
         try:

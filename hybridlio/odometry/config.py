@@ -8,13 +8,14 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.files import read_yaml
 from hybridlio.core.sensors import ImuNoise
 from hybridlio.core.setting_checks import SettingError
 from hybridlio.learned.source_settings import LstmSettings, NetworkResidualSettings
+from hybridlio.odometry.names import BACKENDS, INITIAL_POSES, RESIDUALS, check_name
 from hybridlio.record.loop_keyframes import LoopKeyframeSettings
 from hybridlio.sources.settings import RecentScansSettings, ScanMatchingSettings
 
@@ -51,6 +52,15 @@ class Config(BaseModel):
     network: NetworkResidualSettings = Field(default_factory=NetworkResidualSettings)
     keyframes: LoopKeyframeSettings = Field(default_factory=LoopKeyframeSettings)
 
+    @field_validator("initial_pose", "residual", "backend")
+    @classmethod
+    def _check_name(cls, name: str, info: ValidationInfo) -> str:
+        check_name(str(info.field_name).replace("_", " "), name, _SEAMS[str(info.field_name)])
+        return name
+
+
+_SEAMS = {"initial_pose": INITIAL_POSES, "residual": RESIDUALS, "backend": BACKENDS}
+
 
 def config_to_yaml(config: Config) -> str:
     """Return the configuration as YAML text for :func:`load_config`."""
@@ -78,6 +88,8 @@ def parse_config(tree: object, where: str) -> Config:
     """
     try:
         return Config.model_validate(tree)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None
     except ValidationError as error:
         wrong = "; ".join(map(_describe, error.errors()))
         raise ConfigError(f"{where}: {wrong}. `hybridlio config` prints all keys with their defaults") from None

@@ -78,6 +78,10 @@ class Odometry:
             DataError: the frame is not after the last one, or the first scan has too few points.
             ConfigError: there are IMU samples without extrinsics, or a source cannot be made with its settings.
         """
+        if not isinstance(frame, Frame):
+            raise ConfigError(
+                f"step takes a Frame, got {type(frame).__name__}; Frame(index, Scan(stamp_ns, points)) is one"
+            )
         if frame.calibration is None and len(frame.imu):
             raise ConfigError(
                 f"frame {frame.index} carries IMU samples but no calibration: set Frame.calibration (T_imu_lidar)"

@@ -1,18 +1,20 @@
 """Implementations of the three seams by name.
 
 To add one, write one function here that makes it from a :class:`~hybridlio.odometry.setup.Setup`, and one line in
-:data:`INITIAL_POSE_SOURCES`, :data:`RESIDUAL_SOURCES` or :data:`BACKENDS`. The command line then offers the name, and
+:data:`INITIAL_POSE_SOURCES`, :data:`RESIDUAL_SOURCES` or :data:`BACKENDS`, with its name in
+:mod:`hybridlio.odometry.names`. The command line then offers the name, and
 the contract tests run on it. Import the implementation inside the function: only what a run uses gets loaded, and the
 command line stays quick.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
 from hybridlio.core.errors import ConfigError, DataError
+from hybridlio.odometry import names
 
 if TYPE_CHECKING:  # the command line imports this module for the names
     from hybridlio.cloud.preparation import PreparationOptions
@@ -157,14 +159,9 @@ def check_names(initial_pose: object, residual: object, backend: object) -> None
     Raises:
         ConfigError: a name is unknown; the message lists the known ones.
     """
-    seams: tuple[tuple[str, object, Iterable[str]], ...] = (
-        ("initial pose", initial_pose, INITIAL_POSE_SOURCES),
-        ("residual", residual, RESIDUAL_SOURCES),
-        ("backend", backend, BACKENDS),
-    )
-    for seam, choice, known in seams:
-        if isinstance(choice, str) and choice not in known:
-            raise ConfigError(f"unknown {seam} {choice!r}; choose one of {', '.join(known)}")
+    names.check_name("initial pose", initial_pose, names.INITIAL_POSES)
+    names.check_name("residual", residual, names.RESIDUALS)
+    names.check_name("backend", backend, names.BACKENDS)
 
 
 def preparation_for(recipe: Recipe) -> PreparationOptions:

@@ -88,10 +88,10 @@ def _run_in(folder: Path, job: Job) -> str | None:
 
 def _run(job: Job, folder: Path) -> None:
     from hybridlio.odometry.odometry import Odometry
-    from hybridlio.runs.keeper import Keeper
-    from hybridlio.runs.kept import resume_if_same
     from hybridlio.runs.recording_check import check_recording
     from hybridlio.runs.run import adapt_config, finish_run
+    from hybridlio.runs.unfinished.keeper import Keeper
+    from hybridlio.runs.unfinished.kept import resume_if_same
     from hybridlio.runs.write import write_run_files
 
     sequence = job.recording.open()

@@ -53,7 +53,7 @@ class FrameByFrame(Protocol):
 
 
 class Keeps(Protocol):
-    """What keeps a run on the disk while it goes; :class:`hybridlio.runs.keeper.Keeper`."""
+    """What keeps a run on the disk while it goes; :class:`hybridlio.runs.unfinished.keeper.Keeper`."""
 
     def see(self, frame: Frame) -> None:
         """Take the frame that is estimated next."""

@@ -23,7 +23,7 @@ from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.files import locked, make_folder
 
 COMPLETE_MARKER = "metrics.json"  # written last
-JOURNAL, STATE = "journal.bin", "state.bin"  # of a run that is not finished; see hybridlio.runs.keeper
+JOURNAL, STATE = "journal.bin", "state.bin"  # of a run that is not finished; see hybridlio.runs.unfinished.keeper
 IsOwn = Callable[[PurePath], bool]
 
 _NEW = ".new"  # in the new of two folders while they are exchanged

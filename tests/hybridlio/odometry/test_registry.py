@@ -7,6 +7,7 @@ import pytest
 
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.sensors import Calibration, ImuNoise
+from hybridlio.odometry import names
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.registry import BACKENDS, INITIAL_POSE_SOURCES, RESIDUAL_SOURCES, check_names
 from hybridlio.odometry.setup import Setup
@@ -29,3 +30,11 @@ def test_objects_are_accepted_unchecked():
 
 def test_a_setup_without_extrinsics_uses_the_identity():
     np.testing.assert_array_equal(Setup(Config(), Calibration(), ImuNoise()).calibration.T_imu_lidar, np.eye(4))
+
+
+def test_the_configuration_knows_the_names_of_the_registry_and_no_others():
+    known = (names.INITIAL_POSES, names.RESIDUALS, names.BACKENDS)
+    assert known == (tuple(INITIAL_POSE_SOURCES), tuple(RESIDUAL_SOURCES), tuple(BACKENDS))
+    for seam in ("initial_pose", "residual", "backend"):
+        with pytest.raises(ConfigError, match=f"unknown {seam.replace('_', ' ')} 'isam2'; choose one of"):
+            Config(**{seam: "isam2"})

@@ -1,6 +1,6 @@
 """The journal of a run that is not finished: what is in it, and how the run goes on from there.
 
-:mod:`hybridlio.runs.keeper` writes it.
+:mod:`hybridlio.runs.unfinished.keeper` writes it.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from hybridlio.record.plain_values import decode
 from hybridlio.record.record import Record
 from hybridlio.record.recorder import Recorder
 from hybridlio.runs.folder import StoredRun
-from hybridlio.runs.identity import header_of, points_digest
 from hybridlio.runs.run import FrameByFrame, Run
+from hybridlio.runs.unfinished.identity import header_of, points_digest
 from hybridlio.runs.whole_folder import JOURNAL, STATE, partial_folder
 
 _log = logging.getLogger(__name__)

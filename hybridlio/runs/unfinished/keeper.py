@@ -18,8 +18,8 @@ from hybridlio.core.sensors import Frame, GpsFix, ImuSamples
 from hybridlio.odometry.config import Config
 from hybridlio.record import journal
 from hybridlio.record.plain_values import encode
-from hybridlio.runs.identity import header_of, points_digest
 from hybridlio.runs.run import Run
+from hybridlio.runs.unfinished.identity import header_of, points_digest
 from hybridlio.runs.whole_folder import JOURNAL, STATE
 
 _BLOCK_SCANS, _BLOCK_S = 50, 1.0  # what a kill may cost, whichever comes first

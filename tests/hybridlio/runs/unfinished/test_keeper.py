@@ -26,18 +26,18 @@ from hybridlio.odometry.config import Config
 from hybridlio.odometry.estimate import Estimate
 from hybridlio.odometry.odometry import Odometry
 from hybridlio.record import journal
-from hybridlio.runs import keeper as keeper_module
 from hybridlio.runs.folder import COVARIANCES, KITTI, POSES, RECORD
-from hybridlio.runs.keeper import Keeper
-from hybridlio.runs.kept import read_kept, resume_run
 from hybridlio.runs.run import Run, finish_run
+from hybridlio.runs.unfinished import keeper as keeper_module
+from hybridlio.runs.unfinished.keeper import Keeper
+from hybridlio.runs.unfinished.kept import read_kept, resume_run
 from hybridlio.runs.whole_folder import JOURNAL, STATE, partial_folder
 
 pytestmark = pytest.mark.usefixtures("without_pages", "plain_logging")
 KILLED = """
 import os, signal, sys
 from hybridlio.odometry.odometry import Odometry
-from hybridlio.runs import keeper
+from hybridlio.runs.unfinished import keeper
 keeper._BLOCK_SCANS, keeper._BLOCK_S, keeper._STATE_SHARE = 5, 1e9, 1e9  # often enough for a drive of two seconds
 step = Odometry.step
 def killed(self, frame):
@@ -128,7 +128,7 @@ def test_another_recording_or_other_settings_are_refused(
 
 
 def test_another_version_is_refused(killed: Path, sequence: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hybridlio.runs.identity.__version__", "99")
+    monkeypatch.setattr("hybridlio.runs.unfinished.identity.__version__", "99")
     with pytest.raises(ConfigError, match=r"by hybridlio .*, not 99"):
         resume_run(partial_folder(killed), sequence, Config(), Odometry())
 
