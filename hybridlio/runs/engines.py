@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # the command line imports this module for the name of an eng
 Task = tuple[Callable[..., Any], tuple[Any, ...]]
 
 LOCAL = "loky"
-_WATCH, _WATCH_S = "parent", 0.5  # name of the thread that watches the parent process, and how often it does
+_WATCH_S = 0.5  # how often a worker looks whether its parent lives
 
 
 def is_remote(name: str) -> bool:
@@ -52,7 +52,9 @@ def engine(name: str, jobs: int | None, threads: int, scheduler: str | None = No
 
     if scheduler is not None and name not in _CONNECT:
         raise ConfigError(f"the engine {name} has no scheduler; use {' or '.join(_CONNECT)}, or omit --scheduler")
-    options: dict[str, Any] = {"inner_max_num_threads": threads} if name == LOCAL else {}
+    options: dict[str, Any] = {}
+    if name == LOCAL:
+        options = {"inner_max_num_threads": threads, "initializer": _end_with_parent, "initargs": (os.getpid(),)}
     with _CONNECT.get(name, _without_cluster)(scheduler, jobs):
         try:
             config = joblib.parallel_config(backend=name, n_jobs=jobs or -1, **options)
@@ -80,22 +82,20 @@ def run_tasks(tasks: Iterable[Task]) -> Generator[Any]:
         pre_dispatch=jobs if jobs > 0 else "all",
         return_as="generator_unordered" if has_generator else "list",
     )
-    yield from parallel(joblib.delayed(_run_task)(os.getpid(), call, arguments) for call, arguments in tasks)
+    yield from parallel(joblib.delayed(call)(*arguments) for call, arguments in tasks)
 
 
-def _run_task(parent: int, call: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-    """Run a task in its process, which ends with its parent, even where that is killed."""
-    if os.getppid() == parent and not any(thread.name == _WATCH for thread in threading.enumerate()):
-        threading.Thread(target=_end_with, args=(parent,), name=_WATCH, daemon=True).start()
-    return call(*arguments)
-
-
-def _end_with(parent: int) -> None:
-    """End this process, without writing anything more, when another process has become its parent.
+def _end_with_parent(parent: int) -> None:
+    """Let this process end when its parent does, even where that is killed; called as a worker starts.
 
     Linux can do so by a signal (PR_SET_PDEATHSIG), but sends it when the parent's thread ends that had started the
     process, and joblib starts processes from several threads.
     """
+    threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+
+
+def _watch(parent: int) -> None:
+    """End this process, without writing anything more, when another process has become its parent."""
     while os.getppid() == parent:
         time.sleep(_WATCH_S)
     os.kill(os.getpid(), signal.SIGKILL)
