@@ -49,9 +49,11 @@ class Row:
 
 SURVIVED = {
     "no fault": Row(lambda sequence: sequence, 0.1),
-    "no scans for 2 s": Row(faults.no_scans(3, 5), 0.2, "20 unusable scans bridged"),
+    "no scans for 2 s": Row(faults.no_scans(3, 5), 0.2, "unusable scans bridged"),
     "no IMU for 2 s": Row(faults.no_imu(3, 5), 0.2),
     "neither for 0.5 s": Row(faults.both(faults.no_scans(3, 3.5), faults.no_imu(3, 3.5)), 1.0, "bridged"),
+    "IMU frozen for 2 s": Row(faults.frozen(3, 5), 0.2),
+    "IMU late by 100 ms": Row(faults.late(0.1), 0.2),
     "stamps of the IMU jitter by 5 ms": Row(faults.jittered(0.005), 0.2),
     "IMU saturated at 9 degrees a second": Row(faults.clipped(0.15, 9.9), 0.2),
     "IMU at 10 Hz": Row(faults.rate(10), 0.2),
@@ -70,14 +72,11 @@ SURVIVED = {
 FLAGGED = {
     "30 % of the points random": Row(faults.random_points(0.3), None, "bridged", scans=8),
     "neither scans nor IMU for 2 s": Row(faults.both(faults.no_scans(3, 5), faults.no_imu(3, 5)), None, "bridged"),
-    "IMU frozen for 2 s": Row(faults.frozen(3, 5), None, "conflict with the IMU"),
-    "IMU late by 100 ms": Row(faults.late(0.1), None, "conflict with the IMU"),
     "kidnapped": Row(faults.rearranged(lambda k: k if k < 40 else k + 20), None, "conflict with the IMU", scans=60),
     "extrinsics with swapped axes": Row(faults.extrinsics(lambda T: T @ _AXES), None, "check T_imu_lidar"),
-    "extrinsics inverted": Row(faults.extrinsics(se3.inverse), None, "differ from the IMU"),
-    "extrinsics turned by 10 degrees": Row(faults.turned_by(10), None),
+    "extrinsics inverted": Row(faults.extrinsics(se3.inverse), None, "left out, with the IMU"),
     "gyroscope in degrees a second": Row(faults.scaled(gyro=57.3), None, "bridged", scans=12),
-    "acceleration in g": Row(faults.scaled(accel=1 / 9.81), None, "check T_imu_lidar, units and clock"),
+    "acceleration in g": Row(faults.scaled(accel=1 / 9.81), None, "left out, with the IMU"),
 }
 REFUSED: dict[str, tuple[Callable[[Sequence], Sequence], str]] = {
     "repeated stamps of the IMU": (faults.repeated_stamps, "time does not increase at row 50"),
@@ -85,9 +84,14 @@ REFUSED: dict[str, tuple[Callable[[Sequence], Sequence], str]] = {
 }
 # Promises that do not hold yet, with the reason.
 MISSING = {
-    "IMU frozen for 2 s": (0.2, "samples that a driver repeats are not recognised while driving"),
-    "IMU late by 100 ms": (0.2, "the offset of the IMU's clock is not estimated while driving"),
-    "neither scans nor IMU for 2 s": (2.0, "a place lost without IMU is not found again"),
+    "extrinsics turned by 10 degrees": (
+        Row(faults.turned_by(10), 0.2),
+        "such a mounting passes unnoticed while driving; `--check` compares before a run",
+    ),
+    "neither scans nor IMU for 2 s": (
+        Row(FLAGGED["neither scans nor IMU for 2 s"].fault, 2.0),
+        "a place lost without IMU is not found again",
+    ),
 }
 
 
@@ -116,7 +120,8 @@ def outcome(drive: Sequence, caplog: pytest.LogCaptureFixture) -> Callable[[str,
             assert run.stopped is None
             assert run.done == row.scans
             warnings = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
-            _done[name] = Outcome(run, "; ".join([*notes(run)[len(drive.notes) :], *warnings]))
+            added = [line for line in notes(run)[len(drive.notes) :] if "injected fault" not in line]
+            _done[name] = Outcome(run, "; ".join([*added, *warnings]))
         return _done[name]
 
     return find
@@ -177,14 +182,16 @@ def test_data_that_cannot_be_right_are_refused(name: str, drive: Sequence) -> No
     [pytest.param(name, marks=pytest.mark.xfail(strict=True, reason=why)) for name, (_, why) in MISSING.items()],
 )
 def test_what_is_not_promised_yet(name: str, outcome: Find) -> None:
-    run = outcome(name, FLAGGED[name]).run
-    assert np.linalg.norm(errors_m(run)[:, :2], axis=1).max() < MISSING[name][0]
+    row, _ = MISSING[name]
+    run = outcome(name, row).run
+    assert row.within_m is not None
+    assert np.linalg.norm(errors_m(run)[:, :2], axis=1).max() < row.within_m
     assert off_share(run) <= _SILENT_SHARE
 
 
 def test_the_documentation_lists_every_row(project_root: Path) -> None:
     text = (project_root / "docs/reliability.md").read_text()
-    assert [name for name in (*SURVIVED, *FLAGGED, *REFUSED) if f"| {name} |" not in text] == []
+    assert [name for name in (*SURVIVED, *FLAGGED, *REFUSED, *MISSING) if f"| {name} |" not in text] == []
 
 
 def test_a_run_on_later_stamps_is_the_same(drive: Sequence) -> None:
