@@ -5,14 +5,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from hybridlio.graph.base.noise import KERNELS as KERNELS
     from hybridlio.graph.formats.load_report import LoadReport as LoadReport
     from hybridlio.graph.pose_graph import PoseGraph as PoseGraph
     from hybridlio.graph.solve.online_solver import OnlineSolver as OnlineSolver
     from hybridlio.graph.solve.solution import Solution as Solution
 
-__all__ = ["LoadReport", "OnlineSolver", "PoseGraph", "Solution"]
+__all__ = ["KERNELS", "LoadReport", "OnlineSolver", "PoseGraph", "Solution"]
 
 _MODULES = {
+    "KERNELS": "hybridlio.graph.base.noise",
     "LoadReport": "hybridlio.graph.formats.load_report",
     "OnlineSolver": "hybridlio.graph.solve.online_solver",
     "PoseGraph": "hybridlio.graph.pose_graph",

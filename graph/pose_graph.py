@@ -12,7 +12,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.graph.base.deep_stack import on_deep_stack
 from hybridlio.graph.formats.files import read_graph, write_graph
 from hybridlio.graph.formats.load_report import LoadOptions, LoadReport
-from hybridlio.graph.landmark_measurements import LandmarkMeasurements, check_free
+from hybridlio.graph.landmark_measurements import check_free
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.connectivity import components
 from hybridlio.graph.model.graph_data import PosesByKey
@@ -27,9 +27,10 @@ from hybridlio.graph.solve.online_solver import OnlineSolver
 from hybridlio.graph.solve.replay import solve_online
 from hybridlio.graph.solve.settings import ONLINE_SOLVERS, InitialMethod, InitialName, OnlineName, Settings, SolverName
 from hybridlio.graph.solve.solution import Solution
+from hybridlio.graph.user_factors import UserFactors
 
 
-class PoseGraph(LandmarkMeasurements):
+class PoseGraph(UserFactors):
     """Poses and measurements; :meth:`optimize` finds the poses that fit the measurements best.
 
     Keys are integers or ``(robot, index)``. Poses are ``(4, 4)``; covariances are ``(6, 6)`` in rad² and m², rotation
@@ -143,7 +144,7 @@ class PoseGraph(LandmarkMeasurements):
             i, j: keys; the graph must have ``i``.
             T_i_j: ``(4, 4)``.
             covariance, information, sigmas: exactly one of them, of a right perturbation of ``T_i_j``, rotation first.
-            robust: ``huber``, ``cauchy``, ``geman-mcclure`` or ``dcs``, alone or with a width in standard deviations.
+            robust: a kernel's name (``hybridlio.graph.KERNELS``), alone or with a width in standard deviations.
 
         Raises:
             DataError: not a pose, or the covariance is not symmetric positive definite.

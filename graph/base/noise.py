@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -15,7 +16,14 @@ _KERNELS: dict[str, Callable[[float], gtsam.noiseModel.mEstimator.Base]] = {
     "cauchy": gtsam.noiseModel.mEstimator.Cauchy,
     "geman-mcclure": gtsam.noiseModel.mEstimator.GemanMcClure,
     "dcs": gtsam.noiseModel.mEstimator.DCS,
+    "fair": gtsam.noiseModel.mEstimator.Fair,
+    "tukey": gtsam.noiseModel.mEstimator.Tukey,
+    "welsch": gtsam.noiseModel.mEstimator.Welsch,
+    "truncated-least-squares": gtsam.noiseModel.mEstimator.TruncatedLeastSquares,
+    "dead-zone": gtsam.noiseModel.mEstimator.L2WithDeadZone,
 }
+# all of GTSAM's; its asymmetric ones equal Cauchy and Tukey at norms, which are never negative
+KERNELS = tuple(_KERNELS)
 
 
 def gaussian(covariance: Array, name: str) -> gtsam.noiseModel.Base:
@@ -37,8 +45,13 @@ def with_kernel(model: gtsam.noiseModel.Base, kernel: str, width: float) -> gtsa
 
     Args:
         model: noise of a correct measurement.
-        kernel: ``huber``, ``cauchy``, ``geman-mcclure`` or ``dcs`` (dynamic covariance scaling).
+        kernel: one of :data:`KERNELS`; ``dcs`` is dynamic covariance scaling.
         width: norm of the whitened residual up to which a measurement counts in full.
     """
+    return gtsam.noiseModel.Robust.Create(estimator(kernel, width), model)
+
+
+def estimator(kernel: str, width: float) -> Any:
+    """Return GTSAM's M-estimator of a kernel's name."""
     # GTSAM compares DCS's parameter with the squared norm, the other kernels' with the norm
-    return gtsam.noiseModel.Robust.Create(_KERNELS[kernel](width**2 if kernel == "dcs" else width), model)
+    return _KERNELS[kernel](width**2 if kernel == "dcs" else width)

@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from hybridlio.core.errors import DataError
+from hybridlio.core.errors import DataError, GraphError
 from hybridlio.core.files import UNREADABLE_NPZ, write_atomically
 from hybridlio.core.geodesy import check_geodetic
 from hybridlio.core.sensors import ImuSamples
@@ -17,7 +17,7 @@ from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.edge_table import FORMS
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, check_key
-from hybridlio.graph.model.measurements import Factor, Kind
+from hybridlio.graph.model.measurements import CODE, Factor, Kind
 from hybridlio.graph.model.new_factors import check_vector
 from hybridlio.graph.model.noise import Noise, NoiseInput, Robust, make_noise, make_robust
 
@@ -49,6 +49,9 @@ def write_npz(data: GraphData, path: str | os.PathLike[str]) -> None:
         arrays["landmark_initial"] = data.landmarks.initial_values
     if len(data.edges):
         arrays |= {f"between_{name}": column for name, column in _edge_columns(data, key_table[:, 0]).items()}
+    code = [factor.label for factor in data.other_factors.values() if factor.kind in CODE]
+    if code:
+        raise GraphError(f"{path}: {code[0]} and {len(code) - 1} more are a user's code, which no file holds")
     for kind in get_args(Kind):
         of_kind = {factor_id: factor for factor_id, factor in data.other_factors.items() if factor.kind == kind}
         if of_kind:

@@ -11,7 +11,7 @@ from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.connectivity import components, groups
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, list_keys
-from hybridlio.graph.model.measurements import OBSERVATIONS, Factor
+from hybridlio.graph.model.measurements import CODE, OBSERVATIONS, VELOCITIES, Factor
 
 _MOTIONS = ("rotation about x", "rotation about y", "rotation about z", "x", "y", "z")
 # Numerical rank of the observed motions, relative to the largest singular value: far above double rounding (1e-16),
@@ -20,6 +20,7 @@ _RANK_TOLERANCE = 1e-6
 # Share of a named motion in an unobserved unit direction from which a message names it: a direction may mix all six,
 # none then has less than 1/√6 = 0.4 in its largest, and smaller shares only confuse.
 _NAMED_SHARE = 0.1
+_ROWS = {"heading": [2], "altitude": [5], "body-velocity": []}  # motions that these measure by themselves
 
 
 def check_determined(data: GraphData) -> None:
@@ -74,11 +75,12 @@ def free_motions(data: GraphData, part: list[Key]) -> list[str]:
         return []
     names = _MOTIONS if data.dimension == 3 else _MOTIONS[2:5]
     factors = [f for f in data.other_factors.values() if f.keys[0] in inside and f.kind not in ("bias", *OBSERVATIONS)]
-    if any(factor.kind == "prior" for factor in factors):
-        return []
+    if any(factor.kind in ("prior", *CODE) for factor in factors):
+        return []  # what a user's code leaves free, the solver finds
     rows = [_motion_jacobian(factor) for factor in factors]
     if data.dimension == 2 or not rows:
-        return list(names)
+        seen = "rotation about z" if any(factor.kind == "heading" for factor in factors) else ""
+        return [name for name in names if name != seen]
     jacobian = np.vstack(rows)
     # rotations move a far position by metres: scaled down, so that both halves compare in the rank below
     reach = float(np.linalg.norm(jacobian[:, :3], axis=1).max())
@@ -99,6 +101,8 @@ def _motion_jacobian(factor: Factor) -> Array:
         return np.hstack([-se3.hat(z[:3] / np.linalg.norm(z[:3])), no_shift])
     if factor.kind == "velocity":
         return np.hstack([-se3.hat(z), no_shift])
+    if factor.kind in _ROWS:
+        return np.eye(6)[_ROWS[factor.kind]]
     if factor.kind == "imu":  # gravity shows the vertical
         return np.hstack([-se3.hat(co.UP), no_shift])
     return np.eye(6)
@@ -112,7 +116,7 @@ def _check_velocities(data: GraphData) -> None:
     others = data.other_factors.values()
     if not any(factor.kind == "imu" for factor in others):
         return
-    with_velocity = {f.keys[0] for f in others if f.kind == "velocity"}
+    with_velocity = {f.keys[0] for f in others if f.kind in VELOCITIES}
     placed = {f.keys[0] for f in others if f.kind in ("prior", "gps")} | data.fixed
     # poses of one group have known relative positions; group 0 holds all whose position in world is known
     group_of: dict[Key, int] = {}

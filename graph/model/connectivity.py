@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -13,14 +14,15 @@ from scipy.sparse.csgraph import connected_components
 from hybridlio.core.sensors import ImuNoise
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key
-from hybridlio.graph.model.measurements import OBSERVATIONS
+from hybridlio.graph.model.measurements import CODE, OBSERVATIONS
 
 
 def group_labels(data: GraphData, kinds: Iterable[str]) -> tuple[int, NDArray[np.int32]]:
     """Return the number of groups of poses that factors of these kinds join, and each pose's group ``(N,)``."""
     index = data.index
-    joining = (f for f in data.other_factors.values() if f.kind in kinds and len(f.keys) == 2)
-    ends = np.array([[index[key] for key in f.keys] for f in joining], dtype=np.int64).reshape(-1, 2)
+    joining = (f for f in data.other_factors.values() if f.kind in kinds)
+    pairs = [(index[i], index[j]) for f in joining for i, j in pairwise(f.keys)]
+    ends = np.array(pairs, dtype=np.int64).reshape(-1, 2)
     if "between" in kinds:
         ends = np.vstack([data.edges.ends, ends])
     adjacency = coo_matrix((np.ones(len(ends)), ends.T), shape=(len(data), len(data)))
@@ -40,11 +42,11 @@ def groups(data: GraphData, kinds: Iterable[str]) -> list[list[Key]]:
 
 
 def components(data: GraphData) -> list[list[Key]]:
-    """Return the connected components over between- and IMU factors, and over shared landmarks, largest first.
+    """Return the connected components over between-, IMU and users' factors, and over shared landmarks, largest first.
 
     Two parts are joined where they share as many landmarks as determine a rigid transform: two, or three in space.
     """
-    parts = groups(data, ("between", "imu"))
+    parts = groups(data, ("between", "imu", *CODE))
     observations = [f for f in data.other_factors.values() if f.kind in OBSERVATIONS]
     if len(parts) == 1 or not observations:
         return parts

@@ -4,16 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.sensors import ImuSamples
 from hybridlio.graph.model.keys import Key
 from hybridlio.graph.model.noise import Noise, Robust
 
-Kind: TypeAlias = Literal["between", "prior", "gps", "attitude", "velocity", "bias", "imu", "point", "bearing-range"]
+Kind: TypeAlias = Literal[
+    "between", "prior", "gps", "attitude", "velocity", "bias", "imu", "point", "bearing-range", "altitude", "heading",
+    "body-velocity", "custom", "gtsam",
+]  # fmt: skip
+CODE = ("custom", "gtsam")  # of users, which no file holds
 OBSERVATIONS = ("point", "bearing-range")  # of landmarks
-VECTOR_NOISE_SIZE = {"gps": 3, "attitude": 2, "velocity": 3, "bias": 6}  # a direction has two degrees of freedom
+# a direction has two degrees of freedom
+VECTOR_NOISE_SIZE = {
+    "gps": 3, "attitude": 2, "velocity": 3, "bias": 6, "altitude": 1, "heading": 1, "body-velocity": 3,
+}  # fmt: skip
+VELOCITIES = ("velocity", "body-velocity")
+IN_OWN_ORDER = ("custom", "heading")  # residuals that are no tangent vectors, which GTSAM orders in its own way
+SCALARS = ("altitude", "heading")
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,11 +37,13 @@ class Factor:
             ``gps``: position, lever arm (6); ``attitude``: direction in world, in body (6); ``velocity``: m/s (3);
             ``bias``: accelerometer, gyroscope (6); ``imu``: the fields of
             :class:`hybridlio.core.sensors.ImuNoise` in their order (6); ``point``: a landmark in the frame of the pose
-            (d); ``bearing-range``: angle or unit direction, and range (2, in space 4).
+            (d); ``bearing-range``: angle or unit direction, and range (2, in space 4); ``altitude``: m (1);
+            ``heading``: rad (1); ``body-velocity``: m/s (3); empty for ``custom`` and ``gtsam``.
         noise: of the measurement; None for ``imu``, whose noise follows from the samples.
         robust: kernel, or None.
         samples: of an ``imu`` factor.
         landmark: key of the observed landmark, of ``point`` and ``bearing-range``.
+        code: of ``custom`` a :class:`hybridlio.graph.model.user_residual.UserResidual`, of ``gtsam`` GTSAM's factor.
     """
 
     kind: Kind
@@ -41,6 +53,7 @@ class Factor:
     robust: Robust | None = None
     samples: ImuSamples | None = None
     landmark: Key | None = None
+    code: Any = None
 
     @property
     def label(self) -> str:

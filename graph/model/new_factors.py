@@ -13,7 +13,7 @@ from hybridlio.core.sensors import ImuNoise, ImuSamples
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, check_key
-from hybridlio.graph.model.measurements import VECTOR_NOISE_SIZE, Factor, Kind, factor_label
+from hybridlio.graph.model.measurements import SCALARS, VECTOR_NOISE_SIZE, Factor, Kind, factor_label
 from hybridlio.graph.model.noise import NoiseInput, RobustLike, make_noise, make_robust
 
 
@@ -55,13 +55,13 @@ def _pose_factor(
 def vector_factor(
     data: GraphData, kind: Kind, key: Key, vectors: tuple[ArrayLike, ...], noise: NoiseInput, robust: RobustLike = None
 ) -> Factor:
-    """Return a GPS, attitude, velocity or bias factor of one pose.
+    """Return a factor of one pose that measures vectors or a number.
 
     Args:
         data: the graph.
-        kind: ``gps``, ``attitude``, ``velocity`` or ``bias``.
+        kind: one of :data:`VECTOR_NOISE_SIZE`.
         key: of the pose.
-        vectors: what is measured, ``(3,)`` each, in the order of :class:`Factor`'s ``measured``.
+        vectors: what is measured, ``(3,)`` each, or ``(1,)``, in the order of :class:`Factor`'s ``measured``.
         noise: of the measurement.
         robust: kernel.
 
@@ -71,8 +71,9 @@ def vector_factor(
     """
     name, size = factor_label(kind, (key,)), VECTOR_NOISE_SIZE[kind]
     (key,) = data.known_keys(key, what=name)
-    data.require_space(name)
-    measured = np.concatenate([check_vector(vector, 3, name) for vector in vectors])
+    if kind != "heading":
+        data.require_space(name)
+    measured = np.concatenate([check_vector(vector, 1 if kind in SCALARS else 3, name) for vector in vectors])
     return Factor(kind, (key,), measured, make_noise(name, size, noise), make_robust(robust, size, name))
 
 

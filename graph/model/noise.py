@@ -13,10 +13,10 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.chi_square import chi_square_quantile
 from hybridlio.core.covariance import check_covariance
 from hybridlio.core.errors import ConfigError, DataError, GraphError
+from hybridlio.graph.base.noise import KERNELS, estimator
 
 Form: TypeAlias = Literal["covariance", "information", "sigmas"]
 
-KERNELS = ("huber", "cauchy", "geman-mcclure", "dcs")
 _INLIER_SHARE = 0.95  # of good measurements that stay within a kernel's width; the usual 5 % significance level
 
 
@@ -105,25 +105,11 @@ class Robust:
 
     def loss(self, squared: float) -> float:
         """Return the kernel's replacement for χ², that is twice its share of the error, at a squared residual norm."""
-        c = self.width**2
-        if self.kernel == "huber":
-            return squared if squared <= c else 2 * self.width * float(np.sqrt(squared)) - c
-        if self.kernel == "cauchy":
-            return c * float(np.log1p(squared / c))
-        if self.kernel == "geman-mcclure":
-            return c * squared / (c + squared)
-        return squared if squared <= c else 4 * c * squared / (c + squared) - c
+        return 2 * float(estimator(self.kernel, self.width).loss(np.sqrt(squared)))
 
     def weight(self, norm: float) -> float:
         """Return the factor, 0 to 1, by which the kernel scales the information at a whitened residual norm."""
-        share = (norm / self.width) ** 2
-        if self.kernel == "huber":
-            return min(1.0, self.width / norm) if norm > 0 else 1.0
-        if self.kernel == "cauchy":
-            return 1 / (1 + share)
-        if self.kernel == "geman-mcclure":
-            return 1 / (1 + share) ** 2
-        return 1.0 if share <= 1 else (2 / (1 + share)) ** 2
+        return float(estimator(self.kernel, self.width).weight(norm))
 
 
 RobustLike: TypeAlias = "str | tuple[str, float] | Robust | None"

@@ -24,8 +24,10 @@ from hybridlio.graph.model.connectivity import InertialChain, chains_without_bia
 from hybridlio.graph.model.edge_table import FORMS
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key
-from hybridlio.graph.model.measurements import OBSERVATIONS, Factor
+from hybridlio.graph.model.measurements import IN_OWN_ORDER, OBSERVATIONS, Factor
 from hybridlio.graph.model.noise import Robust
+from hybridlio.graph.model.user_residual import altitude, heading
+from hybridlio.graph.solve.custom_factors import body_velocity_factor, custom_factor
 from hybridlio.graph.solve.landmark_factors import initial_landmarks, insert_landmarks, observation
 
 BiasAt: TypeAlias = Callable[[int], gtsam.imuBias.ConstantBias]
@@ -113,11 +115,19 @@ class Builder:
         """Return any factor but a between-factor."""
         if factor.kind in OBSERVATIONS:
             return observation(self.data, factor, robust)
+        if factor.kind == "gtsam":
+            return factor.code.rekey([X(self.data.index[key]) for key in factor.keys])
         model = None
         if factor.noise is not None:
             noise = factor.noise
-            model = self._model(noise.form, noise.values.tobytes(), noise.values, factor.robust if robust else None)
-        return getattr(self, f"_{factor.kind}")(factor, [self.data.index[key] for key in factor.keys], model)
+            kernel = factor.robust if robust else None
+            if factor.kind in IN_OWN_ORDER:
+                model = noise_model(noise.form, noise.values, kernel, 3)
+            else:
+                model = self._model(noise.form, noise.values.tobytes(), noise.values, kernel)
+        return getattr(self, f"_{factor.kind.replace('-', '_')}")(
+            factor, [self.data.index[key] for key in factor.keys], model
+        )
 
     def fixed_pose_prior(self, key: Key) -> Any:
         """Return the prior that holds a fixed pose at its initial value.
@@ -175,6 +185,19 @@ class Builder:
     def _velocity(self, factor: Factor, indices: list[int], model: Any) -> Any:
         return gtsam.PriorFactorVector(V(indices[0]), factor.measured, model)
 
+    def _custom(self, factor: Factor, indices: list[int], model: Any) -> Any:
+        return custom_factor(factor.code, [X(k) for k in indices], model)
+
+    def _altitude(self, factor: Factor, indices: list[int], model: Any) -> Any:
+        return custom_factor(altitude(float(factor.measured[0]), factor.label), [X(indices[0])], model)
+
+    def _heading(self, factor: Factor, indices: list[int], model: Any) -> Any:
+        residual = heading(float(factor.measured[0]), factor.label, self.data.dimension)
+        return custom_factor(residual, [X(indices[0])], model)
+
+    def _body_velocity(self, factor: Factor, indices: list[int], model: Any) -> Any:
+        return body_velocity_factor(factor.measured, X(indices[0]), V(indices[0]), model)
+
     def _bias(self, factor: Factor, indices: list[int], model: Any) -> Any:
         z = factor.measured
         return gtsam.PriorFactorConstantBias(B(indices[0]), gtsam.imuBias.ConstantBias(z[:3], z[3:]), model)
@@ -218,6 +241,8 @@ def _initial_velocities(data: GraphData, poses: Array) -> dict[int, Array]:
         indices = [data.index[key] for key in factor.keys]
         if factor.kind == "velocity":
             found[indices[0]] = factor.measured
+        elif factor.kind == "body-velocity":
+            found[indices[0]] = co.to_matrices(poses[indices[0]][None])[0, :3, :3] @ factor.measured
         elif factor.kind == "imu" and factor.samples is not None:
             dt_s = float(factor.samples.stamps_ns[-1] - factor.samples.stamps_ns[0]) / NS_PER_S
             mean = (poses[indices[1], :3] - poses[indices[0], :3]) / dt_s

@@ -13,7 +13,7 @@ from hybridlio.core.errors import GraphError
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import list_keys
-from hybridlio.graph.model.measurements import OBSERVATIONS, Factor
+from hybridlio.graph.model.measurements import OBSERVATIONS, VELOCITIES, Factor
 from hybridlio.graph.solve.builder import Builder
 from hybridlio.graph.solve.changes import Changes
 from hybridlio.graph.solve.landmark_factors import insert_landmarks, point_in_pose_frame
@@ -33,7 +33,7 @@ def determines_new_poses(data: GraphData, changes: Changes, with_velocity: set[i
     """
     index = data.index
     placed = {index[f.keys[0]] for f in changes.of_kind("prior")} | {index[key] for key in changes.fixed}
-    moving = {index[f.keys[0]] for f in changes.of_kind("velocity")} | with_velocity
+    moving = {index[f.keys[0]] for f in changes.of_kind(*VELOCITIES)} | with_velocity
     reach = _Reach(changes.poses.start, placed, moving)
     edges = data.edges.ends[changes.edge_rows].tolist()
     inertial = [(index[f.keys[0]], index[f.keys[1]]) for f in changes.of_kind("imu")]
@@ -204,9 +204,14 @@ class OnlineStart:
         if index in self._with_velocity:
             return self._solver.calculateEstimateVector(V(index))
         if index not in self._velocities:
-            for factor in self._changes.of_kind("velocity"):
-                if self._data.index[factor.keys[0]] == index:
+            for factor in self._changes.of_kind(*VELOCITIES):
+                pose = self._pose(index)
+                if self._data.index[factor.keys[0]] != index:
+                    continue
+                if factor.kind == "velocity":
                     self._velocities[index] = factor.measured
+                elif pose is not None:
+                    self._velocities[index] = pose.rotation().matrix() @ factor.measured
         return self._velocities.get(index)
 
     def _use_given(self, inertial: list[Factor]) -> None:
@@ -229,7 +234,7 @@ class OnlineStart:
         """Insert the velocities and biases that new factors bring."""
         index = self._data.index
         with_bias = {index[key] for f in self._changes.of_kind("imu", "bias") for key in f.keys}
-        with_velocity = {index[key] for f in self._changes.of_kind("imu", "velocity") for key in f.keys}
+        with_velocity = {index[key] for f in self._changes.of_kind("imu", *VELOCITIES) for key in f.keys}
         for factor in inertial:
             i, j = (index[key] for key in factor.keys)
             samples = self.builder.factor(factor).preintegratedMeasurements()

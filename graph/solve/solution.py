@@ -18,6 +18,7 @@ from hybridlio.graph.base.isam import gtsam_message, incremental_solver
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key
+from hybridlio.graph.model.measurements import CODE
 from hybridlio.graph.solve.builder import Builder
 from hybridlio.graph.solve.landmark_factors import landmark_point
 from hybridlio.graph.solve.nonlinear import SolverResult
@@ -199,11 +200,15 @@ class Solution:
         builder = Builder(self._data)
         graph = builder.graph(robust=False)
         order = np.argsort(co.GTSAM_ORDER[2]) if self._data.dimension == 2 else slice(None)
+        coded = {n for n, f in self._data.other_factors.items() if f.kind in CODE}
         found = {}
         for slot, factor_id in enumerate(builder.factor_ids()):
             factor: Any = graph.at(slot)
-            residual = np.asarray(factor.unwhitenedError(self._result.values))
-            residual = residual[order] if len(residual) > 2 else residual  # a planar observation has two components
+            has_residual = hasattr(factor, "unwhitenedError")  # some of GTSAM's have none
+            residual = np.asarray(factor.unwhitenedError(self._result.values)) if has_residual else np.zeros(0)
+            # a planar observation has two components; users' own residuals have any number, in their order
+            in_gtsams_order = len(residual) > 2 and factor_id not in coded
+            residual = residual[order] if in_gtsams_order else residual
             found[factor_id] = residual, 2 * float(factor.error(self._result.values))
         return found
 

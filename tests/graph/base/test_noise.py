@@ -3,7 +3,8 @@ import pytest
 
 from hybridlio.core.errors import DataError
 from hybridlio.graph.base import noise
-from hybridlio.graph.model.noise import KERNELS, Robust
+from hybridlio.graph.base.noise import KERNELS
+from hybridlio.graph.model.noise import Robust
 
 
 def test_the_squared_whitened_residual_is_the_mahalanobis_distance(rng: np.random.Generator):
