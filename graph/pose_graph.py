@@ -27,10 +27,10 @@ from hybridlio.graph.solve.online_solver import OnlineSolver
 from hybridlio.graph.solve.replay import solve_online
 from hybridlio.graph.solve.settings import ONLINE_SOLVERS, InitialMethod, InitialName, OnlineName, Settings, SolverName
 from hybridlio.graph.solve.solution import Solution
-from hybridlio.graph.user_factors import UserFactors
+from hybridlio.graph.whole_graphs import WholeGraph
 
 
-class PoseGraph(UserFactors):
+class PoseGraph(WholeGraph):
     """Poses and measurements; :meth:`optimize` finds the poses that fit the measurements best.
 
     Keys are integers or ``(robot, index)``. Poses are ``(4, 4)``; covariances are ``(6, 6)`` in rad² and m², rotation

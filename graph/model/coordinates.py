@@ -32,12 +32,18 @@ _PLANAR_TOLERANCE = 1e-9  # rad, m: rounding of a matrix product, far below any 
 
 
 def from_matrix(T: ArrayLike, dimension: Dimension, name: str) -> Array:
-    """Return the coordinates of one pose ``(4, 4)``; a planar graph also takes ``(3, 3)``.
+    """Return the coordinates of one pose ``(4, 4)``, or in the plane ``(3, 3)``.
+
+    GTSAM's ``Pose3`` and ``Pose2`` are taken too, and coordinates ``x y z qx qy qz qw`` or ``x y θ``.
 
     Raises:
         DataError: not a rigid transform, or out of the plane of a planar graph; the message starts with ``name``.
     """
+    if isinstance(T, gtsam.Pose3 | gtsam.Pose2):
+        T = T.matrix()
     T = np.asarray(T, dtype=np.float64)
+    if T.shape == IDENTITY[dimension].shape:
+        T = _from_coordinates(T, name)
     if dimension == 3:
         T = se3.check_pose(T, name)
         return np.concatenate([T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)])
@@ -47,6 +53,13 @@ def from_matrix(T: ArrayLike, dimension: Dimension, name: str) -> Array:
     if np.abs(T - _lift(T[_PLANAR])).max() > _PLANAR_TOLERANCE:
         raise DataError(f"{name}: the graph is planar, but the pose's z, roll or pitch is not zero")
     return np.array([T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0])])
+
+
+def _from_coordinates(values: Array, name: str) -> Array:
+    """Return the pose ``(4, 4)`` of ``x y θ``, or of ``x y z qx qy qz qw``."""
+    if not np.isfinite(values).all() or (len(values) == 7 and not values[3:].any()):
+        raise DataError(f"{name}: expected finite coordinates and a quaternion that is not zero, got {values.tolist()}")
+    return np.asarray(to_matrices(values[None])[0])
 
 
 def _lift(T: Array) -> Array:

@@ -20,7 +20,7 @@ _LISTED_KEYS = 10  # in a message, which then fits on a screen; the rest is coun
 
 
 def check_key(key: object) -> Key:
-    """Return the key as plain integers.
+    """Return the key as plain integers; ``gtsam.symbol("b", 5)`` is ``(1, 5)``.
 
     Raises:
         GraphError: neither an integer nor (robot, index), or out of range.
@@ -31,9 +31,7 @@ def check_key(key: object) -> Key:
             raise GraphError(f"key {key!r}: a robot must be at most {_LAST_ROBOT}, an index below 2**{_INDEX_BITS}")
         return robot, index
     number = _check_integer(key, key)
-    if number >= PLAIN_KEYS:
-        raise GraphError(f"key {key!r}: an integer key must be below {PLAIN_KEYS}")
-    return number
+    return number if number < PLAIN_KEYS else from_integer(number)  # a symbol of GTSAM's
 
 
 def _check_integer(value: object, key: object) -> int:
@@ -62,6 +60,8 @@ def from_integer(number: int) -> Key:
     letter = number >> _INDEX_BITS
     if letter < _FIRST_LETTER:
         return check_key(number)
+    if letter > 127:
+        raise GraphError(f"key {number}: an integer key must be below {PLAIN_KEYS}, or a symbol of GTSAM's")
     return check_key((letter - _FIRST_LETTER, number & ((1 << _INDEX_BITS) - 1)))
 
 

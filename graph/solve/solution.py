@@ -22,9 +22,10 @@ from hybridlio.graph.model.measurements import CODE
 from hybridlio.graph.solve.builder import Builder
 from hybridlio.graph.solve.landmark_factors import landmark_point
 from hybridlio.graph.solve.nonlinear import SolverResult
+from hybridlio.graph.views.solution_views import SolutionViews
 
 
-class Solution:
+class Solution(SolutionViews):
     """Poses, velocities and biases of a solved graph, and how well they fit; independent of later changes to the graph.
 
     Attributes:
@@ -71,9 +72,13 @@ class Solution:
         """Keys of all poses, in the graph's order."""
         return list(self._index)
 
-    @cached_property
+    @property
     def poses(self) -> Array:
         """All poses ``(N, 4, 4)`` in world, in the order of :attr:`keys`."""
+        return self._poses
+
+    @cached_property
+    def _poses(self) -> Array:
         return co.to_matrices(self._result.poses)
 
     @property

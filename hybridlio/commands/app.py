@@ -16,6 +16,7 @@ from hybridlio.commands.georeference import georeference
 from hybridlio.commands.info import info
 from hybridlio.commands.map import map_
 from hybridlio.commands.odometry import odometry
+from hybridlio.commands.optimize import optimize
 from hybridlio.commands.report import report
 from hybridlio.commands.simulate import simulate
 from hybridlio.commands.smooth import smooth
@@ -61,6 +62,7 @@ for _command in (
     ablate,
     config,
     view,
+    optimize,
 ):
     app.command()(_command)
 app.command("map")(map_)

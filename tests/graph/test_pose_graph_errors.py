@@ -57,7 +57,7 @@ WRONG = {
     "one IMU sample": (lambda g: g.add_imu(1, 2, samples(1)), DataError, "imu 1-2.*at least 2.*got 1"),
     "IMU without noise": (lambda g: g.add_imu(1, 2, samples(), ImuNoise(0)), DataError, "imu 1-2.*positive"),
     "unknown kernel": (
-        lambda g: g.add_between(1, 2, np.eye(4), sigmas=ONE, robust="tukey"), ConfigError, "between 1-2.*tukey"
+        lambda g: g.add_between(1, 2, np.eye(4), sigmas=ONE, robust="magic"), ConfigError, "between 1-2.*magic"
     ),
     "kernel without width": (
         lambda g: g.add_between(1, 2, np.eye(4), sigmas=ONE, robust=("huber", 0)), ConfigError, "width"

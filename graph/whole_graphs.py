@@ -1,0 +1,164 @@
+"""Work on whole graphs: copies, parts, joining, changes of what is there, and GTSAM's form."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from typing import Any, Self
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hybridlio.core import se3
+from hybridlio.core.arrays import Array
+from hybridlio.core.errors import GraphError
+from hybridlio.graph.model import coordinates as co
+from hybridlio.graph.model.graph_data import GraphData
+from hybridlio.graph.model.keys import Key, check_key, list_keys
+from hybridlio.graph.model.noise import NoiseInput, make_noise
+from hybridlio.graph.user_factors import UserFactors
+from hybridlio.graph.views.gtsam_graph import from_gtsam, to_gtsam
+
+
+class WholeGraph(UserFactors):
+    """The part of a pose graph that copies, cuts and joins graphs."""
+
+    def copy(self) -> Self:
+        """Return an independent copy; ids of factors stay."""
+        return self._of(self._data.copy())
+
+    def subgraph(self, keys: Collection[Key]) -> Self:
+        """Return the graph of some poses, and of the factors that concern them alone; ids of factors stay.
+
+        Raises:
+            GraphError: unknown key.
+        """
+        kept = set(self._data.known_keys(*keys, what="subgraph"))
+        return self._of(_part(self._data, kept))
+
+    def remove_pose(self, key: Key) -> None:
+        """Remove a pose and all factors that concern it; an online solver cannot follow this.
+
+        Raises:
+            GraphError: unknown key.
+        """
+        (known,) = self._data.known_keys(key, what="remove_pose")
+        self._data = _part(self._data, set(self._data.keys) - {known})
+
+    def set_noise(
+        self, factor_id: int, covariance: ArrayLike | None = None, *, information: ArrayLike | None = None,
+        sigmas: ArrayLike | None = None,
+    ) -> int:  # fmt: skip
+        """Replace a factor's noise; the factor gets a new id, which is returned.
+
+        Raises:
+            GraphError: unknown id, or a factor without noise of its own.
+            DataError: as for a new factor.
+        """
+        if factor_id not in self._data.factors:
+            raise GraphError(f"no factor has id {factor_id}")
+        factor = self._data.factors[factor_id]
+        if factor.noise is None:
+            raise GraphError(f"{factor.label}: its noise follows from its samples or is GTSAM's")
+        size = len(factor.noise.values)
+        changed = replace(factor, noise=make_noise(factor.label, size, NoiseInput(covariance, information, sigmas)))
+        self._data.remove(factor_id)
+        return self._data.add_factor(changed)
+
+    def merge(
+        self, other: WholeGraph, keys: Mapping[Key, Key] | None = None, T_world_other: ArrayLike | None = None
+    ) -> dict[int, int]:
+        """Add another graph's poses and factors; return the new id of each of its factors.
+
+        Args:
+            other: a graph of the same dimension, without landmarks, geodetic origin or fixed poses.
+            keys: new keys of its poses, for those that change, such as ``{k: (1, k) for k in other.keys}``.
+            T_world_other: the other graph's world in this one ``(4, 4)``, by which its initial values and priors are
+                moved; without it they are left out, and factors between the graphs place its poses. Its other factors
+                in world (GPS, attitude, velocity, altitude, heading) are left out in any case.
+
+        Raises:
+            GraphError: a key that is in use, or a graph that cannot be merged.
+        """
+        theirs, changes = other._data, {k: check_key(v) for k, v in (keys or {}).items()}
+        renamed = {key: changes.get(key, key) for key in theirs.keys}
+        _check_mergeable(self._data, theirs, list(renamed.values()))
+        T, initial = None, np.full_like(theirs.initial_values, np.nan)
+        if T_world_other is not None:
+            at = co.from_matrix(T_world_other, self._data.dimension, "T_world_other")
+            T, known = co.to_matrices(at[None])[0], ~np.isnan(theirs.initial_values[:, 0])
+            initial[known] = _moved(theirs.initial_values[known], T)
+        self._data.add_poses(list(renamed.values()), initial)
+        ids = {}
+        for factor_id, factor in theirs.factors.items():
+            if factor.kind == "prior" and T is not None:
+                factor = replace(factor, measured=_moved(factor.measured[None], T)[0])
+            elif factor.kind in _IN_WORLD:
+                continue
+            ids[factor_id] = self._data.add_factor(replace(factor, keys=tuple(renamed[key] for key in factor.keys)))
+        return ids
+
+    def to_gtsam(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """Return GTSAM's factors, and the initial values; an integer key stays, ``(robot, index)`` becomes a symbol."""
+        return to_gtsam(self._data)
+
+    @classmethod
+    def from_gtsam(cls, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Self:
+        """Return a pose graph of GTSAM's factors over poses, with GTSAM's values as initial values.
+
+        Between-factors and priors with Gaussian noise become this graph's own; all others stay GTSAM's, and cannot be
+        saved.
+
+        Raises:
+            DataError: values other than poses of one dimension, or a factor over other variables.
+        """
+        data = from_gtsam(graph, values)
+        made: Any = cls(data.dimension)
+        made._data = data
+        return made  # type: ignore[no-any-return]
+
+    def _of(self, data: GraphData) -> Self:
+        made = type(self)(data.dimension)
+        made._data = data
+        return made
+
+
+_IN_WORLD = ("prior", "gps", "attitude", "velocity", "altitude", "heading")  # they hold in the other graph's world
+
+
+def _moved(coordinates: Array, T: Array) -> Array:
+    """Return coordinates of poses seen from another world."""
+    poses = se3.orthonormalise(T @ co.to_matrices(coordinates))
+    return co.from_matrices(poses, 2 if coordinates.shape[1] == 3 else 3)
+
+
+def _part(data: GraphData, kept: set[Key]) -> GraphData:
+    """Return a graph of some poses, and of the factors that concern them alone."""
+    part, old = GraphData(data.dimension), data.index
+    order = [key for key in data.keys if key in kept]
+    part.add_poses(order, data.initial_values[[old[key] for key in order]])
+    for key in data.fixed & kept:
+        part.fix(key)
+    part.origin = data.origin
+    part.other_factors = {n: f for n, f in data.other_factors.items() if kept.issuperset(f.keys)}
+    seen = {factor.landmark for factor in part.other_factors.values()}
+    for key in data.landmarks.keys:
+        if key in seen:
+            part.landmarks.add(key, data.landmarks.initial_value(key))
+    new = np.full(len(data), -1, dtype=np.int64)
+    new[[old[key] for key in order]] = np.arange(len(order))
+    part.edges = data.edges.where(np.asarray((new[data.edges.ends] >= 0).all(axis=1)))
+    part.edges.ends[:] = new[part.edges.ends]
+    part.next_id = data.next_id
+    return part
+
+
+def _check_mergeable(ours: GraphData, theirs: GraphData, keys: list[Key]) -> None:
+    if ours.dimension != theirs.dimension:
+        raise GraphError(f"merge: one graph is {ours.dimension}D, the other {theirs.dimension}D")
+    if len(theirs.landmarks) or theirs.origin is not None or theirs.fixed:
+        raise GraphError("merge: a graph with landmarks, a geodetic origin or fixed poses cannot be added to another")
+    in_use = [key for key in keys if key in ours or key in ours.landmarks]
+    if in_use or len(set(keys)) < len(keys):
+        raise GraphError(f"merge: keys in use, or given twice: {list_keys(in_use or keys)}; give new ones by keys=")

@@ -1,0 +1,46 @@
+"""``hybridlio optimize``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hybridlio.commands.common import Verbose, guarded
+from hybridlio.commands.terminal import print_result, print_warning
+from hybridlio.core.errors import ConfigError
+
+
+@guarded
+def optimize(
+    graph: Annotated[
+        Path, typer.Argument(metavar="IN", help="The pose graph: .g2o, .graph or .npz.", show_default=False)
+    ],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="OUT", help="Where to write the solved graph.")
+    ] = None,
+    solver: Annotated[
+        str, typer.Option(metavar="NAME", help="batch, gnc (rejects wrong loops), incremental or fixed-lag.")
+    ] = "batch",
+    plot: Annotated[
+        Path | None, typer.Option(metavar="PNG", help="Where to draw it, with factors coloured by their χ².")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")] = False,
+    _verbosity: Verbose = 0,
+) -> None:
+    """Find the poses that fit a pose graph's factors best."""
+    from hybridlio.graph import PoseGraph
+
+    for path in (output, plot):
+        if path is not None and path.exists() and not overwrite:
+            raise ConfigError(f"{path} exists; give another name, or --overwrite")
+    loaded = PoseGraph.load(graph)
+    solution = loaded.optimize(solver)  # type: ignore[arg-type]  # checked by optimize
+    if output is not None:
+        loaded.save(output, solution)
+    if plot is not None:
+        solution.plot().savefig(plot, dpi=150)
+    print_result(repr(solution).strip("<>"))
+    for reason in solution.doubtful:
+        print_warning(f"doubtful: {reason}")
