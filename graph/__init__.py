@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hybridlio.graph.base.noise import KERNELS as KERNELS
+    from hybridlio.graph.base.kernels import KERNELS as KERNELS
     from hybridlio.graph.formats.load_report import LoadReport as LoadReport
     from hybridlio.graph.pose_graph import PoseGraph as PoseGraph
     from hybridlio.graph.solve.online_solver import OnlineSolver as OnlineSolver
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 __all__ = ["KERNELS", "LoadReport", "OnlineSolver", "PoseGraph", "Solution"]
 
 _MODULES = {
-    "KERNELS": "hybridlio.graph.base.noise",
+    "KERNELS": "hybridlio.graph.base.kernels",
     "LoadReport": "hybridlio.graph.formats.load_report",
     "OnlineSolver": "hybridlio.graph.solve.online_solver",
     "PoseGraph": "hybridlio.graph.pose_graph",

@@ -22,10 +22,18 @@ from hybridlio.graph.model.new_factors import between_factor, check_vector, prio
 from hybridlio.graph.model.noise import NoiseInput, RobustLike
 from hybridlio.graph.solve.batch import solve_batch
 from hybridlio.graph.solve.initial_values import find_initial_values
-from hybridlio.graph.solve.nonlinear import IterationProgress, silent
 from hybridlio.graph.solve.online_solver import OnlineSolver
 from hybridlio.graph.solve.replay import solve_online
-from hybridlio.graph.solve.settings import ONLINE_SOLVERS, InitialMethod, InitialName, OnlineName, Settings, SolverName
+from hybridlio.graph.solve.settings import (
+    ONLINE_SOLVERS,
+    InitialMethod,
+    InitialName,
+    IterationProgress,
+    OnlineName,
+    Settings,
+    SolverName,
+    silent,
+)
 from hybridlio.graph.solve.solution import Solution
 from hybridlio.graph.whole_graphs import WholeGraph
 

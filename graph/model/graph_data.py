@@ -12,7 +12,8 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
 from hybridlio.core.geodesy import GeodeticPoint
 from hybridlio.graph.model import coordinates as co
-from hybridlio.graph.model.edge_table import FORMS, EdgeTable, GrowingArray
+from hybridlio.graph.model.edge_table import FORMS, EdgeTable
+from hybridlio.graph.model.growing_array import GrowingArray
 from hybridlio.graph.model.keys import Key, check_key, list_keys
 from hybridlio.graph.model.landmarks import Landmarks
 from hybridlio.graph.model.measurements import Factor

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from hybridlio.core.arrays import Array
-from hybridlio.graph.model.edge_table import GrowingArray
+from hybridlio.graph.model.growing_array import GrowingArray
 from hybridlio.graph.model.keys import Key
 
 

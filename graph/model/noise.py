@@ -13,7 +13,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.chi_square import chi_square_quantile
 from hybridlio.core.covariance import check_covariance
 from hybridlio.core.errors import ConfigError, DataError, GraphError
-from hybridlio.graph.base.noise import KERNELS, estimator
+from hybridlio.graph.base.kernels import KERNELS, estimator
 
 Form: TypeAlias = Literal["covariance", "information", "sigmas"]
 

@@ -25,7 +25,8 @@ from hybridlio.graph.outliers.loop_support import GraphOdometry, LoopSupport, lo
 from hybridlio.graph.outliers.search import Found, all_at_once, nearest_first, repaired
 from hybridlio.graph.outliers.weighted_solver import WeightedSolver
 from hybridlio.graph.solve.initial_values import find_initial_values
-from hybridlio.graph.solve.nonlinear import IterationProgress, poses_of
+from hybridlio.graph.solve.linear_solver import poses_of
+from hybridlio.graph.solve.settings import IterationProgress
 
 # Chance that even one of all correct loops exceeds the bound; the usual bound of 1 % a loop rejects so many in a large
 # graph that its poses move by more than their standard deviations.

@@ -15,7 +15,8 @@ from hybridlio.graph.model.connectivity import components
 from hybridlio.graph.model.edge_arrays import edges_of, loops_of
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.solve.builder import Builder, noise_model
-from hybridlio.graph.solve.nonlinear import IterationProgress, levenberg_marquardt_params, needs_qr, poses_of
+from hybridlio.graph.solve.linear_solver import levenberg_marquardt_params, needs_qr, poses_of
+from hybridlio.graph.solve.settings import IterationProgress
 
 _ITERATIONS_PER_STEP = 2  # each step starts close to its optimum
 _MAX_STEPS = 200  # 1.4^200 is 1e29: all weights are 0 or 1 long before

@@ -15,7 +15,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.estimates import State
 from hybridlio.graph.base import noise
-from hybridlio.graph.base.noise import KERNELS
+from hybridlio.graph.base.kernels import KERNELS
 from hybridlio.graph.base.truncated_squares import GRADUATION, chi2_bound, first_control, truncated_weights
 from hybridlio.graph.model.noise import Robust, default_width
 from hybridlio.graph.run.factor_groups import (

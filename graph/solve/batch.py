@@ -7,8 +7,8 @@ from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.outliers.rejection import reject_outliers
 from hybridlio.graph.solve.growing_start import grow_start
 from hybridlio.graph.solve.initial_values import choose_start
-from hybridlio.graph.solve.nonlinear import IterationProgress, NonlinearSolver
-from hybridlio.graph.solve.settings import Settings
+from hybridlio.graph.solve.nonlinear import NonlinearSolver
+from hybridlio.graph.solve.settings import IterationProgress, Settings
 from hybridlio.graph.solve.solution import Solution
 
 

@@ -15,7 +15,8 @@ from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.checks import check_determined
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.solve.builder import Builder
-from hybridlio.graph.solve.nonlinear import IterationProgress, NonlinearSolver, silent
+from hybridlio.graph.solve.nonlinear import NonlinearSolver
+from hybridlio.graph.solve.settings import IterationProgress, silent
 
 _FIRST_POSES = 50  # a stretch whose odometry has not drifted far
 _GROWTH = (

@@ -15,19 +15,20 @@ from hybridlio.core.errors import ConfigError, GraphError
 from hybridlio.graph.base.deep_stack import on_deep_stack
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.checks import check_determined
-from hybridlio.graph.model.edge_table import GrowingArray
 from hybridlio.graph.model.graph_data import GraphData
+from hybridlio.graph.model.growing_array import GrowingArray
 from hybridlio.graph.model.keys import Key, check_key, list_keys
 from hybridlio.graph.solve.builder import Builder
 from hybridlio.graph.solve.changes import Changes, ChangeTracker
 from hybridlio.graph.solve.engines import Engine, FixedLag, Incremental
 from hybridlio.graph.solve.initial_values import choose_start
 from hybridlio.graph.solve.landmark_factors import insert_landmarks
-from hybridlio.graph.solve.nonlinear import NonlinearSolver, biases_of, poses_of, silent
+from hybridlio.graph.solve.linear_solver import poses_of
+from hybridlio.graph.solve.nonlinear import NonlinearSolver, biases_of
 from hybridlio.graph.solve.online_factors import NewFactors, new_factors
 from hybridlio.graph.solve.online_landmarks import OnlineLandmarks
 from hybridlio.graph.solve.online_start import OnlineStart, determines_new_poses
-from hybridlio.graph.solve.settings import ONLINE_SOLVERS
+from hybridlio.graph.solve.settings import ONLINE_SOLVERS, silent
 
 _FIRST_ITERATIONS = 100  # as PoseGraph.optimize by default
 _FIRST_TOLERANCE = 1e-9  # of the error: the first update's result is iSAM2's linearisation point, so solve it exactly

@@ -17,7 +17,6 @@ from hybridlio.graph.model.measurements import OBSERVATIONS, VELOCITIES, Factor
 from hybridlio.graph.solve.builder import Builder
 from hybridlio.graph.solve.changes import Changes
 from hybridlio.graph.solve.landmark_factors import insert_landmarks, point_in_pose_frame
-from hybridlio.graph.solve.nonlinear import poses_of
 
 
 def determines_new_poses(data: GraphData, changes: Changes, with_velocity: set[int]) -> bool:
@@ -133,8 +132,11 @@ class OnlineStart:
 
     def poses(self) -> Array:
         """Return the coordinates ``(N, 7)`` or ``(N, 3)`` of all new poses; errors as for :meth:`values`."""
-        values = self.values()
-        return poses_of(values, self._data.dimension)
+        self.values()
+        placed = [self._poses[k] for k in range(len(self._data))]
+        if self._data.dimension == 2:
+            return np.array([[pose.x(), pose.y(), pose.theta()] for pose in placed])
+        return co.from_matrices(np.array([pose.matrix() for pose in placed]), 3)
 
     def _new_landmarks(self) -> dict[int, Array]:
         """Return the points of new landmarks, by index, where their first observation sees them."""

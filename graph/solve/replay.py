@@ -10,9 +10,10 @@ from hybridlio.graph.model.checks import check_determined, check_observed
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.solve.builder import Builder
 from hybridlio.graph.solve.initial_values import choose_start
-from hybridlio.graph.solve.nonlinear import IterationProgress, SolverResult, biases_of, poses_of
+from hybridlio.graph.solve.linear_solver import poses_of
+from hybridlio.graph.solve.nonlinear import SolverResult, biases_of
 from hybridlio.graph.solve.online_solver import OnlineSolver
-from hybridlio.graph.solve.settings import Settings
+from hybridlio.graph.solve.settings import IterationProgress, Settings
 from hybridlio.graph.solve.solution import Solution
 
 _LAST_UPDATES = 3  # each linearises anew what has moved, so they act as Gauss-Newton's last iterations

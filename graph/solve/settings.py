@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -11,6 +12,9 @@ SolverName: TypeAlias = Literal["auto", "batch", "gnc", "incremental", "fixed-la
 OnlineName: TypeAlias = Literal["incremental", "fixed-lag"]
 InitialMethod: TypeAlias = Literal["odometry", "spanning-tree", "chordal"]
 InitialName: TypeAlias = Literal["auto", "given"] | InitialMethod
+
+IterationProgress: TypeAlias = Callable[[str, int, float], None]  # stage, iteration, error
+TOLERANCE = 1e-6  # of the error: poses then lie within a few thousandths of a standard deviation
 
 SOLVERS = ("auto", "batch", "gnc", "incremental", "fixed-lag")
 ONLINE_SOLVERS = ("incremental", "fixed-lag")
@@ -42,3 +46,8 @@ class Settings:
                 "max_iterations, tolerance and lag must be positive, "
                 f"got {self.max_iterations}, {self.tolerance} and {self.lag}"
             )
+
+
+def silent(stage: str, iteration: int, error: float) -> None:
+    """Ignore progress."""
+    del stage, iteration, error

@@ -30,7 +30,7 @@ def optimize(
     _verbosity: Verbose = 0,
 ) -> None:
     """Find the poses that fit a pose graph's factors best."""
-    from hybridlio.graph import PoseGraph
+    from hybridlio.graph.pose_graph import PoseGraph
 
     for path in (output, plot):
         if path is not None and path.exists() and not overwrite:

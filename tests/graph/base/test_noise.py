@@ -3,7 +3,7 @@ import pytest
 
 from hybridlio.core.errors import DataError
 from hybridlio.graph.base import noise
-from hybridlio.graph.base.noise import KERNELS
+from hybridlio.graph.base.kernels import KERNELS
 from hybridlio.graph.model.noise import Robust
 
 
