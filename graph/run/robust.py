@@ -15,7 +15,6 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.estimates import State
 from hybridlio.graph.base import noise
-from hybridlio.graph.base.kernels import KERNELS
 from hybridlio.graph.base.truncated_squares import GRADUATION, chi2_bound, first_control, truncated_weights
 from hybridlio.graph.model.noise import Robust, default_width
 from hybridlio.graph.run.factor_groups import (
@@ -27,7 +26,9 @@ from hybridlio.graph.run.factor_groups import (
 )
 from hybridlio.smoothing.verdict import KindFit
 
-ROBUST_METHODS = (*KERNELS, "gnc")
+# Kernels that tolerate outliers from the poses of the odometry on. Those that lose all weight (Tukey, truncated least
+# squares) drop correct loops there, and a dead zone keeps wrong ones (tests/graph/run/test_factor_groups.py).
+ROBUST_METHODS = ("huber", "cauchy", "geman-mcclure", "dcs", "gnc")
 _MAX_STEPS = 100  # a bound on loops that end by themselves: 1.4^100 graduates residuals of 10^7 standard deviations
 _LEAST_WEIGHT = 0.5  # of a measurement that counts as accepted: one at the kernel's width keeps a quarter to a half
 _CONVERGED_RATIO = 0.99  # of the error to the previous one: weights do not depend on the last percent

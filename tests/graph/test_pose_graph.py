@@ -319,6 +319,8 @@ def test_the_public_names_are_exactly_these():
         *("add_prior", "add_between", "add_imu", "add_velocity", "add_zero_velocity", "add_bias"),
         *("add_gps", "add_gps_geodetic", "add_attitude", "add_gravity"),
         *("landmarks", "add_landmark", "add_point_observation", "add_bearing_range"),
+        *("add_factor", "add_gtsam_factor", "add_altitude", "add_heading", "add_body_velocity", "add_wheel_speed"),
+        *("copy", "subgraph", "remove_pose", "merge", "set_noise", "to_gtsam", "from_gtsam"),
         *("initialise", "optimize", "online", "load", "load_report", "save"),
     }
 
