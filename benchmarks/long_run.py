@@ -82,14 +82,14 @@ def light_frames(first: int, scans: int) -> Iterator[Frame]:
         yield Frame(k, Scan((k + 1) * _STEP_NS, nothing), ImuSamples(stamps, gyro, accel), calibration=Calibration())
 
 
-def simulated_lap(folder: Path) -> Sequence:
+def simulated_lap(folder: Path, lidar: str = "hdl-64e") -> Sequence:
     """Open the lap in a folder; simulate it first unless the folder holds it. It ends at its first pose."""
     turn = np.linspace(0, 2 * np.pi, LAP + 1)
     yaw = np.column_stack([np.zeros((LAP + 1, 2)), turn])
     place = RADIUS_M * np.column_stack([np.sin(turn), 1 - np.cos(turn), np.zeros(LAP + 1)])
     folder.mkdir(parents=True, exist_ok=True)
     np.savetxt(folder / "lap.txt", se3.make(se3.so3_exp(yaw), place)[:, :3].reshape(-1, 12))
-    config = SimulationConfig(seed=8101, poses=folder / "lap.txt", poses_frame="lidar")
+    config = SimulationConfig(seed=8101, lidar=lidar, poses=folder / "lap.txt", poses_frame="lidar")
     with progress("simulating the lap") as tick:
         simulate(folder, config, tick)
     return open_sequence(folder)

@@ -128,3 +128,30 @@ def test_the_cost_of_keeping_a_run_is_printed(tiny_drive):
     assert done.returncode == 0, done.stderr
     assert "12 scans" in done.stdout
     assert "ms a scan" in done.stdout
+
+
+def test_the_latency_of_a_stream_is_measured(tiny_drive, tmp_path):
+    done = run("stream_latency.py", tiny_drive, "--frames", ":8", "--speed", "0.5", "-o", tmp_path / "found.json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert found["scans"] == 8
+    assert 0 < found["latency, median [ms]"] <= found["latency, 99th percentile [ms]"]
+    assert found["predict, median [ms]"] > 0
+
+
+def test_a_soak_goes_on_from_lap_to_lap():
+    program = (
+        "import numpy as np, soak; from long_run import LAP;"
+        "from hybridlio.core.sensors import Calibration, Frame, ImuSamples, Scan;"
+        "step, cloud = 10**8, np.zeros((1, 3), np.float32);"
+        "samples = lambda t: ImuSamples(np.arange(t - step, t + 1, 10**7), *np.ones((2, 11, 3)));"
+        "frame = lambda k: Frame(k, Scan(k * step, cloud), samples(k * step), calibration=Calibration());"
+        "frames = [frame(k) for k in range(LAP + 1)];"
+        "laps = soak.Laps(frames);"
+        "stamps = [laps[k].scan.stamp_ns for k in range(2 * LAP + 2)];"
+        "assert (np.diff(stamps) == step).all();"
+        "assert all(laps[k].imu.stamps_ns[-1] == stamps[k] for k in range(len(stamps)));"
+        "assert [laps[k].index for k in (0, 1, LAP, LAP + 1)] == [0, 1, LAP, 1]"
+    )
+    done = python("-c", program)
+    assert done.returncode == 0, done.stderr

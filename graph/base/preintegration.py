@@ -61,30 +61,25 @@ def gtsam_bias(state: State) -> gtsam.imuBias.ConstantBias:
 def preintegrate(imu: ImuSamples, state: State, noise: ImuNoise) -> gtsam.PreintegratedCombinedMeasurements:
     """Preintegrate the samples from the state's stamp to the last one, with the state's biases and gravity.
 
-    The noise grows with the longest step between two samples (:func:`sampling_noise`).
+    The trapezoidal rule: each step between two samples takes their mean. The noise grows with the longest step
+    (:func:`sampling_noise`).
 
     Raises:
         DataError: there are fewer than two samples.
     """
     if len(imu) < 2:
         raise DataError(f"preintegration: {len(imu)} IMU samples after {state.stamp_ns} ns, at least 2 are needed")
-    longest_s = float(np.diff(imu.stamps_ns).max()) / NS_PER_S
-    params = preintegration_params(noise, longest_s, state.gravity_m_s2)
-    pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam_bias(state))
-    integrate(pim, imu, state.gyro_bias_rad_s)
-    return pim
-
-
-def integrate(pim: gtsam.PreintegratedCombinedMeasurements, imu: ImuSamples, gyro_bias_rad_s: Array) -> None:
-    """Add samples to ``pim`` by the trapezoidal rule: each step between two samples takes their mean."""
     steps_s = np.diff(imu.stamps_ns) / NS_PER_S
+    params = preintegration_params(noise, float(steps_s.max()), state.gravity_m_s2)
+    pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam_bias(state))
     gyro = (imu.gyro_rad_s[1:] + imu.gyro_rad_s[:-1]) / 2
     # GTSAM takes the specific force in the sensor's frame at the start of the step (Euler integration); the second
     # sample is measured at its end, so it is rotated back by the turn in between before the mean is taken
-    turned = se3.so3_exp((gyro - gyro_bias_rad_s) * steps_s[:, None])
+    turned = se3.so3_exp((gyro - state.gyro_bias_rad_s) * steps_s[:, None])
     accel = (imu.accel_m_s2[:-1] + (turned @ imu.accel_m_s2[1:, :, None])[..., 0]) / 2
     for step_s, a, w in zip(steps_s, accel, gyro, strict=True):
         pim.integrateMeasurement(a, w, step_s)
+    return pim
 
 
 def preintegrate_unknown(state: State, dt_s: float) -> gtsam.PreintegratedCombinedMeasurements:

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from itertools import pairwise
 
 import gtsam
 import numpy as np
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import State
-from hybridlio.core.sensors import NS_PER_S, ImuNoise, ImuSamples
-from hybridlio.graph.base.preintegration import gtsam_bias, integrate, preintegration_params
+from hybridlio.core.sensors import NS_PER_S, ImuNoise
+from hybridlio.graph.base.preintegration import gtsam_bias, preintegration_params
+
+Values = Sequence[float]
 
 
 class InertialPrediction:
@@ -31,19 +35,24 @@ class InertialPrediction:
         to_body[6:9, 6:9] = state.T_world_imu[:3, :3].T
         self._covariance: Array = to_body @ state.covariance @ to_body.T
 
-    def advance(self, imu: ImuSamples) -> None:
-        """Integrate samples; the first is at :attr:`stamp_ns`. Fewer than two change nothing."""
-        if len(imu) >= 2:
-            self._nav, self._covariance = self._after(imu)
-            self.stamp_ns = int(imu.stamps_ns[-1])
+    def advance(self, stamps_ns: Sequence[int], values: Sequence[Values]) -> None:
+        """Integrate samples.
 
-    def pose_after(self, imu: ImuSamples) -> tuple[Array, Array]:
-        """Return the IMU's pose ``(4, 4)`` after samples as for :meth:`advance`, without advancing.
+        Args:
+            stamps_ns: ascending, the first :attr:`stamp_ns`; at least two.
+            values: six for each stamp, angular velocity (rad/s) and specific force (m/s²).
+        """
+        self._nav, self._covariance = self._after(stamps_ns, values)
+        self.stamp_ns = stamps_ns[-1]
+
+    def pose_after(self, stamps_ns: Sequence[int], values: Sequence[Values]) -> tuple[Array, Array]:
+        """Return the IMU's pose ``(4, 4)`` after samples as for :meth:`advance`, if any, without advancing.
 
         The covariance ``(6, 6)`` propagates the state's (pose, velocity, biases, gravity) and the samples' noise.
         """
-        end_ns = int(imu.stamps_ns[-1]) if len(imu) else self.stamp_ns
-        nav, covariance = self._after(imu) if len(imu) >= 2 else (self._nav, self._covariance)
+        end_ns, nav, covariance = self.stamp_ns, self._nav, self._covariance
+        if stamps_ns:
+            end_ns, (nav, covariance) = stamps_ns[-1], self._after(stamps_ns, values)
         pose = nav.pose().matrix()
         # gravity g moves the end by g·dt²/2 in world; a right perturbation's translation is in the frame of the end
         half_dt2 = ((end_ns - self._state.stamp_ns) / NS_PER_S) ** 2 / 2
@@ -52,18 +61,26 @@ class InertialPrediction:
         total[3:, 3:] += by_gravity @ self._state.gravity_covariance @ by_gravity.T
         return pose, (total + total.T) / 2
 
-    def _after(self, imu: ImuSamples) -> tuple[gtsam.NavState, Array]:
-        pim = gtsam.PreintegratedCombinedMeasurements(self._params_for(imu), self._bias)
-        integrate(pim, imu, self._state.gyro_bias_rad_s)
+    def _after(self, stamps_ns: Sequence[int], values: Sequence[Values]) -> tuple[gtsam.NavState, Array]:
+        """Integrate by the trapezoidal rule of :func:`hybridlio.graph.base.preintegration.preintegrate`.
+
+        Sample by sample: for the one or two of a call this takes half the time of arrays.
+        """
+        steps_s = [(b - a) / NS_PER_S for a, b in pairwise(stamps_ns)]
+        pim = gtsam.PreintegratedCombinedMeasurements(self._params_for(max(steps_s)), self._bias)
+        samples = [np.array(row) for row in values]
+        for step_s, before, after in zip(steps_s, samples, samples[1:], strict=False):
+            gyro = (before[:3] + after[:3]) / 2
+            turned = gtsam.Rot3.Expmap((gyro - self._state.gyro_bias_rad_s) * step_s).rotate(after[3:])
+            pim.integrateMeasurement((before[3:] + turned) / 2, gyro, step_s)
         by_state, by_bias = np.zeros((9, 9), order="F"), np.zeros((9, 6), order="F")
         nav = pim.predict(self._nav, self._bias, by_state, by_bias)
         J = np.eye(15)
         J[:9, :9], J[:9, 9:] = by_state, by_bias
         return nav, J @ self._covariance @ J.T + pim.preintMeasCov()
 
-    def _params_for(self, imu: ImuSamples) -> gtsam.PreintegrationCombinedParams:
-        """Return parameters for the longest step between the samples, rounded up to a power of two, to reuse them."""
-        longest_s = float(np.diff(imu.stamps_ns).max()) / NS_PER_S
+    def _params_for(self, longest_s: float) -> gtsam.PreintegrationCombinedParams:
+        """Return parameters for the longest step between samples, rounded up to a power of two, to reuse them."""
         gap_s = 2.0 ** math.ceil(math.log2(longest_s))
         if gap_s not in self._params:
             self._params[gap_s] = preintegration_params(self._noise, gap_s, self._state.gravity_m_s2)

@@ -88,7 +88,8 @@ class FrameAssembler:
         count = bisect_left(self._scans, self._newest_ns - behind_ns, key=lambda s: s.stamp_ns)
         if count:
             self.counts.skipped_scans += count
-            _log.warning("estimation is too slow: %d scans skipped so far", self.counts.skipped_scans)
+            if self.counts.skipped_scans - count < _LOGGED:
+                _log.warning("estimation is too slow: %d scans skipped so far", self.counts.skipped_scans)
             del self._scans[:count]
 
     def has_frame(self, everything: bool) -> bool:

@@ -56,27 +56,24 @@ class ImuBuffer:
         at = bisect_right(self._stamps, stamp_ns) - 1
         return self._stamps[at] if at >= 0 else None
 
-    def until(self, start_ns: int, end_ns: int) -> ImuSamples:
-        """Return the samples from ``start_ns`` to ``end_ns``, interpolated at both ends.
+    def steps(self, start_ns: int, end_ns: int) -> tuple[list[int], list[Values]]:
+        """Return stamps and values from ``start_ns`` to ``end_ns``, interpolated at both ends, as lists for speed.
 
-        Behind the newest sample its values are held until ``end_ns``.
+        Behind the newest sample its values are held.
         """
-        first, last = bisect_left(self._stamps, start_ns), bisect_right(self._stamps, end_ns)
-        newest = len(self) == last and last > 0
-        if first < last and self._stamps[first] == start_ns and (newest or self._stamps[last - 1] == end_ns):
-            rows = self._rows(first, last)
-        else:
-            rows = self.around(start_ns, end_ns).between(start_ns, end_ns)
-        if not newest or self._stamps[-1] == end_ns:
-            return rows
-        stamps = [*rows.stamps_ns.tolist(), end_ns] if len(rows) else [start_ns, end_ns]
-        values = np.hstack([rows.gyro_rad_s, rows.accel_m_s2]).tolist() if len(rows) else [self._values[-1]]
-        return _samples(stamps, [*values, self._values[-1]])
+        first, last = bisect_right(self._stamps, start_ns), bisect_left(self._stamps, end_ns)
+        stamps = [start_ns, *self._stamps[first:last], end_ns]
+        return stamps, [self._at(start_ns), *self._values[first:last], self._at(end_ns)]
+
+    def _at(self, stamp_ns: int) -> Values:
+        after = bisect_left(self._stamps, stamp_ns)
+        if after == len(self) or after == 0 or self._stamps[after] == stamp_ns:
+            return self._values[min(after, len(self) - 1)]
+        before_ns, after_ns = self._stamps[after - 1 : after + 1]
+        share = (stamp_ns - before_ns) / (after_ns - before_ns)
+        ends = zip(self._values[after - 1], self._values[after], strict=True)
+        return tuple(a + share * (b - a) for a, b in ends)
 
     def _rows(self, first: int, last: int) -> ImuSamples:
-        return _samples(self._stamps[first:last], self._values[first:last])
-
-
-def _samples(stamps: list[int], values: list[Values]) -> ImuSamples:
-    table = np.array(values, dtype=np.float64).reshape(-1, 6)
-    return ImuSamples(np.array(stamps, dtype=np.int64), table[:, :3], table[:, 3:])
+        table = np.array(self._values[first:last], dtype=np.float64).reshape(-1, 6)
+        return ImuSamples(np.array(self._stamps[first:last], dtype=np.int64), table[:, :3], table[:, 3:])

@@ -51,6 +51,7 @@ class PosePrediction:
         self._estimate, self._state, self._noise = estimate, state, noise
         self._twist = se3.log(estimate.step.pose) * NS_PER_S / (estimate.stamp_ns - before_ns)
         self._T_imu_lidar, self._T_lidar_imu = calibration.T_imu_lidar, se3.inverse(calibration.T_imu_lidar)
+        self._rotation = se3.adjoint(self._T_lidar_imu)  # of covariances, from the IMU's frame to the lidar's
         self._inertial = InertialPrediction(state, noise)
 
     def advance(self, stamp_ns: int, imu: ImuBuffer) -> None:
@@ -59,7 +60,7 @@ class PosePrediction:
         if stamp_ns < self._inertial.stamp_ns:
             self._inertial = InertialPrediction(self._state, self._noise)
         if self._state.has_imu and last is not None and last > self._inertial.stamp_ns:
-            self._inertial.advance(imu.until(self._inertial.stamp_ns, last))
+            self._inertial.advance(*imu.steps(self._inertial.stamp_ns, last))
 
     def pose_at(self, stamp_ns: int, imu: ImuBuffer) -> PredictedPose:
         """Return the pose at a stamp; samples are held for a quarter of a second behind the newest.
@@ -76,11 +77,13 @@ class PosePrediction:
         if not self._state.has_imu or last is None or stamp_ns - last > LONGEST_INTERPOLATION_NS:
             return self._at_constant_velocity(stamp_ns)
         self.advance(stamp_ns, imu)
-        pose, covariance = self._inertial.pose_after(imu.until(self._inertial.stamp_ns, stamp_ns))
+        start_ns = self._inertial.stamp_ns
+        rest = imu.steps(start_ns, stamp_ns) if stamp_ns > start_ns else ((), ())
+        pose, covariance = self._inertial.pose_after(*rest)
         return PredictedPose(
             stamp_ns,
             self._T_lidar_imu @ pose @ self._T_imu_lidar,
-            se3.rotate_covariance(covariance, self._T_lidar_imu),
+            self._rotation @ covariance @ self._rotation.T,
             from_imu=True,
         )
 
@@ -113,7 +116,11 @@ class LatestPrediction:
         if before is None or state is None or noise is None:
             return
         self._prediction = PosePrediction(estimate, before.stamp_ns, state, noise, self._calibration)
-        if self._is_used and self._imu.newest_ns is not None:  # integrate here what pose_at would have to
+        self.advance()
+
+    def advance(self) -> None:
+        """Integrate the new samples, if predictions are wanted, so that :meth:`pose_at` need not."""
+        if self._is_used and self._prediction is not None and self._imu.newest_ns is not None:
             self._prediction.advance(self._imu.newest_ns, self._imu)
 
     def pose_at(self, stamp_ns: int) -> PredictedPose:

@@ -157,7 +157,7 @@ class OdometryStream:
     def predict(self, stamp_ns: int) -> PredictedPose:
         """Return the pose at a time after the last estimate, by the IMU samples since.
 
-        It takes a fraction of a millisecond, so it may be called at the IMU's rate. Where the newest sample is over
+        It takes some 0.1 ms, so it may be called at the IMU's rate. Where the newest sample is over
         0.25 s before the stamp, and without an IMU, the last step's velocity continues.
 
         Raises:
@@ -177,11 +177,10 @@ class OdometryStream:
 
     def record(self) -> Record:
         """As :meth:`Odometry.record`, with all fixes so far; those after the last scan can show a clock's offset."""
-        with self._estimating:
+        with self._estimating, self._changed:
             record = self.odometry.record()
-        with self._changed:
-            fixes = sorted([*record.gps, *self._frames.fixes], key=lambda fix: fix.stamp_ns)
-        return replace(record, gps=tuple(fixes))
+            fixes = [*record.gps, *self._frames.fixes]
+            return replace(record, gps=tuple(sorted(fixes, key=lambda fix: fix.stamp_ns)))
 
     def flush(self) -> list[Estimate]:
         """Estimate all scans that wait, without more IMU samples; return their estimates, if not to ``on_estimate``."""
@@ -226,6 +225,7 @@ class OdometryStream:
             if self._closed:
                 raise ConfigError("the stream is closed; make a new one")
             add()
+            self._prediction.advance()
             if self._thread is not None:
                 if self._frames.waiting():
                     self._frames.skip_scans(self._longest_behind_ns)
