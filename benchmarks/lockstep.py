@@ -26,6 +26,7 @@ from hybridlio.datasets.sequence import Sequence
 
 Open = Callable[[], Sequence]  # opens the recording in each process, so it must be picklable
 
+_LONGEST_S = 20  # hundreds of times a usual scan; a system that has lost its way may search without end
 _DIVERGED_M = 1e6  # farther than any drive goes; beyond it later computations overflow
 
 
@@ -82,6 +83,9 @@ def run_in_lockstep(
 def _run_scan(connection: Connection, k: int, kept: Pass) -> None:
     try:
         connection.send(k)
+        if not connection.poll(_LONGEST_S):
+            kept.error = f"scan {k}: no answer within {_LONGEST_S} s"
+            return
         reply = connection.recv()
     except (EOFError, OSError):
         kept.error = f"its process ended at scan {k}"
