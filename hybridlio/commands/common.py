@@ -89,7 +89,7 @@ Rate = Annotated[
 Check = Annotated[
     bool,
     typer.Option(
-        "--check/--no-check", help="Compare the IMU with the scans first: clocks, units, mounting (a few seconds)."
+        "--check/--no-check", help="Compare the IMU with the scans first: clocks, units, mounting (some seconds)."
     ),
 ]
 Frames = Annotated[str | None, typer.Option("--frames", metavar="A:B", help="Use scans A to B-1 only, counted from 0.")]

@@ -25,12 +25,13 @@ LARGEST_OFFSET_S = 0.2  # drivers that stamp on arrival are late by less; larger
 # Four stretches of ten seconds at 10 Hz: the offset is then known to 0.5 ms in ordinary driving, as the gyroscope's
 # noise allows. Two are enough to see that the clocks agree (benchmarks/clock_offsets.py has accuracy and time).
 _STRETCHES, _FIRST_STRETCHES, _STRETCH_SCANS = 4, 2, 100
-_ABOUT_NS = NS_PER_S // 40  # a quarter of a scan before and after its stamp
 _QUIET_SCANS = 15  # of a stretch, among which it begins at the one that turns least
 _LEAST_SCANS = 60  # in a recording, for 50 steps that the samples cover
 _POINTS = 30_000
-_MAX_PASSES = 3  # of scans that need motion compensation, which depends on the offset; the error falls tenfold a pass
+_MAX_PASSES = 6  # of scans that need motion compensation, which depends on the offset: the error falls to a tenth a
+# pass in a car, to a quarter in a hand that turns fast
 _SETTLED_S = 5e-4
+_COARSE_S = 0.02  # standard deviation of an offset that compensation begins with: as fine as the search and its step
 _LARGEST_RATE_RAD_S = 6.0  # of 95 % of samples; rates beyond are of another unit and no help to compensate scans
 
 
@@ -79,7 +80,7 @@ def compare_imu(sequence: Sequence, progress: Progress | None = None) -> ImuChec
         check = recording.check(paths)
         if check is None or check.wrong or not recording.are_distorted:
             break
-        now_s = check.offset.offset_s if check.offset is not None and check.offset.is_determined else 0.0
+        now_s = check.offset.offset_s if _is_known_coarsely(check) and check.offset is not None else 0.0
         if abs(now_s - before_s) < _SETTLED_S and len(compensating):
             break
         before_s, compensating = now_s, _moved(check)
@@ -107,7 +108,7 @@ class _Loaded:
         return [
             path
             for stretch in self._stretches[stretches]
-            for path in scan_paths(self._with_samples(stretch, compensating), calibration)
+            for path in scan_paths(self._counted(stretch), calibration, compensating)
         ]
 
     def check(self, paths: list[ScanPath]) -> ImuCheck | None:
@@ -117,12 +118,12 @@ class _Loaded:
             return None
         return check_imu(right, self._sequence.imu, self._sequence.calibration.T_imu_lidar, LARGEST_OFFSET_S)
 
-    def _with_samples(self, scans: list[Scan], imu: ImuSamples) -> Iterator[tuple[Scan, ImuSamples]]:
+    def _counted(self, scans: list[Scan]) -> Iterator[Scan]:
         for scan in scans:
             self._done = min(self._done + 1, self._total)
             if self._progress is not None:
                 self._progress("", self._done, self._total)
-            yield scan, _during(scan, imu)
+            yield scan
 
 
 def _is_on_time(check: ImuCheck) -> bool:
@@ -131,12 +132,18 @@ def _is_on_time(check: ImuCheck) -> bool:
     return offset is not None and offset.is_determined and abs(offset.offset_s) + 2 * offset.sigma_s < LEAST_OFFSET_S
 
 
+def _is_known_coarsely(check: ImuCheck) -> bool:
+    """Whether motion compensation is better with the offset that was found than without."""
+    offset = check.offset
+    return offset is not None and not offset.contradicts and offset.sigma_s < _COARSE_S
+
+
 def _moved(check: ImuCheck) -> ImuSamples:
     """Return the samples at the offset that was found, significant or not, without the gyroscope's bias."""
     imu, offset = check.imu, check.offset
     if offset is None:
         return imu
-    to_come_ns = 0 if offset.is_significant or not offset.is_determined else round(offset.offset_s * NS_PER_S)
+    to_come_ns = 0 if offset.is_significant or not _is_known_coarsely(check) else round(offset.offset_s * NS_PER_S)
     return ImuSamples(imu.stamps_ns + to_come_ns, imu.gyro_rad_s - offset.gyro_bias_rad_s, imu.accel_m_s2)
 
 
@@ -177,10 +184,3 @@ def _thinned(scan: Scan) -> Scan:
     every = max(1, len(scan) // _POINTS) | 1  # an odd step: a stored order by 2^n beams then loses no beam
     times = scan.time_offsets_ns
     return Scan(scan.stamp_ns, scan.points[::every], None, None if times is None else times[::every])
-
-
-def _during(scan: Scan, imu: ImuSamples) -> ImuSamples:
-    times = scan.time_offsets_ns
-    if times is None or not len(times):
-        return imu.between(scan.stamp_ns - _ABOUT_NS, scan.stamp_ns + _ABOUT_NS)
-    return imu.between(scan.stamp_ns + int(times.min()), scan.stamp_ns + int(times.max()))

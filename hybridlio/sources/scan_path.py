@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hybridlio.calibration.turns import GyroPath
 from hybridlio.cloud.deskew import constant_twist, deskew, sweep_motion
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
@@ -18,7 +19,7 @@ from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuSamples, Sca
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.registration.icp import register
 from hybridlio.registration.local_map import LocalMap
-from hybridlio.registration.motion_search import best_start, motions
+from hybridlio.registration.motion_search import best_start, fits_better, motions
 from hybridlio.sources.scene_scale import SceneScale
 from hybridlio.sources.settings import ScanMatchingSettings
 from hybridlio.sources.thinned_scan import ThinnedScan, thin
@@ -32,6 +33,7 @@ _KERNEL = 0.25
 # A path slides along a road or turns too little while most points still match, but they lie farther from the surfaces:
 # by 1.6 to 2.5 times on the drive with hard driving. Where all is well the distances vary by 15 %.
 _LOST_RATIO, _SETTLED_SCANS, _JUDGING_SCANS = 1.5, 10, 30
+_ABOUT_NS = NS_PER_S // 40  # a quarter of a scan before and after its stamp
 _FIRST_REPETITIONS = 2  # of the first step, when its speed is known and both scans are compensated with it
 
 
@@ -39,11 +41,14 @@ class ScanPath:
     """Registers scans to a local map of the scans before.
 
     Args:
-        calibration: of the IMU, if its samples compensate motion.
+        calibration: of the IMU.
+        imu: samples that compensate motion and propose rotations, on the scans' clock and free of bias; may be empty.
     """
 
-    def __init__(self, calibration: Calibration) -> None:
-        self._calibration = calibration
+    def __init__(self, calibration: Calibration, imu: ImuSamples) -> None:
+        self._calibration, self._imu = calibration, imu
+        self._origin_ns = int(imu.stamps_ns[0]) if len(imu) else 0
+        self._gyro = GyroPath(imu, self._origin_ns) if len(imu) > 1 else None
         self._settings = ScanMatchingSettings()
         self._map = LocalMap(self._settings.local_map)
         self._stamps: list[int] = []
@@ -61,14 +66,13 @@ class ScanPath:
         """Median over the scans of their points' standard deviation from the map; 0 for none."""
         return float(np.median(self._sigmas_m)) if self._sigmas_m else 0.0
 
-    def add(self, scan: Scan, sweep_imu: ImuSamples) -> bool:
+    def add(self, scan: Scan) -> bool:
         """Register the next scan, and return whether it fits; otherwise the path is as before.
 
         Args:
             scan: after the last one.
-            sweep_imu: samples about its stamp, during its sweep if its points have times, on its clock and free of
-                bias; may be empty.
         """
+        sweep_imu = _during(scan, self._imu)
         if self._first is None:
             self._first = scan, sweep_imu
             self._settings = _scaled_settings(scan)
@@ -76,7 +80,7 @@ class ScanPath:
         if len(self._poses) > 1:
             dt, before = scan.stamp_ns - self._stamps[-1], self._stamps[-1] - self._stamps[-2]
             twist = se3.log(se3.between(self._poses[-2], self._poses[-1])) * (dt / before)
-            return self._register(scan, sweep_imu, se3.exp(twist))
+            return self._register(scan, sweep_imu, se3.exp(twist), self._turned(scan, se3.exp(twist)))
         step = self._search(scan, sweep_imu)
         for _ in range(_FIRST_REPETITIONS):
             if step is None or not self._start(step, scan.stamp_ns) or not self._register(scan, sweep_imu, step):
@@ -87,6 +91,18 @@ class ScanPath:
         fits = self._register(scan, sweep_imu, step)
         self._settings = _coarser(self._settings)
         return fits
+
+    def _turned(self, scan: Scan, step: Array) -> Array | None:
+        """Return a step with its rotation by the gyroscope; None where the samples do not cover it.
+
+        Rotations of a sensor in a hand change more from step to step than its velocity does.
+        """
+        starts, ends = (np.array([(t - self._origin_ns) / NS_PER_S]) for t in (self._stamps[-1], scan.stamp_ns))
+        if self._gyro is None or not self._gyro.covers(starts, ends)[0]:
+            return None
+        R_imu_lidar = self._calibration.T_imu_lidar[:3, :3]
+        turn = se3.so3_exp(self._gyro.turns(starts, ends)[0] @ R_imu_lidar)
+        return se3.make(turn, step[:3, 3])
 
     def _start(self, step: Array, end_ns: int) -> bool:
         """Make a map of the first scan alone, compensated for its motion to the next one."""
@@ -112,12 +128,17 @@ class ScanPath:
             starts += [step @ turn for step in motions(settings.start_speeds_m_s, (0.0,), dt_s)]
         return best_start(surface, thinned.source, thinned.points, starts, settings.registration)
 
-    def _register(self, scan: Scan, sweep_imu: ImuSamples, step: Array) -> bool:
+    def _register(self, scan: Scan, sweep_imu: ImuSamples, step: Array, turned: Array | None = None) -> bool:
+        """Register from a step, or from the same with another rotation if the scan fits better there."""
         thinned = self._compensated(scan, sweep_imu, step, self._stamps[-1], scan.stamp_ns)
         surface, settings = self._map.surface, self._settings
         if len(thinned.points) < settings.min_points or surface is None:
             return False
         start, kernel_m = self._poses[-1] @ step, _KERNEL * settings.registration.max_distance_m
+        threads = settings.registration.threads
+        if turned is not None:
+            other = self._poses[-1] @ turned
+            start = other if fits_better(surface, thinned.source, other, start, kernel_m, threads) else start
         found = register(surface, thinned.source, start, settings.registration, kernel_m)
         usual_m = self.sigma_m if len(self._sigmas_m) >= _SETTLED_SCANS else np.inf
         if found.matched < settings.min_matched or found.sigma_m > _LOST_RATIO * usual_m:
@@ -140,6 +161,14 @@ class ScanPath:
         return thin(scan, self._settings)
 
 
+def _during(scan: Scan, imu: ImuSamples) -> ImuSamples:
+    """Return the samples during a scan's sweep, or about its stamp if its points have no times."""
+    times = scan.time_offsets_ns
+    if times is None or not len(times):
+        return imu.between(scan.stamp_ns - _ABOUT_NS, scan.stamp_ns + _ABOUT_NS)
+    return imu.between(scan.stamp_ns + int(times.min()), scan.stamp_ns + int(times.max()))
+
+
 def _scaled_settings(scan: Scan) -> ScanMatchingSettings:
     """Return scan matching's settings at the scale of the scene, which changes little within a stretch."""
     scale = SceneScale(ScanMatchingSettings())
@@ -158,18 +187,18 @@ def _coarser(fine: ScanMatchingSettings) -> ScanMatchingSettings:
     )
 
 
-def scan_paths(scans: Iterable[tuple[Scan, ImuSamples]], calibration: Calibration) -> list[ScanPath]:
+def scan_paths(scans: Iterable[Scan], calibration: Calibration, imu: ImuSamples) -> list[ScanPath]:
     """Return the lidar's path through scans, two or more in each; a new one begins after each scan that does not fit.
 
     Args:
-        scans: in order of time, each with the samples during its sweep, which may be empty.
-        calibration: of the IMU.
+        scans: in order of time.
+        calibration, imu: see :class:`ScanPath`.
     """
-    paths = [ScanPath(calibration)]
-    for scan, sweep_imu in scans:
-        if not paths[-1].add(scan, sweep_imu):
-            paths.append(ScanPath(calibration))
-            paths[-1].add(scan, sweep_imu)
+    paths = [ScanPath(calibration, imu)]
+    for scan in scans:
+        if not paths[-1].add(scan):
+            paths.append(ScanPath(calibration, imu))
+            paths[-1].add(scan)
     return [path for path in paths if len(path.trajectory) > 1]
 
 

@@ -11,7 +11,7 @@ from hybridlio.sources.scan_path import best_paths, scan_paths
 def test_the_turns_of_a_path_are_those_of_the_lidar(rng: np.random.Generator):
     walk = carried(rng, seconds=4.0, turning=0.6)
     scans = [as_sequence(rng, walk).load_scan(k) for k in range(len(walk.path))]
-    (found,) = scan_paths(((scan, ImuSamples.empty()) for scan in scans), Calibration())
+    (found,) = scan_paths(scans, Calibration(), ImuSamples.empty())
     path = found.trajectory
     np.testing.assert_array_equal(path.stamps_ns, walk.path.stamps_ns)
     steps, true = (se3.between(poses[:-1], poses[1:]) for poses in (path.poses, walk.path.poses))
@@ -24,23 +24,22 @@ def test_a_new_path_begins_after_a_scan_that_does_not_fit(rng: np.random.Generat
     sequence = as_sequence(rng, walk)
     scans = [sequence.load_scan(k) for k in range(len(walk.path))]
     scans[12] = Scan(scans[12].stamp_ns, np.empty((0, 3), np.float32))
-    paths = scan_paths(((scan, ImuSamples.empty()) for scan in scans), Calibration())
+    paths = scan_paths(scans, Calibration(), ImuSamples.empty())
     assert len(paths) == 2
     assert len(paths[0].trajectory) == 12
 
 
 def test_no_scans_give_no_path():
-    assert scan_paths([], Calibration()) == []
+    assert scan_paths([], Calibration(), ImuSamples.empty()) == []
 
 
 def test_a_path_that_began_with_a_false_fit_is_left_out(rng: np.random.Generator):
     walk = carried(rng, seconds=4.0, turning=0.6)
     sequence = as_sequence(rng, walk)
-    scans = [(sequence.load_scan(k), ImuSamples.empty()) for k in range(len(walk.path))]
-    (right,) = scan_paths(scans, Calibration())
-    blurred = [
-        (Scan(s.stamp_ns, s.points + rng.normal(0, 0.06, s.points.shape).astype(np.float32)), i) for s, i in scans
-    ]
-    wrong = scan_paths(blurred, Calibration())
+    scans = [sequence.load_scan(k) for k in range(len(walk.path))]
+    (right,) = scan_paths(scans, Calibration(), ImuSamples.empty())
+    noise = [rng.normal(0, 0.06, scan.points.shape).astype(np.float32) for scan in scans]
+    blurred = [Scan(scan.stamp_ns, scan.points + more) for scan, more in zip(scans, noise, strict=True)]
+    wrong = scan_paths(blurred, Calibration(), ImuSamples.empty())
     (kept,) = best_paths([*wrong, right])
     np.testing.assert_array_equal(kept.poses, right.trajectory.poses)

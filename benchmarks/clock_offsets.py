@@ -1,0 +1,74 @@
+"""Find offsets of the IMU's clock that are put into recordings, and measure what correcting them does to odometry.
+
+python benchmarks/clock_offsets.py DATA… [--offsets-ms -150 -50 -10 0 10 50 150] [--drift] [--scans 300]
+
+Each recording's IMU stamps are moved by each offset in turn. The table has the offset that was found, its error and
+standard deviation, whether it was applied, and the processor time of the check. With `--drift` it also has the absolute
+trajectory error of odometry over the first scans, in percent of the path, with the offset uncorrected, corrected, and
+without any; this needs reference poses.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import hybridlio as hl
+from hybridlio.calibration.imu_check import moved
+from hybridlio.runs.recording_check import check_recording, compare_imu, is_comparable
+from hybridlio.runs.run import run_odometry
+
+OFFSETS_MS = (-150.0, -50.0, -10.0, 0.0, 10.0, 50.0, 150.0)
+
+
+def drift_percent(sequence: hl.Sequence, scans: int) -> float:
+    """Return the absolute trajectory error of odometry over some scans, in percent of the path's length."""
+    part = sequence.part(0, min(scans, len(sequence)))
+    run = run_odometry(part, hl.Odometry())
+    assert part.reference is not None
+    evaluation = hl.evaluate(part.reference, run.trajectory)
+    return 100 * evaluation.ate_m / max(part.reference.length_m, 1e-9)
+
+
+def row(sequence: hl.Sequence, offset_ms: float, scans: int | None) -> str:
+    """Return a row of the table for one recording with one offset."""
+    late = replace(sequence, imu=moved(sequence.imu, 1e-3 * offset_ms))
+    begin = time.process_time()
+    found = compare_imu(late) if is_comparable(late) else None
+    spent = time.process_time() - begin
+    cells = [sequence.name, f"{offset_ms:+.0f}"]
+    if found is None or found.offset is None:
+        cells += ["–", "–", "–", "no"]
+    else:
+        offset = found.offset
+        error_ms = 1e3 * offset.offset_s + offset_ms
+        applied = "yes" if offset.is_significant else "no"
+        cells += [f"{1e3 * offset.offset_s:+.2f}", f"{error_ms:+.2f}", f"{1e3 * offset.sigma_s:.2f}", applied]
+    cells += ["; ".join([*found.doubtful, *found.wrong]) if found is not None else "", f"{spent:.1f}"]
+    if scans is not None:
+        cells += [f"{drift_percent(one, scans):.3f}" for one in (late, check_recording(late), sequence)]
+    return f"| {' | '.join(cells)} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path, nargs="+", help="recordings with an IMU whose clock agrees with the lidar's")
+    parser.add_argument("--offsets-ms", type=float, nargs="+", default=OFFSETS_MS)
+    parser.add_argument("--drift", action="store_true", help="also run odometry (minutes)")
+    parser.add_argument("--scans", type=int, default=300, help="of each odometry run (default: %(default)s)")
+    options = parser.parse_args()
+    logging.disable(logging.WARNING)
+    heads = ["recording", "offset, ms", "found, ms", "error, ms", "σ, ms", "applied", "doubts", "CPU s"]
+    heads += ["ATE % uncorrected", "ATE % corrected", "ATE % right clock"] if options.drift else []
+    print(f"| {' | '.join(heads)} |\n| {' | '.join(['---'] * len(heads))} |")
+    for path in options.data:
+        sequence = hl.open_sequence(path)
+        for offset_ms in options.offsets_ms:
+            print(row(sequence, offset_ms, options.scans if options.drift else None), flush=True)
+
+
+if __name__ == "__main__":
+    main()
