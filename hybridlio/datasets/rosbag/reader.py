@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import Calibration, ImuSamples
+from hybridlio.core.tables import counted
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.calibration_yaml import read_calibration_yaml
 from hybridlio.datasets.gps_csv import note_fixes
@@ -31,6 +33,7 @@ from hybridlio.datasets.sequence import Sequence
 from hybridlio.datasets.stamps import SCAN_GAP_FACTOR, note_coverage, note_gaps, usable_scans
 
 LAYOUT = "a .bag, .mcap or .db3 file, or a folder of ROS 2 with metadata.yaml"
+_MIN_SCANS_OF_DAMAGED = 2  # fewer scans before the damage are no recording
 SUFFIXES = (ROS_1, *ROS_2_FILES)
 
 
@@ -100,7 +103,7 @@ def _open(path: Path, wanted: BagTopics, vertical_angle_deg: float | None) -> Se
     known = known_bag(bag, wanted, notes)
     wanted = wanted if known is None else known.filled(wanted)
     chosen = choose(bag, wanted, notes)
-    contents = _read(bag, chosen)
+    contents = _read(bag, chosen, notes)
     frames = {kind: log.frame for kind, log in contents.logs.items()}
     mounting = Mounting(bag, contents.tree, wanted, frames, notes, known)
     scans = _scans(bag, chosen["lidar"], contents.logs["lidar"], notes)
@@ -138,28 +141,43 @@ def _note_part(path: Path, notes: Notes) -> None:
             notes.add(f"part {number} of a split bag; give the folder {path.parent} to use all parts")
 
 
-def _read(bag: Bag, chosen: dict[str, Topic]) -> _Contents:
+def _read(bag: Bag, chosen: dict[str, Topic], notes: Notes) -> _Contents:
     """Pass over the messages of the chosen topics and of the frames, once."""
     contents = _Contents({kind: Log() for kind in chosen})
     kinds = {topic.name: kind for kind, topic in chosen.items()}
     static = [t.name for t in bag.topics.values() if t.type in TRANSFORM_TYPES and t.name.endswith("_static")]
-    for name, received_ns, raw in bag.messages([*kinds, *static]):
+    for name, received_ns, raw in _until_damage(bag, [*kinds, *static], contents.logs["lidar"], notes):
         if name not in kinds:
             contents.tree.add(bag.decode(name, raw))
             continue
         kind = kinds[name]
-        log = contents.logs[kind]
         header = _header(raw, bag.is_ros2)
-        log.add(header, received_ns)
+        values: tuple[float, ...] = ()
         if kind == "imu":
-            log.values.extend(read_imu(raw, header, bag.is_ros2))
+            values = read_imu(raw, header, bag.is_ros2)
         elif kind == "gps":
-            log.values.extend(measurements.fix_values(bag.decode(name, raw)))
+            values = measurements.fix_values(bag.decode(name, raw))
         elif kind == "reference":
-            child, numbers = measurements.body_pose(bag.decode(name, raw), chosen[kind].type)
+            child, values = measurements.body_pose(bag.decode(name, raw), chosen[kind].type)
             contents.body_frame = contents.body_frame or child
-            log.values.extend(numbers)
+        contents.logs[kind].add(header, received_ns)
+        contents.logs[kind].values.extend(values)
     return contents
+
+
+def _until_damage(bag: Bag, topics: list[str], scans: Log, notes: Notes) -> Iterator[tuple[str, int, bytes]]:
+    """Yield the bag's messages; where it is damaged behind some scans, note it and end there.
+
+    Raises:
+        DataError: the bag is damaged before its second scan.
+    """
+    try:
+        yield from bag.messages(topics)
+    except DataError as error:
+        if len(scans) < _MIN_SCANS_OF_DAMAGED:
+            raise
+        text = str(error).removeprefix(f"{bag.path}: cannot be read, ")
+        notes.add(f"{text}; the {counted(len(scans), 'scan')} before the damage are used")
 
 
 def _header(raw: bytes, is_ros2: bool) -> Header:
