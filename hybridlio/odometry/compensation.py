@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from hybridlio.cloud.deskew import compensation_noise, constant_twist, deskew, sweep_motion
 from hybridlio.core.arrays import Array
-from hybridlio.core.sensors import Calibration, Frame, ImuNoise
+from hybridlio.core.estimates import State
+from hybridlio.core.sensors import Calibration, Frame, ImuNoise, ImuSamples
+from hybridlio.odometry.inertial_motion import inertial_motion
+from hybridlio.record.recorder import concatenate_imu
 
 
 class MotionCompensation:
     """Moves the points of a sweep to where the lidar would have seen them at the scan's stamp.
 
-    The gyroscope gives the rotation during the sweep; the speed comes from a relative pose. Scans whose points carry
-    no times need no compensation and pass unchanged.
+    The IMU gives rotation and bend of the path during the sweep, the speed comes from a relative pose. Scans whose
+    points carry no times need no compensation and pass unchanged.
 
     Args:
         calibration: the extrinsics.
@@ -28,19 +33,28 @@ class MotionCompensation:
         """Return whether the points of the frame's scan carry times."""
         return frame.scan.time_offsets_ns is not None
 
-    def compensate(self, frame: Frame, T_start_end: Array, start_ns: int, end_ns: int, gyro_bias_rad_s: Array) -> Frame:
+    def compensate(
+        self, frame: Frame, T_start_end: Array, start_ns: int, end_ns: int, state: State | None, imu: ImuSamples
+    ) -> Frame:
         """Return the frame with a compensated scan.
 
         Args:
             frame: a frame, with the IMU samples of its sweep where there are any.
             T_start_end: ``(4, 4)`` lidar motion near the sweep, such as the initial pose of the step to this frame.
             start_ns, end_ns: stamps between which that motion takes place.
-            gyro_bias_rad_s: ``(3,)`` the gyroscope's bias.
+            state: at ``start_ns``; None if it is not known yet.
+            imu: samples between both stamps.
         """
         if not self.applies_to(frame):
             return frame
-        step = constant_twist(T_start_end, start_ns, end_ns)
-        motion = sweep_motion(frame, step, gyro_bias_rad_s, self._calibration)
+        motion = None
+        if state is not None and len(imu):
+            samples = concatenate_imu([imu, frame.sweep_imu])
+            motion = inertial_motion(samples, state, T_start_end, end_ns, self._calibration)
+        if motion is None:
+            step = constant_twist(T_start_end, start_ns, end_ns)
+            bias = np.zeros(3) if state is None else state.gyro_bias_rad_s
+            motion = sweep_motion(frame, step, bias, self._calibration)
         return replace(frame, scan=deskew(frame.scan, motion))
 
     def noise(self, frame: Frame) -> Array | None:

@@ -102,7 +102,7 @@ class Pipeline:
         """
         with timed(seconds, "motion compensation"):
             compensated = self.compensation.compensate(
-                frame, initial.pose, state.stamp_ns, frame.scan.stamp_ns, state.gyro_bias_rad_s
+                frame, initial.pose, state.stamp_ns, frame.scan.stamp_ns, state, frame.imu
             )
             noise = self.compensation.noise(frame)
         with timed(seconds, "residual"):

@@ -39,7 +39,7 @@ def start_residual(pipeline: Pipeline) -> None:
     """
     first, stamp_ns = pipeline.first, pipeline.first.scan.stamp_ns
     pipeline.residual.start(
-        pipeline.compensation.compensate(first, np.eye(4), stamp_ns - NS_PER_S, stamp_ns, np.zeros(3))
+        pipeline.compensation.compensate(first, np.eye(4), stamp_ns - NS_PER_S, stamp_ns, None, ImuSamples.empty())
     )
 
 
@@ -77,7 +77,7 @@ def repeat_first_step(
             break
         pipeline.residual.start(
             pipeline.compensation.compensate(
-                first, relative.pose, first.scan.stamp_ns, second.scan.stamp_ns, start.gyro_bias_rad_s
+                first, relative.pose, first.scan.stamp_ns, second.scan.stamp_ns, start, second.imu
             )
         )
         compensated, relative = pipeline.refine(second, relative, start, {})

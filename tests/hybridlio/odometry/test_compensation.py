@@ -94,10 +94,10 @@ def test_the_error_left_by_compensation_has_the_predicted_variance(rng, imu):
 def test_a_frame_without_point_times_passes_unchanged_and_without_noise(rng):
     frame, points = sweep(1, rng)
     compensation = MotionCompensation(Calibration(), ImuNoise())
-    compensated = compensation.compensate(frame, np.eye(4), 0, SWEEP_NS, np.zeros(3))
+    compensated = compensation.compensate(frame, np.eye(4), 0, SWEEP_NS, None, ImuSamples.empty())
     np.testing.assert_allclose(compensated.scan.points, points, atol=1e-4)
     assert compensation.noise(frame) is not None
-    assert compensation.compensate(compensated, np.eye(4), 0, SWEEP_NS, np.zeros(3)) is compensated
+    assert compensation.compensate(compensated, np.eye(4), 0, SWEEP_NS, None, ImuSamples.empty()) is compensated
     assert compensation.noise(compensated) is None
 
 

@@ -1,0 +1,67 @@
+"""The lidar's motion around a sweep by the IMU, sample by sample."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hybridlio.core import se3
+from hybridlio.core.arrays import Array
+from hybridlio.core.estimates import State
+from hybridlio.core.sensors import LONGEST_INTERPOLATION_NS, NS_PER_S, Calibration, ImuSamples
+from hybridlio.core.trajectory import Trajectory
+
+
+def inertial_motion(
+    imu: ImuSamples, state: State, T_start_end: Array, end_ns: int, calibration: Calibration
+) -> Trajectory | None:
+    """Return lidar poses at the samples: rotation from the gyroscope, and the bend of the path from the accelerometer.
+
+    A drone or a hand turns without its path turning with it, and a car does the opposite; the accelerometer tells them
+    apart. The speed is such that the path leads through both ends of ``T_start_end``.
+
+    Args:
+        imu: samples from the state's stamp, or before it, to beyond ``end_ns``.
+        state: attitude, gravity and biases at the begin of the motion.
+        T_start_end: ``(4, 4)`` lidar motion from the state's stamp to ``end_ns``.
+        end_ns: a stamp.
+        calibration: the extrinsics.
+
+    Returns:
+        Poses ``T_world_lidar`` at the samples' stamps; None if there is no sample at both ends, or a gap.
+    """
+    stamps = imu.stamps_ns
+    i, j = np.searchsorted(stamps, (state.stamp_ns, end_ns))
+    if not (i < j < len(stamps) and stamps[i] == state.stamp_ns and stamps[j] == end_ns):
+        return None
+    if np.diff(stamps).max() > LONGEST_INTERPOLATION_NS:
+        return None
+    since_s = (stamps - state.stamp_ns) / NS_PER_S
+    R_world_imu = _rotations(imu.gyro_rad_s - state.gyro_bias_rad_s, since_s)
+    R_world_imu = state.T_world_imu[:3, :3] @ R_world_imu[i].T @ R_world_imu
+    force = (imu.accel_m_s2 - state.accel_bias_m_s2)[..., None]
+    bend = _bend((R_world_imu @ force)[..., 0] + state.gravity_m_s2, since_s, int(i))
+    T_imu_lidar = calibration.T_imu_lidar
+    step = T_imu_lidar @ T_start_end @ se3.inverse(T_imu_lidar)
+    velocity = (state.T_world_imu[:3, :3] @ step[:3, 3] - bend[j]) / since_s[j]
+    poses = se3.make(R_world_imu, bend + since_s[:, None] * velocity)
+    return Trajectory(stamps, poses @ T_imu_lidar)
+
+
+def _rotations(rates: Array, times_s: Array) -> Array:
+    """Integrate angular rates ``(S, 3)`` to rotations ``(S, 3, 3)`` relative to the first."""
+    turns = se3.so3_exp((rates[1:] + rates[:-1]) / 2 * np.diff(times_s)[:, None])
+    out = [np.eye(3)]
+    for turn in turns:
+        out.append(out[-1] @ turn)
+    return np.array(out)
+
+
+def _bend(acceleration: Array, times_s: Array, at: int) -> Array:
+    """Integrate accelerations ``(S, 3)`` twice, to zero displacement and velocity at sample ``at``."""
+    steps = np.diff(times_s)[:, None]
+    before, after = acceleration[:-1], acceleration[1:]
+    zero = np.zeros((1, 3))
+    velocity = np.concatenate([zero, np.cumsum((before + after) / 2 * steps, axis=0)])
+    # linear between two samples
+    moved = np.concatenate([zero, np.cumsum(velocity[:-1] * steps + (2 * before + after) / 6 * steps**2, axis=0)])
+    return np.asarray(moved - moved[at] - velocity[at] * (times_s - times_s[at])[:, None])
