@@ -109,6 +109,17 @@ class ImuSamples:
         """Return an object without samples."""
         return cls(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)))
 
+    @classmethod
+    def concatenate(cls, parts: list[ImuSamples]) -> ImuSamples:
+        """Return the samples of consecutive or overlapping intervals in order; equal stamps are kept once."""
+        parts = [part for part in parts if len(part)]
+        if not parts:
+            return cls.empty()
+        stamps, first = np.unique(np.concatenate([part.stamps_ns for part in parts]), return_index=True)
+        gyro = np.concatenate([part.gyro_rad_s for part in parts])[first]
+        accel = np.concatenate([part.accel_m_s2 for part in parts])[first]
+        return cls(stamps, gyro, accel)
+
     def between(self, start_ns: int, end_ns: int) -> ImuSamples:
         """Return the samples from ``start_ns`` to ``end_ns``, with linearly interpolated ones at both ends.
 

@@ -11,7 +11,6 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import State
 from hybridlio.core.sensors import Calibration, Frame, ImuNoise, ImuSamples
 from hybridlio.odometry.inertial_motion import inertial_motion
-from hybridlio.record.recorder import concatenate_imu
 
 
 class MotionCompensation:
@@ -49,7 +48,7 @@ class MotionCompensation:
             return frame
         motion = None
         if state is not None and len(imu):
-            samples = concatenate_imu([imu, frame.sweep_imu])
+            samples = ImuSamples.concatenate([imu, frame.sweep_imu])
             motion = inertial_motion(samples, state, T_start_end, end_ns, self._calibration)
         if motion is None:
             step = constant_twist(T_start_end, start_ns, end_ns)

@@ -17,7 +17,6 @@ from hybridlio.core.sensors import NS_PER_S, Frame, ImuSamples, Scan
 from hybridlio.core.start_state import start_state
 from hybridlio.odometry.pipeline import Pipeline
 from hybridlio.record.record import Record
-from hybridlio.record.recorder import concatenate_imu
 
 _log = logging.getLogger(__name__)
 
@@ -55,7 +54,7 @@ def start_backend(pipeline: Pipeline, second: Frame) -> State:
     before = ImuSamples.empty()
     if len(first.imu):
         before = first.imu.between(first.scan.stamp_ns - _LEVELLING_NS, first.scan.stamp_ns)
-    samples = concatenate_imu([before, second.imu])
+    samples = ImuSamples.concatenate([before, second.imu])
     pipeline.start = start_state(first.scan.stamp_ns, samples, pipeline.imu_noise)
     pipeline.backend.start(pipeline.start)
     return pipeline.start

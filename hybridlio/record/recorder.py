@@ -88,7 +88,7 @@ class Recorder:
             initial=tuple(initial for initial, _ in steps),
             relative=tuple(relative for _, relative in steps),
             # an interrupted `add` may have left samples and fixes of the scan after the last
-            imu=concatenate_imu(self._imu).between(start.stamp_ns, last_ns),
+            imu=ImuSamples.concatenate(self._imu).between(start.stamp_ns, last_ns),
             gps=tuple(sorted((f for f in self._gps if f.stamp_ns <= last_ns), key=lambda fix: fix.stamp_ns)),
             start=start,
             calibration=calibration,
@@ -121,14 +121,3 @@ def _steps(arrays: dict[str, Any]) -> Iterator[tuple[RelativePose, RelativePose]
     return zip(
         relative_poses("initial", arrays), with_earlier_scans(relative_poses("relative", arrays), arrays), strict=True
     )
-
-
-def concatenate_imu(parts: list[ImuSamples]) -> ImuSamples:
-    """Concatenate samples of consecutive intervals; a sample on a common border is kept once."""
-    parts = [part for part in parts if len(part)]
-    if not parts:
-        return ImuSamples.empty()
-    stamps, first = np.unique(np.concatenate([part.stamps_ns for part in parts]), return_index=True)
-    gyro = np.concatenate([part.gyro_rad_s for part in parts])[first]
-    accel = np.concatenate([part.accel_m_s2 for part in parts])[first]
-    return ImuSamples(stamps, gyro, accel)

@@ -19,7 +19,6 @@ from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSa
 from hybridlio.core.start_state import start_state
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.record.record import Record
-from hybridlio.record.recorder import concatenate_imu
 from hybridlio.simulation.drive.path import SmoothPath
 from hybridlio.simulation.rig import GRAVITY_WORLD_M_S2, IMU_RATE_HZ, SCAN_RATE_HZ
 from hybridlio.simulation.sensors.imu import ideal_imu
@@ -95,7 +94,7 @@ class Chain:
     def record(self, online: Array) -> Record:
         """Return a run's record with the online lidar poses ``online`` ``(N, 4, 4)``."""
         stamps = np.array([frame.scan.stamp_ns for frame in self.frames])
-        imu = concatenate_imu([frame.imu for frame in self.frames[1:]])
+        imu = ImuSamples.concatenate([frame.imu for frame in self.frames[1:]])
         trajectory = Trajectory(stamps, online, np.tile(np.eye(6), (len(stamps), 1, 1)))
         steps = tuple(self.relative)
         return Record(trajectory, steps, steps, imu, (), self.start, self.calibration, self.noise)

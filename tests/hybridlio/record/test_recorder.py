@@ -11,7 +11,7 @@ from hybridlio.core.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.core.start_state import start_state
 from hybridlio.record.loop_keyframes import LoopKeyframes, LoopKeyframeSelector, LoopKeyframeSettings
 from hybridlio.record.record import Record
-from hybridlio.record.recorder import Recorder, concatenate_imu
+from hybridlio.record.recorder import Recorder
 
 STEP_NS = 10**8
 
@@ -133,7 +133,7 @@ def test_an_interrupt_at_any_line_of_add_keeps_the_previous_scans(monkeypatch, s
 def test_samples_on_a_common_border_are_kept_once():
     stamps = np.arange(11) * 10**7
     whole = ImuSamples(stamps, np.arange(33.0).reshape(11, 3), np.arange(33.0).reshape(11, 3))
-    again = concatenate_imu([whole.between(0, 5 * 10**7), ImuSamples.empty(), whole.between(5 * 10**7, 10**8)])
+    again = ImuSamples.concatenate([whole.between(0, 5 * 10**7), ImuSamples.empty(), whole.between(5 * 10**7, 10**8)])
     np.testing.assert_array_equal(again.stamps_ns, stamps)
     np.testing.assert_array_equal(again.gyro_rad_s, whole.gyro_rad_s)
-    assert len(concatenate_imu([])) == 0
+    assert len(ImuSamples.concatenate([])) == 0
