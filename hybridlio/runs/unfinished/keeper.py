@@ -23,9 +23,9 @@ from hybridlio.runs.unfinished.identity import header_of, points_digest
 from hybridlio.runs.whole_folder import JOURNAL, STATE
 
 _BLOCK_SCANS, _BLOCK_S = 50, 1.0  # what a kill may cost, whichever comes first
-_STATE_SHARE = (
-    0.004  # of the time that storing the state may take; storing estimates takes 0.3 % (benchmarks/keeping.py)
-)
+# Share of the time that storing the state may take; storing estimates takes 0.3 % (benchmarks/keeping.py).
+_STATE_SHARE = 0.004
+_STATE_AFTER_S = 10.0  # at the latest: a resumed run estimates these seconds again
 
 
 class Keeper:
@@ -91,7 +91,7 @@ class Keeper:
         rows = len(self._run.estimates)
         if rows == self._rows:
             return
-        start_s = time.perf_counter()
+        start_s, start_cpu_s = time.perf_counter(), time.thread_time()
         block = self._block()
         is_due = with_state and start_s >= self._state_due_s
         state = self._state() if is_due else None
@@ -99,7 +99,8 @@ class Keeper:
         self._rows, self._written_s = rows, start_s
         self._writing = self._writer.submit(self._put, block, state)
         if is_due:
-            self._state_due_s = start_s + (time.perf_counter() - start_s + self._state_write_s) / _STATE_SHARE
+            spent_s = time.thread_time() - start_cpu_s + self._state_write_s  # a busy machine makes neither longer
+            self._state_due_s = start_s + min(spent_s / _STATE_SHARE, _STATE_AFTER_S)
 
     def _wait(self) -> None:
         """Wait until everything that was given to the thread is on the disk."""
