@@ -181,16 +181,12 @@ TABLE = [
         _UNKNOWN_ROTATION_SIGMA_RAD=("1e-5", "10.0"),
         _LEVER_M=("0.0", "1e4"),
         _LOST_COST=("0.01", "1.0"),
+        _LOST_SCANS=("1", "50"),
         _YOUNG_MAP_INFLATION=("0.0", "100.0"),
         _YOUNG_MAP_DRIFT_SHARE=("0.0", "50.0"),
         _UNCHANGED_MAP_DRIFT_SHARE=("0.5", "0.0"),
     ),
-    *_in(
-        "hybridlio/sources/thinned_scan.py",
-        MATCHING,
-        _VOXEL_SHRINKAGE=("0.1",),
-        _AMPLE=("0.1",),
-    ),
+    *_in("hybridlio/sources/thinned_scan.py", MATCHING, _VOXEL_SHRINKAGE=("0.1",), _AMPLE=("0.1",)),
     *_in(
         "hybridlio/sources/scene_scale.py",
         (f"{SOURCES}scene_scale.py",),

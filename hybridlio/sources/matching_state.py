@@ -46,6 +46,7 @@ class MatchingState:
             If the IMU is wrong, the next scan is still found from here.
         keyframe: ``(N, 3)`` points of the last scan, lidar frame, that go into the map before the next scan is matched;
             None where the scan is no keyframe. They wait because the scan may be taken back.
+        unmatched: number of scans in a row that had enough points and did not fit the map.
         adrift: whether the last scan's position relative to the map is unknown. The next keyframe starts a new map.
     """
 
@@ -54,6 +55,7 @@ class MatchingState:
     doubted: PathPoint | None = None
     keyframe: Array | None = None
     adrift: bool = False
+    unmatched: int = 0
 
     @classmethod
     def started(cls, keyframe: Array) -> MatchingState:
@@ -97,6 +99,11 @@ class MatchingState:
     def keyframe_inserted(self) -> MatchingState:
         """Return the state after the pending keyframe has gone into the map."""
         return replace(self, keyframe=None)
+
+    def restarted(self, keyframe: Array) -> MatchingState:
+        """Return the state in which a new map starts at the last scan, because scans no longer fit the old one."""
+        here = replace(self.current, bridge_covariance=np.zeros((6, 6)), map_changed=True)
+        return replace(self, current=here, keyframe=keyframe, adrift=True, unmatched=0)
 
     @property
     def last_found(self) -> PathPoint:

@@ -30,6 +30,9 @@ from hybridlio.sources.thinned_scan import ThinnedScan, thin
 _UNKNOWN_ROTATION_SIGMA_RAD = 0.02
 _LEVER_M = 10.0  # half of a scan's points are nearer; turns a rotation's uncertainty into a displacement
 _LOST_COST = 0.6  # mean cost of the points, 0 to 1; well above that of any scan that is placed correctly
+# A new map starts after this number of scans in a row that have enough points and do not fit. A passing occlusion lasts
+# less than half a second at 10 Hz; bridging longer adds more error than a new map, which starts at the bridges' error.
+_LOST_SCANS = 5
 # The local map is least reliable while it is young: one keyframe has ground along its own rings only, and normals
 # between them are guesses. Its covariance is inflated by 1 + 5/keyframes, and at least half of it, divided by
 # the number of keyframes, is drift, because the map is as wrong as the few scans that it consists of.
@@ -159,13 +162,19 @@ class ScanMatching:
         """Move the state on by the initial pose and return that pose as a failed step."""
         is_first = self._map.surface is None  # no scan so far had planes to match
         self._state = self._state.bridged(initial, scan.points if is_first else None)
-        points = len(scan.points)
+        drift, points = self._drift(_FLOOR_COVARIANCE, map_changed=False), len(scan.points)
+        if observed is not None:
+            self._state = replace(self._state, unmatched=self._state.unmatched + 1)
+            if self._state.unmatched >= _LOST_SCANS:
+                # the new map lies beside the old one by the error of all bridges since the last match
+                drift = None if drift is None else self._state.current.bridge_covariance
+                self._state = self._state.restarted(scan.points)
         return RelativePose(
             initial.pose,
             initial.covariance,
             source=initial.source,
             ok=False,
-            drift=self._drift(_FLOOR_COVARIANCE, map_changed=False),
+            drift=drift,
             from_imu=initial.from_imu,
             details=_details(observed.registration, points) if observed else {"points": float(points)},
         )

@@ -90,3 +90,15 @@ def test_a_match_taken_back_is_replaced_by_the_initial_pose_but_remembered(match
     again = state.matched(STEP @ STEP, 0.1, is_degenerate=False, is_vague=False)
     np.testing.assert_allclose(again.current.twist, TWIST, atol=1e-12)  # from where the scan was found
     assert again.doubted is None
+
+
+def test_a_new_map_starts_where_the_bridges_led_without_their_error(matched: MatchingState):
+    """The error of the bridges belongs to the step to the new map, and not to the steps within it."""
+    keyframe = np.ones((7, 3))
+    lost = matched.bridged(RelativePose(np.eye(4), np.eye(6), "guess"))
+    restarted = lost.restarted(keyframe)
+    np.testing.assert_array_equal(restarted.current.T_map_lidar, lost.current.T_map_lidar)
+    assert restarted.keyframe is keyframe
+    assert restarted.adrift
+    assert restarted.current.map_changed
+    assert not restarted.current.bridge_covariance.any()

@@ -273,6 +273,25 @@ def test_a_bridged_scan_does_not_enter_the_map(sequence: Sequence, frames: list[
     np.testing.assert_array_equal(answers[0], answers[1])
 
 
+@pytest.mark.parametrize("target", TARGETS)
+def test_scans_that_no_longer_fit_start_a_new_map(target: str, sequence: Sequence, frames: list[Frame]):
+    """As after a gap: a few are bridged, and the next ones are matched to each other."""
+    matching = ScanMatching(ScanMatchingSettings(target=target))
+    rng = np.random.default_rng(2)
+    matching.start(with_points(frames[0], rng.uniform([-60, -60, 10], [60, 60, 130], (20_000, 3))))
+    known = [matching.refine(frames[k], guess(true_pose(sequence, k - 1, k))) for k in range(1, 10)]
+    bridged = [not step.ok for step in known]
+    first_again = bridged.index(False)
+    assert 3 <= first_again <= 8
+    assert not any(bridged[first_again:])
+    truth = true_pose(sequence, first_again, first_again + 1)
+    assert error(known[first_again].pose, truth)[1] < 0.05
+    if target == "local-map":  # the path of the map gets the covariance of all bridges together
+        drift = known[first_again - 1].drift
+        assert drift is not None
+        assert np.trace(drift) == pytest.approx(first_again * np.trace(SURE), rel=0.2)
+
+
 @pytest.mark.parametrize("points", [0, 40])
 def test_a_first_scan_with_too_few_points_is_refused(points: int, frames: list[Frame]):
     poor = with_points(replace(frames[0], index=17), frames[0].scan.points[:points])

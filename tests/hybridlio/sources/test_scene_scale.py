@@ -93,6 +93,15 @@ def test_a_narrow_lidar_gets_voxels_that_leave_enough_points():
     assert settings.registration == DEFAULTS.registration
 
 
+def test_voxels_of_a_room_are_not_made_finer():
+    """They are as small already; below a decimetre voxels average away too little noise."""
+    room, few = SceneScale(DEFAULTS), SceneScale(DEFAULTS)
+    for _ in range(20):
+        room.observe(2.3, *AMPLE)
+        few.observe(2.3, 1500, 14_400)
+    assert few.settings.map_voxel_m == room.settings.map_voxel_m
+
+
 def test_voxels_are_no_finer_than_the_measured_points():
     """A scan of 1,000 points has no more, however fine the voxels."""
     assert street_seen_by(900, 1000)[0].settings == DEFAULTS
