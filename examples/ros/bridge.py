@@ -35,7 +35,7 @@ class Bridge:
     ) -> None:
         stated = read_calibration_yaml(Path(calibration), needs_imu=True)
         self._clouds, self._publish_predicted = LiveClouds(stated.format), publish_predicted
-        self._imu_offset_ns = stated.imu_time_offset_ns
+        self._imu_offset_ns = round((stated.imu_time_offset_s or 0.0) * 1e9)
         self._lock = threading.Lock()  # callbacks may come from several threads
         self.lidar_frame = "lidar"
         self.stream = hl.OdometryStream(
