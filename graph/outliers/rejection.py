@@ -32,6 +32,7 @@ from hybridlio.graph.solve.settings import IterationProgress
 # graph that its poses move by more than their standard deviations.
 _CHANCE_OF_A_LOSS = 0.1
 _GROWTHS = 3.0, 2.0, 1.5  # of the rounds of the searches: the finer, the more of them
+_LOST_SHARE = 0.05  # of confirmed loops whose rejection asks for a second look: few wrong loops agree with a neighbour
 _SAME_SHARE = 0.01  # of loops on which two searches may differ and still agree: some lie at the bound
 
 
@@ -83,7 +84,7 @@ def reject_outliers(data: GraphData, start: Array | None, report: IterationProgr
             break
         found.append(search())
     best = min(found, key=lambda one: one.cost)
-    if not _agreed(found):
+    if not _agreed(found) or _lost_support(best, support) > _LOST_SHARE:
         best = repaired(solver, best)
     wrong = frozenset(solver.loops.ids[~best.correct].tolist())
     poses = poses_of(best.values, data.dimension)
@@ -117,9 +118,9 @@ def _more_searches(solver: WeightedSolver, start: gtsam.Values, support: LoopSup
     """Yield further searches, the most different ones first."""
     if support is None:
         return
-    none_confirmed = LoopSupport(support.scale, np.zeros_like(support.supported))
+    as_stated = LoopSupport(1.0, np.zeros_like(support.supported))  # noise as stated, and no loop before the others
+    yield lambda: nearest_first(solver, start, as_stated, _GROWTHS[1])
     yield lambda: nearest_first(solver, start, support, _GROWTHS[1])
-    yield lambda: nearest_first(solver, start, none_confirmed, _GROWTHS[1])
     yield lambda: nearest_first(solver, start, support, _GROWTHS[2])
 
 
@@ -131,6 +132,13 @@ def _agreed(found: list[Found]) -> bool:
     return bool(np.mean(best.correct != second.correct) <= _SAME_SHARE)
 
 
+def _lost_support(best: Found, support: LoopSupport | None) -> float:
+    """Return the share of the loops confirmed by a neighbour that are rejected."""
+    if support is None or not support.supported.any():
+        return 0.0
+    return float(np.mean(~best.correct[support.supported]))
+
+
 def _doubts(best: Found, found: list[Found], support: LoopSupport | None, reached: bool) -> tuple[str, ...]:
     doubts = []
     if not reached:
@@ -140,7 +148,6 @@ def _doubts(best: Found, found: list[Found], support: LoopSupport | None, reache
     rejected = np.mean(~best.correct)
     if rejected > 0.5:
         doubts.append(f"{100 * rejected:.0f} % of the loops are rejected")
-    lost = support.supported & ~best.correct if support is not None else np.zeros(1, dtype=bool)
-    if support is not None and 2 * np.count_nonzero(lost) > np.count_nonzero(support.supported) > 0:
+    if _lost_support(best, support) > 0.5:
         doubts.append("most loops that confirm one another are rejected")
     return tuple(doubts)
