@@ -6,7 +6,8 @@ Navigation" (2001), §5.4.2). Where both covariances are right it is χ² distri
 
 A difference alone does not tell which side is wrong. The scans do, because each is registered to the map by itself:
 if the path that they found is smooth while the IMU contradicts two steps of it in a row, the IMU is wrong. If the path
-jumps, or moves on beside its jump as the IMU predicts, the scan is.
+jumps, or moves on beside its jump as the IMU predicts, the scan is. Scans that leave a direction unconstrained, as those
+of a narrow lidar on open ground do, drift smoothly and are no judges of the IMU.
 """
 
 from __future__ import annotations
@@ -125,6 +126,7 @@ class InnovationGate:
         self._rejected_in_a_row = 0
         self._undecided = False
         self._motion = MotionChange()
+        self._determined_in_a_row = 0  # scans until now that constrain every direction
         # the last scan, where it was found, in the pose that the source's path has for it; None if they are the same
         self._found: Array | None = None
 
@@ -146,6 +148,8 @@ class InnovationGate:
             leaves_out_imu: the IMU is not to be used; only its innovation is wanted.
         """
         self._steps += 1
+        is_determined = measured.ok and not len(measured.degenerate)
+        self._determined_in_a_row = self._determined_in_a_row + 1 if is_determined else 0
         own = measured
         if self._found is not None:
             own = replace(measured, pose=se3.between(self._found, measured.pose))
@@ -158,7 +162,7 @@ class InnovationGate:
         if measured.ok and result.verdict in _MOVES_ON:
             # the IMU confirms the path: then the step to this scan is from the bridge, not from a scan found wrongly
             step = measured.pose if result.verdict == "accepted" else own.pose
-            is_typical = self._found is None and result.verdict in ("untested", "accepted")
+            is_typical = is_determined and self._found is None and result.verdict in ("untested", "accepted")
             self._motion.learn(step, dt_s, is_typical)
         taken_back = result.takes_back and self._takes_back
         self._found = se3.between(bridge.pose, measured.pose) if taken_back else None
@@ -182,7 +186,8 @@ class InnovationGate:
             self._rejected_in_a_row = 0
             return measured, GateResult("accepted", nis, parts)
         contradicts_path = normalised_innovation_squared(own, predicted) > GATE_NIS
-        smooth = self._motion.continues(own.pose, dt_s) and contradicts_path
+        can_judge = self._determined_in_a_row > WARM_UP_STEPS
+        smooth = can_judge and contradicts_path and self._motion.continues(own.pose, dt_s)
         if self._rejected_in_a_row > MAX_REJECTIONS or (smooth and was_undecided):
             return measured, GateResult("IMU left out", nis, parts)
         if smooth:
