@@ -6,8 +6,8 @@ Navigation" (2001), §5.4.2). Where both covariances are right it is χ² distri
 
 A difference alone does not tell which side is wrong. The scans do, because each is registered to the map by itself:
 if the path that they found is smooth while the IMU contradicts two steps of it in a row, the IMU is wrong. If the path
-jumps, or moves on beside its jump as the IMU predicts, the scan is. Scans that leave a direction unconstrained, as those
-of a narrow lidar on open ground do, drift smoothly and are no judges of the IMU.
+jumps, or moves on beside its jump as the IMU predicts, the scan is. Scans that leave a direction unconstrained, as
+those of a narrow lidar on open ground do, drift smoothly and are no judges of the IMU.
 """
 
 from __future__ import annotations
