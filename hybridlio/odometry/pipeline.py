@@ -27,6 +27,12 @@ _CONTRADICTS = (
     "frame %d: the IMU's %s contradict the scans, which move on smoothly; its samples are left out until they agree "
     "again. If this happens often, check T_imu_lidar, units and clock"
 )
+_NOISY = (
+    "frame %d: the IMU's %s differ from the scans' motion %.0f times as much as their stated noise explains; they are "
+    "believed that much less. State their noise (imu_noise), or check T_imu_lidar, units and clock"
+)
+# Noise of an IMU on a platform that shakes is a few times that of its data sheet; wrong units or axes make more of it.
+_NOISE_FACTOR_WARNED = 5.0
 
 
 @dataclass(eq=False)
@@ -141,6 +147,11 @@ class Pipeline:
             level = logging.INFO if self._has_warned else logging.WARNING
             self._has_warned = True
             _log.log(level, _CONTRADICTS, frame.index, which)
+        worst = int(self.trust.noise_factors.argmax())
+        factor = float(self.trust.noise_factors[worst])
+        if factor > _NOISE_FACTOR_WARNED and not self._has_warned:
+            self._has_warned = True
+            _log.warning(_NOISY, frame.index, ("angular rates", "accelerations")[worst], factor)
 
     def correct(self, frame: Frame, initial: RelativePose, relative: RelativePose, step: RelativePose) -> None:
         """Let the initial-pose source learn from the backend's step, unless the step is only its own prediction."""

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hybridlio.core.arrays import Array
 from hybridlio.core.sensors import NS_PER_S, Frame, ImuNoise, ImuSamples
 from hybridlio.sources.innovation_gate import GATE_NIS, GateResult
 
@@ -43,7 +44,7 @@ class ImuTrust:
     @property
     def noise(self) -> ImuNoise:
         """Noise densities that explain the innovations."""
-        gyro, accel = np.exp(self._log_scale / 2)
+        gyro, accel = self.noise_factors
         stated = self._stated
         return replace(
             stated,
@@ -52,6 +53,11 @@ class ImuTrust:
             gyro_walk_rad_s2_sqrt_hz=gyro * stated.gyro_walk_rad_s2_sqrt_hz,
             accel_walk_m_s3_sqrt_hz=accel * stated.accel_walk_m_s3_sqrt_hz,
         )
+
+    @property
+    def noise_factors(self) -> Array:
+        """How many times the stated noise explains the innovations of gyroscope and accelerometer, ``(2,)``."""
+        return np.asarray(np.exp(self._log_scale / 2))
 
     def learn(self, result: GateResult, stamp_ns: int) -> None:
         """Take the gate's result of the step to the scan at ``stamp_ns``."""

@@ -41,8 +41,9 @@ class GateResult:
 
             * ``untested``: passed on; there is no usable prediction, or the run is in its first steps.
             * ``accepted``: passed on; the innovation is within the gate.
-            * ``undecided``: replaced by the bridge, whose covariance spans both; the IMU's samples are left out too.
-              The residual source is asked to take the scan back; the next scan decides.
+            * ``undecided``: a gross contradiction on a smooth path; replaced by the bridge, whose covariance spans
+              both; the IMU's samples are left out too. The residual source is asked to take the scan back; the next
+              scan decides.
             * ``IMU left out``: passed on without the IMU's samples, which contradict the scans or did so lately.
             * ``down-weighted``: passed on with a covariance inflated until the innovation is at the gate.
             * ``rejected``: replaced by the bridge; the residual source is asked to take the scan back.
@@ -190,7 +191,7 @@ class InnovationGate:
         smooth = can_judge and contradicts_path and self._motion.continues(own.pose, dt_s)
         if self._rejected_in_a_row > MAX_REJECTIONS or (smooth and was_undecided):
             return measured, GateResult("IMU left out", nis, parts)
-        if smooth:
+        if smooth and nis > GROSS_NIS:  # smaller contradictions are the covariances': scans that a lidar repeats badly
             self._undecided = True
             return _either(measured, bridge, nis), GateResult("undecided", nis, parts)
         if nis <= GROSS_NIS:

@@ -30,7 +30,7 @@ def test_the_first_second_or_so_is_not_gated():
 
 @pytest.mark.parametrize(
     ("sigmas", "verdict"),
-    [(3.5, "accepted"), (7.0, "undecided"), (12.0, "down-weighted"), (25.0, "rejected")],
+    [(3.5, "accepted"), (7.0, "down-weighted"), (12.0, "down-weighted"), (25.0, "rejected")],
 )
 def test_the_verdict_follows_the_number_of_sigmas(sigmas: float, verdict: str):
     gate = InnovationGate()
