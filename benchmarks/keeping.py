@@ -64,8 +64,12 @@ def main() -> None:
         ]
         print(f"the run waits {shares[0]:.2f} % of the time, {shares[1]:.2f} % of its processor time", end="")
         print(f"; a thread beside it uses {shares[2]:.2f} %")
-        sizes = [(folder / file).stat().st_size for file in (JOURNAL, STATE)]
+        files = [folder / name for name in (JOURNAL, STATE)]  # a short run ends before its state is due
+        sizes = [file.stat().st_size if file.is_file() else 0 for file in files]
         print(f"journal {sizes[0] / run.done / 1e3:.1f} kB a scan, state {sizes[1] / 1e6:.1f} MB")
+        if not sizes[1]:
+            print("too short for a state to resume from; give more scans")
+            return
         start_s = time.perf_counter()
         resumed, _ = resume_run(folder, sequence, config, Odometry())
         spent_s = time.perf_counter() - start_s

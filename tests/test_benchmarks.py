@@ -127,7 +127,7 @@ def test_the_cost_of_keeping_a_run_is_printed(tiny_drive):
     done = run("keeping.py", tiny_drive, "--frames", ":12")
     assert done.returncode == 0, done.stderr
     assert "12 scans" in done.stdout
-    assert "ms a scan" in done.stdout
+    assert "kB a scan" in done.stdout
 
 
 def test_the_latency_of_a_stream_is_measured(tiny_drive, tmp_path):

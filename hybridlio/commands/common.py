@@ -67,7 +67,8 @@ ReaderName = Annotated[
     typer.Option(
         "--reader",
         metavar="NAME",
-        help="kitti-raw, kitti-odometry, folder or rosbag; by default detected from the files.",
+        help="kitti-raw, kitti-odometry, folder, rosbag, ouster, velodyne, or a data set: kitti-360, nuscenes, nclt, "
+        "mulran, helipr, boreas, newer-college, argoverse-2, apollo; by default detected from the files.",
     ),
 ]
 RawRoot = Annotated[

@@ -65,7 +65,9 @@ def simulate(
 
     The same options give the same files to the last byte. The same command resumes an interrupted simulation.
     """
+    from hybridlio.datasets.protection import check_output
     from hybridlio.runs.own_files import RUN
+    from hybridlio.runs.whole_folder import held
     from hybridlio.simulation.choices import Scene
 
     place = out.expanduser().resolve()
@@ -78,7 +80,10 @@ def simulate(
     }  # fmt: skip
     body = {"platform": platform, "imu": imu}
     is_road = scene in get_args(Scene)
-    _write(out, *(_road_drive(common | road, body) if is_road else _platform(common | body, road)))
+    config, write = _road_drive(common | road, body) if is_road else _platform(common | body, road)
+    check_output(out, may_hold=True)
+    with held(place / f"drive-{config.seed:04d}"):
+        _write(out, config, write)
 
 
 def _road_drive(values: dict[str, Any], others: dict[str, Any]) -> tuple[Any, Any]:

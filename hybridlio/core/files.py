@@ -78,10 +78,12 @@ def locked(lock_file: Path, wait: bool = True) -> Iterator[str | None]:
     Raises:
         DataError: the file cannot be created.
     """
-    make_folder(lock_file.parent)
     while True:
+        make_folder(lock_file.parent)
         try:
             file = lock_file.open("a+", encoding="utf-8")
+        except FileNotFoundError:
+            continue  # the process that held the lock has removed the folder meanwhile
         except OSError as error:
             raise DataError(f"cannot write to {lock_file.parent}: {error.strerror}; choose another folder") from None
         with file:

@@ -214,8 +214,8 @@ def _find(root: Path, reader: str | None) -> tuple[str, dict[str, Path]]:
     if root.is_file():
         tried = [name for name in tried if root.suffix in READERS[name].suffixes]
     if not tried:
-        known = ", ".join(suffix for one in READERS.values() for suffix in one.suffixes)
-        raise DataError(f"{root}: not a folder; give a recording's folder, or a bag ({known})")
+        known = ", ".join(dict.fromkeys(suffix for one in READERS.values() for suffix in one.suffixes))
+        raise DataError(f"{root}: not a folder; give a recording's folder, or a bag or capture ({known})")
     for name in tried:
         found = READERS[name].find(root)
         if found:

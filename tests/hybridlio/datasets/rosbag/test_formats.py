@@ -233,5 +233,5 @@ def test_a_file_that_is_no_bag_is_refused(tmp_path: Path) -> None:
         with pytest.raises(DataError, match=rf"{name}: cannot be read, the bag is truncated or damaged"):
             open_sequence(tmp_path / name)
     (tmp_path / "a.txt").write_text("hello")
-    with pytest.raises(DataError, match=r"a.txt: not a folder; give a recording's folder, or a bag \(.bag, .mcap"):
+    with pytest.raises(DataError, match=r"a.txt: not a folder; give .*, or a bag or capture \(.*\.bag, \.mcap"):
         open_sequence(tmp_path / "a.txt")
