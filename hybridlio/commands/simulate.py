@@ -65,14 +65,8 @@ def simulate(
 
     The same options give the same files to the last byte. The same command resumes an interrupted simulation.
     """
-    from hybridlio.datasets.protection import check_output
-    from hybridlio.runs.own_files import RUN
-    from hybridlio.runs.whole_folder import held
     from hybridlio.simulation.choices import Scene
 
-    place = out.expanduser().resolve()
-    if run := next((above for above in (place, *place.parents) if RUN.are_in(above)), None):
-        raise ConfigError(f"{out} is or lies inside the run folder {run}; choose another folder")
     common = {"seconds": seconds, "seed": seed, "scene": scene, "lidar": lidar, "start_moving": not start_at_rest}
     road = {
         "length_m": length_m, "speed_m_s": speed, "driving": driving, "gps": gps, "loops": loops, "poses": poses,
@@ -81,9 +75,7 @@ def simulate(
     body = {"platform": platform, "imu": imu}
     is_road = scene in get_args(Scene)
     config, write = _road_drive(common | road, body) if is_road else _platform(common | body, road)
-    check_output(out, may_hold=True)
-    with held(place / f"drive-{config.seed:04d}"):
-        _write(out, config, write)
+    _write(out, config, write)
 
 
 def _road_drive(values: dict[str, Any], others: dict[str, Any]) -> tuple[Any, Any]:
@@ -126,10 +118,17 @@ def _validated(kind: Any, values: dict[str, Any]) -> Any:
 
 
 def _write(out: Path, config: Any, write: Any) -> None:
+    from hybridlio.datasets.protection import check_output
     from hybridlio.datasets.registry import open_sequence
+    from hybridlio.runs.own_files import RUN
+    from hybridlio.runs.whole_folder import held
 
+    place = out.expanduser().resolve()
+    if run := next((above for above in (place, *place.parents) if RUN.are_in(above)), None):
+        raise ConfigError(f"{out} is or lies inside the run folder {run}; choose another folder")
+    check_output(out, may_hold=True)
     try:
-        with progress("simulating") as report:
+        with held(place / f"drive-{config.seed:04d}"), progress("simulating") as report:
             folder = write(out, config, report)
     except KeyboardInterrupt:
         print_message("interrupted; the same command resumes the simulation")
