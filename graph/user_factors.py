@@ -30,7 +30,7 @@ class UserFactors(LandmarkMeasurements):
     ) -> int:  # fmt: skip
         """Add a residual of some poses, which is zero in the mean.
 
-        A call costs about 20 µs on top of the function's own time; without a Jacobian each linearisation calls the
+        A call costs about 40 µs on top of the function's own time; without a Jacobian each linearisation calls the
         function 12 times for each pose (6 in the plane).
 
         Args:
