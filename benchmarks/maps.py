@@ -17,37 +17,18 @@ import numpy as np
 import hybridlio as hl
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.sensors import Calibration
 from hybridlio.core.trajectory import Trajectory
-from hybridlio.datasets.sequence import Sequence
 from hybridlio.mapping.build import build_map
 from hybridlio.mapping.point_map import PointMap
 from hybridlio.mapping.settings import MapSettings
 from hybridlio.simulation.config import SimulationConfig
-from hybridlio.simulation.measurements import imu_samples, lidar_poses, scan_at, scan_stamps_ns
+from hybridlio.simulation.measurements import lidar_poses
 from hybridlio.simulation.plan import Drive, plan
-from hybridlio.simulation.rig import T_CAMERA_LIDAR, T_IMU_LIDAR
-from hybridlio.simulation.sensors.lidar import ray_pattern
+from hybridlio.simulation.recording import drive_recording
 from hybridlio.simulation.world.shapes import merge
 from hybridlio.simulation.world.world import TILE_M
 
 GHOST_M = 0.3  # three voxels, and over ten times a range's noise
-_SIGHT_M = 130.0
-
-
-def recording(drive: Drive, config: SimulationConfig) -> Sequence:
-    """Return the drive as a recording in memory."""
-    pattern, stamps, model = ray_pattern(config.lidar_model), scan_stamps_ns(drive), config.lidar_model
-    return Sequence(
-        f"simulated-{config.seed}",
-        stamps,
-        lambda k: scan_at(drive, k, pattern, config, model),
-        imu_samples(drive, config),
-        Calibration(T_IMU_LIDAR, T_CAMERA_LIDAR),
-        Trajectory(stamps, lidar_poses(drive)).from_first(),
-        lidar=model,
-        imu_noise=config.imu_noise,
-    )
 
 
 def distances(drive: Drive, points: Array) -> Array:
@@ -93,7 +74,7 @@ def main() -> None:
             motion_distortion=True,
         )
         drive = plan(config)
-        whole = recording(drive, config)
+        whole = drive_recording(drive, config)
         scans = {k: whole[k].scan for k in range(len(whole))}
         sequence = replace(whole, load_scan=scans.__getitem__)
         odometry = hl.Odometry()

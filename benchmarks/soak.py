@@ -102,7 +102,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="for the lap")
     parser.add_argument("--scans", type=int, default=50_000, help="length of the run (default: %(default)s)")
-    parser.add_argument("--points", type=int, default=4000, help="about so many a scan (default: %(default)s)")
+    parser.add_argument("--points", type=int, default=4000, help="points a scan, roughly (default: %(default)s)")
     parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="for all figures as JSON")
     options = parser.parse_args()
     if options.scans < SETTLED:

@@ -27,7 +27,7 @@ _depth = threading.local()  # of the current thread: poses that its stack is mad
 
 
 def on_deep_stack(poses: int, call: Callable[[], _Result]) -> _Result:
-    """Return what the call returns, or raise what it raises, on a stack for a tree of so many poses.
+    """Return what the call returns, or raise what it raises, on a stack for a tree of this number of poses.
 
     Raises:
         GraphError: the system does not give the stack.

@@ -28,8 +28,8 @@ from hybridlio.graph.solve.initial_values import find_initial_values
 from hybridlio.graph.solve.linear_solver import poses_of
 from hybridlio.graph.solve.settings import IterationProgress
 
-# Chance that even one of all correct loops exceeds the bound; the usual bound of 1 % a loop rejects so many in a large
-# graph that its poses move by more than their standard deviations.
+# Chance that even one of all correct loops exceeds the bound. The usual bound of 1 % a loop rejects many of a large
+# graph's, and its poses then move by more than their standard deviations.
 _CHANCE_OF_A_LOSS = 0.1
 _GROWTHS = 3.0, 2.0, 1.5  # of the rounds of the searches: the finer, the more of them
 _LOST_SHARE = 0.05  # of confirmed loops whose rejection asks for a second look: few wrong loops agree with a neighbour

@@ -48,7 +48,7 @@ def all_at_once(solver: WeightedSolver, start: gtsam.Values) -> Found:
 def nearest_first(solver: WeightedSolver, start: gtsam.Values, support: LoopSupport, growth: float) -> Found:
     """Take in loops in rounds, those that span the fewest edges first, so that odometry has not drifted far.
 
-    A round graduates over the loops so far and those whose ends are at most so many edges apart, along odometry and
+    A round graduates over the loops so far and those whose ends are at most a number of edges apart, along odometry and
     the loops that count as correct; each round takes in loops of ``growth`` times as many. Loops that a neighbour
     confirms come first, all others when these have made the map rigid.
 

@@ -76,7 +76,7 @@ def write_run_files(folder: Path, run: Run, config: Config) -> Findings:
         write_tum(folder / run_folder.REFERENCE, sequence.reference)
     text = config_to_yaml(config)
     write_atomically(folder / run_folder.CONFIG, text)
-    data = report_data(run, config, text, notes(run), forward_speed_length_m(run))
+    data = report_data(run, record, config, text, notes(run), forward_speed_length_m(run))
     findings = analyse(data)
     write_pages(folder, data, findings)
     doubts = {"reference_doubts": list(data.reference_doubts)}

@@ -8,7 +8,7 @@ from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.measurements import imu_samples, lidar_poses, scan_at, scan_stamps_ns
-from hybridlio.simulation.plan import plan
+from hybridlio.simulation.plan import Drive, plan
 from hybridlio.simulation.rig import T_CAMERA_LIDAR, T_IMU_LIDAR
 from hybridlio.simulation.sensors.lidar import ray_pattern
 
@@ -27,9 +27,13 @@ def simulated_recording(config: SimulationConfig, lidar: LidarModel | None = Non
         ConfigError: there is no such pose file.
         DataError: the pose file is malformed.
     """
+    return drive_recording(plan(config), config, lidar)
+
+
+def drive_recording(drive: Drive, config: SimulationConfig, lidar: LidarModel | None = None) -> Sequence:
+    """Return a drive that is planned already, as :func:`simulated_recording` does."""
     model = lidar or config.lidar_model
-    drive, pattern = plan(config), ray_pattern(model)
-    stamps = scan_stamps_ns(drive)
+    pattern, stamps = ray_pattern(model), scan_stamps_ns(drive)
     return Sequence(
         f"simulated-{config.seed}",
         stamps,

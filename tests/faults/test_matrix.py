@@ -38,7 +38,7 @@ class Row:
         fault: puts it into the drive.
         within_m: largest error of a position, horizontally; None promises only that the fault is flagged.
         said: what the notes or the log contain; empty where nothing need be said.
-        scans: the first so many of the drive are used; a fault that stays shows early.
+        scans: number of scans used, from the first on; a fault that stays shows early.
     """
 
     fault: faults.Fault

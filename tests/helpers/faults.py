@@ -91,7 +91,7 @@ def scaled(gyro: float = 1.0, accel: float = 1.0) -> Fault:
 
 
 def rate(every: int) -> Fault:
-    """One sample in so many."""
+    """Keep every n-th sample."""
     return on_imu(lambda imu, _: ImuSamples(imu.stamps_ns[::every], imu.gyro_rad_s[::every], imu.accel_m_s2[::every]))
 
 

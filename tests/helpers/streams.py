@@ -48,7 +48,7 @@ def feed(stream: OdometryStream, data: Iterable[Event]) -> list[Estimate]:
 
 
 def thinned(sequence: Sequence, every: int) -> Sequence:
-    """Return the recording with every so many points."""
+    """Return the recording with every n-th point."""
 
     def load(k: int) -> Any:
         scan = sequence.load_scan(k)

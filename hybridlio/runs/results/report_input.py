@@ -30,18 +30,24 @@ _NO_CONFLICT = ("untested", "accepted")
 
 
 def report_data(
-    run: Run, config: Config, config_text: str, notes: Sequence[str], forward_speed_length_m: float | None
+    run: Run,
+    record: Record | None,
+    config: Config,
+    config_text: str,
+    notes: Sequence[str],
+    forward_speed_length_m: float | None,
 ) -> ReportData:
     """Return the input of the run's report.
 
     Args:
         run: the run, complete or not.
+        record: the run's, which takes long to make; None for fewer than two estimates.
         config: its settings.
         config_text: the settings as YAML.
         notes: what a reader should know first.
         forward_speed_length_m: path length of the IMU by the vehicle's own forward speed, if known.
     """
-    record, trajectory = run.record, run.trajectory
+    trajectory = run.trajectory
     return ReportData(
         name=run.sequence.name,
         estimate=trajectory,

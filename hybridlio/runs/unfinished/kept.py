@@ -114,7 +114,7 @@ def read_kept(folder: Path, rows: int | None = None) -> Kept | None:
 
     Args:
         folder: the folder of the journal.
-        rows: read the blocks of the first so many estimates only.
+        rows: number of estimates whose blocks are read, from the first on.
 
     Raises:
         DataError: the journal is damaged.

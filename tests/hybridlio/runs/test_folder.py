@@ -134,7 +134,7 @@ def test_scans_before_the_first_usable_one_have_rows_with_the_covariance_of_an_u
         return sequence.load_scan(k)
 
     run = run_odometry(replace(sequence, load_scan=load), Odometry(config=CONFIG))
-    assert report_data(run, CONFIG, "", [], None).first_scan == 3
+    assert report_data(run, run.record, CONFIG, "", [], None).first_scan == 3
     write_run(tmp_path, run, CONFIG)
     whole = read_tum(tmp_path / "poses_tum.txt")
     assert whole.stamps_ns.tolist() == sequence.stamps_ns.tolist()

@@ -160,7 +160,7 @@ def test_an_interrupted_run_goes_on_too(
 
 
 def full_after(blocks: int) -> Callable[..., None]:
-    """Return a function that appends so many blocks to journals, then reports a full disk in the middle of one."""
+    """Return a function that appends a number of blocks to journals, then reports a full disk in the middle of one."""
     append, left = journal.append_block, [blocks]
 
     def append_block(file: Any, block: bytes) -> None:
