@@ -7,7 +7,7 @@ number of epochs) are the defaults of :mod:`hybridlio.learned.settings`, the sam
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -21,13 +21,6 @@ PAPER = Recipe("paper", NetworkSettings(), LossSettings(normal_thin_m=0.0), Opti
 Where the text can hardly be meant as printed, ``paper-element-wise`` and ``paper-rows-as-printed`` follow it literally.
 """
 
-
-def _paper_with(name: str, loss: Mapping[str, Any] = MappingProxyType({}), **network: Any) -> Recipe:
-    return Recipe(name, replace(PAPER.network, **network), replace(PAPER.loss, **loss), PAPER.optimiser)
-
-
-_ONLY_PO2PL = {"lambda_": 0.0}
-_ONLY_PL2PL = {"alpha": 0.0}
 
 DEFAULT = Recipe(
     "default",
@@ -152,29 +145,62 @@ DEPARTURES = (
 )
 """``default``, and ``default`` without one of its departures from ``paper`` or with one more."""
 
+_ONLY_PO2PL = {"lambda_": 0.0}
+_ONLY_PL2PL = {"alpha": 0.0}
+
+
+@dataclass(frozen=True)
+class Changes:
+    """The settings in which a row of the paper's tables differs from its method.
+
+    Attributes:
+        network, loss: changed settings by name.
+    """
+
+    network: Mapping[str, Any]
+    loss: Mapping[str, Any]
+
+    def of(self, recipe: Recipe, name: str) -> Recipe:
+        """Return a recipe with these changes, under a name."""
+        network, loss = replace(recipe.network, **self.network), replace(recipe.loss, **self.loss)
+        return replace(recipe, name=name, network=network, loss=loss)
+
+
+def _changes(loss: Mapping[str, Any] = MappingProxyType({}), **network: Any) -> Changes:
+    return Changes(network, loss)
+
+
+ROWS: Mapping[str, Changes] = MappingProxyType(
+    {
+        "paper": _changes(),
+        "imu-feature": _changes(imu="feature"),
+        "no-imu": _changes(imu="none"),
+        "normals-joined": _changes(normals="joined"),
+        "normals-none": _changes(normals="none", distance="none"),
+        "no-imu-normals-joined": _changes(imu="none", normals="joined"),
+        "no-imu-normals-none": _changes(imu="none", normals="none", distance="none"),
+        "mlp": _changes(head="mlp"),
+        "no-imu-mlp": _changes(imu="none", head="mlp"),
+        "without-plane-to-plane": _changes(_ONLY_PO2PL),
+        "no-imu-without-plane-to-plane": _changes(_ONLY_PO2PL, imu="none"),
+        "without-point-to-plane": _changes(_ONLY_PL2PL),
+        "no-imu-without-point-to-plane": _changes(_ONLY_PL2PL, imu="none"),
+        "same-pixel": _changes({"matching": "same-pixel"}),
+        "no-imu-same-pixel": _changes({"matching": "same-pixel"}, imu="none"),
+        "cho": _changes({"matching": "same-pixel", **_ONLY_PO2PL}, imu="none", normals="joined", head="mlp"),
+        "nubert": _changes({"matching": "nearest-projected"}, imu="none", normals="none", distance="none", head="mlp"),
+    }
+)
+"""What each row of the paper's tables 1 to 5 changes in the method, by the name of its preset."""
+
 _ALL = (
     PAPER,
     PUBLISHED,
     *DEPARTURES,
-    _paper_with("paper-element-wise", {"product": "element-wise"}),
-    _paper_with("paper-rows-as-printed", geometry=MapGeometry(23.0, -3.0, 52, 720)),
-    _paper_with("paper-thinned-normals", {"normal_thin_m": 0.2}),
-    _paper_with("imu-feature", imu="feature"),
-    _paper_with("no-imu", imu="none"),
-    _paper_with("normals-joined", normals="joined"),
-    _paper_with("normals-none", normals="none"),
-    _paper_with("no-imu-normals-joined", imu="none", normals="joined"),
-    _paper_with("no-imu-normals-none", imu="none", normals="none"),
-    _paper_with("mlp", head="mlp"),
-    _paper_with("no-imu-mlp", imu="none", head="mlp"),
-    _paper_with("without-plane-to-plane", _ONLY_PO2PL),
-    _paper_with("no-imu-without-plane-to-plane", _ONLY_PO2PL, imu="none"),
-    _paper_with("without-point-to-plane", _ONLY_PL2PL),
-    _paper_with("no-imu-without-point-to-plane", _ONLY_PL2PL, imu="none"),
-    _paper_with("same-pixel", {"matching": "same-pixel"}),
-    _paper_with("no-imu-same-pixel", {"matching": "same-pixel"}, imu="none"),
-    _paper_with("cho", {"matching": "same-pixel", **_ONLY_PO2PL}, imu="none", normals="joined", head="mlp"),
-    _paper_with("nubert", {"matching": "nearest-projected"}, imu="none", normals="none", head="mlp"),
+    _changes({"product": "element-wise"}).of(PAPER, "paper-element-wise"),
+    _changes(geometry=MapGeometry(23.0, -3.0, 52, 720)).of(PAPER, "paper-rows-as-printed"),
+    _changes({"normal_thin_m": 0.2}).of(PAPER, "paper-thinned-normals"),
+    *(changes.of(PAPER, name) for name, changes in ROWS.items() if name != "paper"),
 )
 
 PRESETS: Mapping[str, Recipe] = MappingProxyType({recipe.name: recipe for recipe in _ALL})
@@ -186,6 +212,9 @@ the projected points and minimises both terms. ``without-point-to-plane`` gives 
 difference of normals does not depend on them.
 """
 
+BASES: Mapping[str, Recipe] = MappingProxyType({recipe.name: recipe for recipe in (PAPER, PUBLISHED)})
+"""The methods that rows of the paper's tables can be variants of."""
+
 
 def preset(name: str) -> Recipe:
     """Return the recipe of a preset.
@@ -196,3 +225,18 @@ def preset(name: str) -> Recipe:
     if name not in PRESETS:
         raise ConfigError(f"unknown preset {name!r}; choose one of {', '.join(PRESETS)}")
     return PRESETS[name]
+
+
+def row_of(base: str, row: str) -> Recipe:
+    """Return the recipe of a row of the paper's tables as a variant of ``paper`` or ``published``.
+
+    A row without normals has no distances to planes either, whatever the base.
+
+    Raises:
+        ConfigError: the base or the row is unknown; lists the known ones.
+    """
+    if base not in BASES:
+        raise ConfigError(f"unknown base {base!r}; choose one of {', '.join(BASES)}")
+    if row not in ROWS:
+        raise ConfigError(f"unknown row {row!r}; choose one of {', '.join(ROWS)}")
+    return ROWS[row].of(BASES[base], row)

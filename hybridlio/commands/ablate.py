@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from hybridlio.learned.training.comparison import Line
     from hybridlio.runs.training_data import DataOptions
 
-RunRow = Callable[["TableRow"], "RowResult"]
+RunRow = Callable[["TableRow"], "tuple[RowResult, ...]"]
 
 Number = Annotated[
     int, typer.Option("--table", metavar="N", help="The table of the paper to reproduce, 1 to 5.", show_default=False)
@@ -49,6 +49,17 @@ Cache = Annotated[
 Reduced = Annotated[
     bool, typer.Option("--reduced", help="Use coarser maps and smaller encoders, which train on a CPU in minutes.")
 ]
+Base = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME",
+        help="The method that the rows are variants of: paper, its set-up as printed, or published, the set-up of the "
+        "shipped weights, which learns within hours on a CPU.",
+    ),
+]
+Seeds = Annotated[
+    int, typer.Option(min=1, metavar="N", help="Train each row with N seeds; the table gives the spread.")
+]
 Only = Annotated[str | None, typer.Option("--rows", metavar="A,B,…", help="Only the rows of these presets.")]
 
 
@@ -60,6 +71,8 @@ def ablate(
     test: Tests = None,
     split: Split = None,
     steps: Steps = 2000,
+    seeds: Seeds = 1,
+    base: Base = "paper",
     reduced: Reduced = False,
     rows: Only = None,
     reader: common.ReaderName = None,
@@ -87,16 +100,17 @@ def ablate(
     folder = out or Path("ablation") / f"table-{table}"
     shards = cache or folder.parent / "shards"
     check_output(shards)
-    for row in chosen:
-        TRAINING.check(folder / row.name)
+    recipes = {row: _recipes(row, base, seeds, reduced) for row in chosen}
+    runs = [folder / recipe.name for row in chosen for recipe in recipes[row]]
+    for run in runs:
+        TRAINING.check(run)
     options = DataOptions(shards, None, None, reader, raw_root, topics)
-    budget = f"{steps} steps per row{', reduced size' if reduced else ''}"
     with claimed(folder, table_files(table)) if is_first_process() else nullcontext():
         if is_first_process():
-            for row in chosen:
-                TRAINING.remove_leftovers(folder / row.name)
-        lines = _run_rows(table, chosen, _row_runner(data, test, options, folder, steps, reduced, device))
-        _finish(folder, table, lines, budget)
+            for run in runs:
+                TRAINING.remove_leftovers(run)
+        lines = _run_rows(table, chosen, _row_runner(data, test, options, folder, steps, recipes, device))
+        _finish(folder, table, lines, _budget(steps, seeds, base, reduced))
 
 
 def _choose_rows(number: int, presets: tuple[str, ...] | None, split: str | None) -> list[TableRow]:
@@ -115,19 +129,35 @@ def _choose_rows(number: int, presets: tuple[str, ...] | None, split: str | None
     return [replace(row, split=None) for k, row in enumerate(rows) if row.preset not in {r.preset for r in rows[:k]}]
 
 
+def _recipes(row: TableRow, base: str, seeds: int, small: bool) -> list[Recipe]:
+    """Return the recipe of a row for each seed, named as its folder."""
+    from hybridlio.learned.presets import row_of
+    from hybridlio.learned.training.ablation import reduced
+
+    recipe = row_of(base, row.preset)
+    recipe = reduced(recipe) if small else recipe
+    names = [row.name] if seeds == 1 else [f"{row.name}-seed-{seed}" for seed in range(seeds)]
+    seeded = [replace(recipe.optimiser, seed=seed) for seed in range(seeds)]
+    return [replace(recipe, name=name, optimiser=optimiser) for name, optimiser in zip(names, seeded, strict=True)]
+
+
+def _budget(steps: int, seeds: int, base: str, reduced: bool) -> str:
+    of_seeds = f", {seeds} seeds" if seeds > 1 else ""
+    of_base = f", variants of {base}" if base != "paper" else ""
+    return f"{steps} steps per row{of_seeds}{of_base}{', reduced size' if reduced else ''}"
+
+
 def _row_runner(
     data: list[Path],
     test: list[Path] | None,
     options: DataOptions,
     folder: Path,
     steps: int,
-    small: bool,
+    recipes: Mapping[TableRow, list[Recipe]],
     device: str,
 ) -> RunRow:
-    """Return a function that trains and evaluates a row."""
-    from hybridlio.learned.presets import preset
+    """Return a function that trains and evaluates a row with each of its recipes."""
     from hybridlio.learned.training.ablation import RowData, run_rows
-    from hybridlio.learned.training.ablation import reduced as reduce_size
     from hybridlio.learned.training.train import RunOptions
     from hybridlio.runs.training_data import prepare_shards, split_options
 
@@ -141,19 +171,19 @@ def _row_runner(
             ]
         return RowData(*parts)
 
-    def run(row: TableRow) -> RowResult:
-        recipe = replace(preset(row.preset), name=row.name)
-        recipe = reduce_size(recipe) if small else recipe
+    def run(row: TableRow) -> tuple[RowResult, ...]:
         with first_process_progress(row.name, "steps") as report:
-            (result,) = run_rows(
-                [recipe],
+            results = run_rows(
+                recipes[row],
                 lambda recipe: prepared(recipe, row.split),
                 folder,
                 steps,
                 run_options,
-                lambda _, p: report(f"loss {p.loss:.4g}, {p.pairs_per_s:.1f} pairs/s", p.step, steps),
+                lambda recipe, p: report(
+                    f"{recipe.name}: loss {p.loss:.4g}, {p.pairs_per_s:.1f} pairs/s", p.step, steps
+                ),
             )
-        return result
+        return tuple(results)
 
     return run
 
@@ -167,7 +197,7 @@ def _run_rows(number: int, chosen: list[TableRow], run: RunRow) -> list[Line]:
     for figures in published(number):
         row = wanted.get(figures.method)
         if row is None:
-            lines.append(Line(figures.method, None, None, figures))
+            lines.append(Line(figures.method, None, (), figures))
             continue
         try:
             lines.append(Line(figures.method, row.preset, run(row), figures))
@@ -176,7 +206,7 @@ def _run_rows(number: int, chosen: list[TableRow], run: RunRow) -> list[Line]:
             raise typer.Exit(INTERRUPTED) from None
         except HybridLioError as error:
             print_message(f"error: {row.name}: {error}")
-            lines.append(Line(figures.method, row.preset, None, figures, str(error)))
+            lines.append(Line(figures.method, row.preset, (), figures, str(error)))
     return lines
 
 

@@ -5,7 +5,7 @@ Measured and published figures are listed together; published ones are marked.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -14,7 +14,8 @@ from hybridlio.learned.training.published import TEST, TRAIN, PublishedRow
 
 KITTI = tuple(f"{n:02}" for n in range(11))
 LEGEND = (
-    "t_rel [%] / r_rel [°/100 m]; published: as printed in UnDeepLIO's tables, trained and tested on KITTI odometry"
+    "t_rel [%] / r_rel [°/100 m], of several seeds their mean ± half of their range; published: as printed in "
+    "UnDeepLIO's tables, trained and tested on KITTI odometry"
 )
 _NOTHING = "–"
 
@@ -26,14 +27,14 @@ class Line:
     Attributes:
         method: name in the paper.
         preset: name of the trained preset; None for a method with published figures only.
-        result: measured figures; None where there are none or training failed.
+        results: measured figures of each seed; empty where there are none or training failed.
         published: the paper's figures.
         error: why training failed, if it did.
     """
 
     method: str
     preset: str | None
-    result: RowResult | None
+    results: tuple[RowResult, ...]
     published: PublishedRow
     error: str | None = None
 
@@ -70,7 +71,7 @@ def to_json_dict(number: int, lines: Sequence[Line], budget: str) -> dict[str, A
 
 
 def _recordings(lines: Sequence[Line]) -> tuple[str, ...]:
-    results = [line.result for line in lines if line.result is not None]
+    results = [result for line in lines for result in line.results]
     return tuple(dict.fromkeys(name for result in results for name in (*result.train, *result.test)))
 
 
@@ -78,11 +79,13 @@ def _measured(line: Line, recordings: Sequence[str]) -> dict[str, str] | None:
     if line.preset is None:
         return None
     row = {"method": line.method, "figures": f"measured ({line.preset})"}
-    result = line.result
-    drifts: Mapping[str, Drift | None] = {} if result is None else {**result.train, **result.test}
-    row |= {name: _cell(drifts.get(name)) for name in recordings}
-    averages = (None, None) if result is None else (result.train_average, result.test_average)
-    return row | {"train avg": _cell(averages[0]), "test avg": _cell(averages[1])}
+    drifts = [{**result.train, **result.test} for result in line.results]
+    row |= {name: _cell([drift.get(name) for drift in drifts]) for name in recordings}
+    averages = {
+        "train avg": _cell([result.train_average for result in line.results]),
+        "test avg": _cell([result.test_average for result in line.results]),
+    }
+    return row | averages
 
 
 def _published(line: Line) -> dict[str, str]:
@@ -97,8 +100,17 @@ def _averages(row: PublishedRow) -> dict[str, str]:
 
 def _both(row: PublishedRow, name: str) -> str:
     t, r = row.t_rel_percent.get(name), row.r_rel_deg_per_100m.get(name)
-    return _NOTHING if t is None or r is None else _cell((t, r))
+    return _NOTHING if t is None or r is None else _cell([(t, r)])
 
 
-def _cell(drift: Drift | None) -> str:
-    return _NOTHING if drift is None else f"{drift[0]:.2f} / {drift[1]:.2f}"
+def _cell(seeds: Sequence[Drift | None]) -> str:
+    """Return the drift of several seeds as text; nothing if one of them has none."""
+    known = [drift for drift in seeds if drift is not None]
+    if not known or len(known) < len(seeds):
+        return _NOTHING
+    return " / ".join(_mean_and_spread(values) for values in zip(*known, strict=True))
+
+
+def _mean_and_spread(values: Sequence[float]) -> str:
+    mean = f"{sum(values) / len(values):.2f}"
+    return mean if len(values) == 1 else f"{mean} ± {(max(values) - min(values)) / 2:.2f}"

@@ -46,22 +46,25 @@ def drive(
     """Estimate a recording's steps in order.
 
     A network with velocity input takes its previous estimate; the first step takes the shard's velocity, so
-    initialisation of the velocity is not evaluated.
+    initialisation of the velocity is not evaluated. Steps before the first known velocity are left out; later ones
+    need none.
 
     Raises:
         DataError: the recording has no usable steps, or an unusable scan between them.
     """
-    pairs = Pairs([shard], network.settings)
-    gaps = np.diff([pairs.where(i)[1] for i in range(len(pairs))]) != 1
+    first, pairs = 0, Pairs([shard], replace(network.settings, velocity=False))
+    if network.settings.velocity:
+        known_from = Pairs([shard], network.settings).where(0)[1]
+        first = next(i for i in range(len(pairs)) if pairs.where(i)[1] == known_from)
+    gaps = np.diff([pairs.where(i)[1] for i in range(first, len(pairs))]) != 1
     if gaps.any():
-        raise DataError(
-            f"{shard.folder}: scan {pairs.where(int(gaps.argmax()))[1] + 1} is not usable; choose one without gaps"
-        )
+        unusable = pairs.where(first + int(gaps.argmax()))[1] + 1
+        raise DataError(f"{shard.folder}: scan {unusable} is not usable; choose one without gaps")
     was_training, device = network.training, next(network.parameters()).device
     network.eval()
     found: list[tuple[Array, Array, Array]] = []
     velocity: torch.Tensor | None = None
-    for i in range(len(pairs)):
+    for i in range(first, len(pairs)):
         batch = pairs.batch([i]).to(device)
         given = batch.network if velocity is None else replace(batch.network, velocity_m_s=velocity)
         out = network(given)
@@ -71,7 +74,7 @@ def drive(
         pose, initial, reference = (x.double().cpu().numpy()[0] for x in (out.pose, out.initial, batch.reference))
         found.append((pose, initial, reference))
         if progress is not None:
-            progress(i + 1, len(pairs))
+            progress(i + 1 - first, len(pairs) - first)
     network.train(was_training)
     return DrivenSteps(*(np.stack(column) for column in zip(*found, strict=True)))
 

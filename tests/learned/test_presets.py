@@ -7,7 +7,7 @@ import torch
 from hybridlio.core.errors import ConfigError
 from hybridlio.learned.networks.odometry_network import OdometryNetwork, parameter_count
 from hybridlio.learned.paper_tables import TABLES, split, table
-from hybridlio.learned.presets import PAPER, PRESETS, preset
+from hybridlio.learned.presets import PAPER, PRESETS, PUBLISHED, ROWS, preset, row_of
 from hybridlio.learned.setting_values import from_dict, to_dict
 from hybridlio.learned.settings import LossSettings, NetworkSettings, OptimiserSettings, Recipe
 from hybridlio.learned.training.published import published
@@ -26,6 +26,25 @@ def test_every_row_of_the_comparisons_is_a_preset_and_differs_from_its_neighbour
         recipes = [(replace(preset(row.preset), name=""), row.split) for row in rows]
         assert all(a != b for i, a in enumerate(recipes) for b in recipes[:i])
     assert {row.preset for rows in TABLES.values() for row in rows} <= set(PRESETS)
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_a_row_changes_the_same_settings_of_either_method(name):
+    of_paper, of_published = row_of("paper", name), row_of("published", name)
+    assert of_paper == preset(name)
+    for part in ("network", "loss"):
+        method, row, variant = (getattr(recipe, part) for recipe in (PUBLISHED, of_paper, of_published))
+        changed = {key for key, value in to_dict(variant).items() if value != to_dict(method)[key]}
+        assert all(getattr(variant, key) == getattr(row, key) for key in changed)
+        in_paper = {key for key, value in to_dict(row).items() if value != to_dict(getattr(PAPER, part))[key]}
+        assert all(getattr(variant, key) == getattr(row, key) for key in in_paper)
+
+
+def test_a_row_of_an_unknown_method_lists_the_known_ones():
+    with pytest.raises(ConfigError, match="paper, published"):
+        row_of("default", "mlp")
+    with pytest.raises(ConfigError, match="normals-joined"):
+        row_of("paper", "attention")
 
 
 def test_rows_carry_the_names_of_the_published_figures():

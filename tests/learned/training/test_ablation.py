@@ -32,6 +32,16 @@ def test_driving_feeds_back_the_estimated_velocity(winding, tiny_recipe):
     assert np.allclose(driven.reference, winding.reference[1:], atol=1e-6)
 
 
+def test_only_the_first_velocity_need_be_known(winding, tiny_recipe):
+    network = OdometryNetwork(replace(tiny_recipe.network, velocity=True))
+    whole = drive(network, winding)
+    winding.velocity_m_s = winding.velocity_m_s.copy()
+    winding.velocity_m_s[4:7] = np.nan
+    assert np.array_equal(drive(network, winding).poses, whole.poses)
+    winding.velocity_m_s[1] = np.nan
+    assert len(drive(network, winding).poses) == len(whole.poses) - 1
+
+
 def test_a_gap_between_steps_is_refused_by_its_scan(rooms, tiny_recipe):
     settings = replace(tiny_recipe.network)
     shard = rooms[0]

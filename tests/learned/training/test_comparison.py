@@ -14,7 +14,7 @@ ON_OTHERS = replace(ON_KITTI, train={"town": (2.0, 1.0)}, test={"village": (3.0,
 
 
 def line(result, method="imu(w preprocess)", preset="paper", **changes):
-    return Line(method, preset, result, PUBLISHED[method], **changes)
+    return Line(method, preset, () if result is None else (result,), PUBLISHED[method], **changes)
 
 
 def test_on_kitti_measured_and_published_rows_stand_under_the_same_sequences():
@@ -54,5 +54,14 @@ def test_the_files_hold_every_figure(result):
         for row in rows:
             assert f"| {' | '.join(row.values())} |" in to_markdown(2, lines, "")
     (entry,) = to_json_dict(2, lines, "9 steps")["lines"]
-    assert entry["result"]["test"] == dict(result.test)
+    assert entry["results"][0]["test"] == dict(result.test)
     assert entry["published"]["t_rel_percent"]["test"] == 2.03
+
+
+def test_several_seeds_are_their_mean_and_half_of_their_range():
+    other = replace(ON_OTHERS, train={"town": (3.0, 1.0)}, test={"village": (4.0, 2.0), "yard": None})
+    seeds = replace(line(ON_OTHERS), results=(ON_OTHERS, other))
+    (measured,) = tables([seeds])["measured"]
+    assert measured["town"] == "2.50 ± 0.50 / 1.00 ± 0.00"
+    assert measured["test avg"] == "3.50 ± 0.50 / 1.75 ± 0.25"
+    assert measured["yard"] == "–"
