@@ -25,8 +25,8 @@ from hybridlio.learned.settings import Recipe
 from hybridlio.learned.training.driving import drive
 from hybridlio.learned.training.train import RunOptions, train
 from hybridlio.learned.training.validation import step_errors
-from hybridlio.runs.recipes import for_steps
-from hybridlio.runs.training_data import DataOptions, prepare_shards
+from hybridlio.runs.training.recipes import for_steps
+from hybridlio.runs.training.training_data import DataOptions, prepare_shards
 
 
 def measure(name: str, network: OdometryNetwork, tests: list[Shard]) -> Iterator[Row]:

@@ -37,8 +37,8 @@ from hybridlio.learned.networks.weights import Weights, load_weights, weights_pa
 from hybridlio.learned.training.driving import drive
 from hybridlio.learned.training.train import RunOptions, train
 from hybridlio.learned.training.validation import step_errors
-from hybridlio.runs.recipes import adaptation_recipe
-from hybridlio.runs.training_data import DataOptions, prepare_shards
+from hybridlio.runs.training.recipes import adaptation_recipe
+from hybridlio.runs.training.training_data import DataOptions, prepare_shards
 
 Row = dict[str, str]
 Sizes = tuple[tuple[float, float], ...]  # degrees and metres

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from hybridlio.learned.training.ablation import RowData
     from hybridlio.learned.training.ablation_results import RowResult
     from hybridlio.learned.training.comparison import Line
-    from hybridlio.runs.training_data import DataOptions
+    from hybridlio.runs.training.training_data import DataOptions
 
 RunRow = Callable[["TableRow"], "tuple[RowResult, ...]"]
 
@@ -91,7 +91,7 @@ def ablate(
     from hybridlio.learned.networks.devices import pick_device
     from hybridlio.runs.new_folder import claimed
     from hybridlio.runs.own_files import TRAINING, table_files
-    from hybridlio.runs.training_data import DataOptions
+    from hybridlio.runs.training.training_data import DataOptions
 
     pick_device(device)
     if (test is None) == (split is None):
@@ -159,7 +159,7 @@ def _row_runner(
     """Return a function that trains and evaluates a row with each of its recipes."""
     from hybridlio.learned.training.ablation import RowData, run_rows
     from hybridlio.learned.training.train import RunOptions
-    from hybridlio.runs.training_data import prepare_shards, split_options
+    from hybridlio.runs.training.training_data import prepare_shards, split_options
 
     run_options = RunOptions(device=None if device == "auto" else device)
 

@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 from hybridlio.commands.app import app
 from hybridlio.learned.networks.weights import load_weights
 from hybridlio.learned.training.training_log import read_log
+from hybridlio.runs.training import simulated_data
 
 SMALL = {
     "network": {
@@ -150,3 +151,23 @@ def test_the_error_for_an_unknown_key_names_it_and_the_file(tiny_drive, tmp_path
     assert refused.exit_code == 2
     assert "my.yaml" in refused.output
     assert "imu_hiden" in refused.output
+
+
+def test_simulated_drives_train_and_validate_without_recordings_and_are_kept(recipe, tmp_path, monkeypatch):
+    monkeypatch.setattr(simulated_data, "DRIVE_S", 1.0)
+    common = ("--simulate", 1, "--lidar", "16-beam", "--preset", "paper", "--config", recipe, "-o", tmp_path / "run")
+    ok(*common, "--cache", tmp_path / "drives", "--epochs", 1)
+    drives = sorted(path.name for path in (tmp_path / "drives").iterdir() if not path.name.startswith("."))
+    assert [name.rsplit("-", 1)[0] for name in drives] == ["simulated-41000", "simulated-45000"]
+    assert "simulated-41000" in load_weights(tmp_path / "run" / "weights.safetensors").about["data"]
+    assert any("validation/loss" in row for row in read_log(tmp_path / "run" / "log.jsonl"))
+
+
+@pytest.mark.parametrize(
+    ("words", "named"), [((), "--simulate"), (("--simulate", 1, "--lidar", "vlp"), "16-beam")], ids=["nothing", "lidar"]
+)
+def test_what_to_train_on_is_checked_before_anything_is_simulated(words, named, tmp_path):
+    refused = run(*words, "-o", tmp_path / "run")
+    assert refused.exit_code == 2
+    assert named in refused.output
+    assert not (tmp_path / "run").exists()

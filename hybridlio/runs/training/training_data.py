@@ -38,10 +38,11 @@ from hybridlio.learned.settings import NetworkSettings, Recipe
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.odometry import Odometry
 from hybridlio.odometry.registry import preparation_for
-from hybridlio.runs.recipes import LSTM
 from hybridlio.runs.run import run_odometry
+from hybridlio.runs.training.recipes import LSTM
 
-_Done = Callable[[int], None]
+Done = Callable[[int], None]
+"""Called with the number of scans done."""
 
 _VERSION = 2  # of the content of shards; a new version prepares all recordings again
 _SCANS_IN_DIGEST = 16  # spread over the recording; hashing all scans would read a long recording twice
@@ -101,11 +102,11 @@ def prepare_shards(
     done, waiting = 0, []
     for sequence, folder in zip(recordings, folders, strict=True):
         report = _report(progress, sequence.name, done, total)
-        if not _prepare_once(sequence, folder, recipe, options, report, wait=False):
+        if not prepare_once(sequence, folder, recipe, options, report, wait=False):
             waiting.append((sequence, folder))  # another process is preparing it
         done += len(sequence)
     for sequence, folder in waiting:
-        _prepare_once(sequence, folder, recipe, options, _ignore, wait=True)
+        prepare_once(sequence, folder, recipe, options, _ignore, wait=True)
     prepared = iter(folders)  # in the order of the recordings among what was found
     return [item if isinstance(item, Shard) else Shard(next(prepared)) for item in found]
 
@@ -193,7 +194,7 @@ def _find(path: Path, options: DataOptions) -> Iterator[Sequence | Shard]:
         )
 
 
-def _report(progress: Progress | None, name: str, before: int, total: int) -> _Done:
+def _report(progress: Progress | None, name: str, before: int, total: int) -> Done:
     """Return the callback of one recording, which reports progress over all recordings."""
     return _ignore if progress is None else lambda done: progress(name, before + done, total)
 
@@ -202,8 +203,8 @@ def _ignore(_done: int) -> None:
     pass
 
 
-def _prepare_once(
-    sequence: Sequence, folder: Path, recipe: Recipe, options: DataOptions, report: _Done, wait: bool
+def prepare_once(
+    sequence: Sequence, folder: Path, recipe: Recipe, options: DataOptions, report: Done, wait: bool
 ) -> bool:
     """Prepare the recording unless its shard exists; return False if another process is at it and ``wait`` is False."""
     with locked(folder.with_name(f".{folder.name}.lock"), wait) as holder:
@@ -213,7 +214,7 @@ def _prepare_once(
         return holder is None
 
 
-def _prepare(sequence: Sequence, folder: Path, recipe: Recipe, initial_pose: str | None, report: _Done) -> None:
+def _prepare(sequence: Sequence, folder: Path, recipe: Recipe, initial_pose: str | None, report: Done) -> None:
     source = _initial_pose_source(sequence, initial_pose)
     first = _load_or_none(sequence, 0)
     is_distorted = first is not None and first.time_offsets_ns is not None
@@ -254,7 +255,7 @@ class _Odometry:
         return self.steps.get(k) if k in self.reliable else None
 
 
-def _run_odometry(sequence: Sequence, source: str, report: _Done) -> _Odometry:
+def _run_odometry(sequence: Sequence, source: str, report: Done) -> _Odometry:
     config = Config(initial_pose=source, residual="scan-matching")
     run = run_odometry(sequence, Odometry(config=config), lambda _stage, done, _total: report(done))
     if run.stopped is not None:

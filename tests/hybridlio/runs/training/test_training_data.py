@@ -14,9 +14,9 @@ from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.sensors import ImuNoise, Scan
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.learned.settings import NetworkSettings, Recipe
-from hybridlio.runs import training_data
 from hybridlio.runs.run import run_odometry
-from hybridlio.runs.training_data import DataOptions, prepare_shards, shard_name, training_pairs
+from hybridlio.runs.training import training_data
+from hybridlio.runs.training.training_data import DataOptions, prepare_shards, shard_name, training_pairs
 
 NETWORK = NetworkSettings(geometry=MAP_GEOMETRIES["16-beam"])
 RECIPE = Recipe(network=NETWORK)
@@ -119,7 +119,7 @@ def test_concurrent_processes_prepare_a_shard_once(tiny_drive, tmp_path, project
         "import sys; from pathlib import Path\n"
         "from hybridlio.learned.settings import NetworkSettings, Recipe\n"
         "from hybridlio.cloud.map_geometry import MAP_GEOMETRIES\n"
-        "from hybridlio.runs.training_data import DataOptions, prepare_shards\n"
+        "from hybridlio.runs.training.training_data import DataOptions, prepare_shards\n"
         "reports = []\n"
         "recipe = Recipe(network=NetworkSettings(geometry=MAP_GEOMETRIES['16-beam']))\n"
         "shards = prepare_shards([Path(sys.argv[1])], recipe,\n"

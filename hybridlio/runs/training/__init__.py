@@ -1,0 +1,1 @@
+"""Training runs: their recipes, and their data from recordings or the simulator."""
