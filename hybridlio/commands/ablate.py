@@ -14,7 +14,7 @@ import typer
 from hybridlio.commands import common
 from hybridlio.commands.common import INTERRUPTED, guarded
 from hybridlio.commands.terminal import print_message, print_result, print_table
-from hybridlio.commands.train import Device, Recordings, first_process_progress, is_first_process
+from hybridlio.commands.training_process import Device, first_process_progress, is_first_process
 from hybridlio.core.errors import ConfigError, HybridLioError
 from hybridlio.datasets.rosbag.choices import NO_CHOICE, BagTopics
 
@@ -30,6 +30,10 @@ if TYPE_CHECKING:
 
 RunRow = Callable[["TableRow"], "tuple[RowResult, ...]"]
 
+Recordings = Annotated[
+    list[Path],
+    typer.Argument(metavar="DATA…", help="Recordings, folders of recordings, or shards.", show_default=False),
+]
 Number = Annotated[
     int, typer.Option("--table", metavar="N", help="The table of the paper to reproduce, 1 to 5.", show_default=False)
 ]

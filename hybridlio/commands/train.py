@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,10 +10,10 @@ import typer
 
 from hybridlio.commands import common
 from hybridlio.commands.common import INTERRUPTED, guarded
-from hybridlio.commands.terminal import print_message, print_result, progress
+from hybridlio.commands.terminal import print_message, print_result
+from hybridlio.commands.training_process import Device, first_process_progress, is_first_process
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.lidar_models import LIDAR_MODELS
-from hybridlio.core.progress import Progress
 from hybridlio.datasets.rosbag.choices import NO_CHOICE, BagTopics
 from hybridlio.odometry.registry import INITIAL_POSE_SOURCES
 
@@ -27,10 +25,6 @@ if TYPE_CHECKING:
     from hybridlio.learned.training.validation_result import Validation
     from hybridlio.runs.training.training_data import DataOptions
 
-Recordings = Annotated[
-    list[Path],
-    typer.Argument(metavar="DATA…", help="Recordings, folders of recordings, or shards.", show_default=False),
-]
 RecordingsIfAny = Annotated[
     list[Path] | None,
     typer.Argument(metavar="[DATA…]", help="Recordings, folders of recordings, or shards.", show_default=False),
@@ -85,7 +79,6 @@ Out = Annotated[
 Cache = Annotated[Path | None, typer.Option(metavar="DIR", help="The folder for prepared recordings; default: in -o.")]
 Epochs = Annotated[int | None, typer.Option(min=1, help="Passes over the data.")]
 Steps = Annotated[int | None, typer.Option(min=1, help="Optimiser steps in all; replaces --epochs.")]
-Device = Annotated[str, typer.Option(metavar="NAME", help="cpu, cuda, …; auto uses a GPU if there is one.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Delete an existing run in -o and start again.")]
 
 
@@ -196,21 +189,6 @@ def _run(
         raise typer.Exit(INTERRUPTED) from None
     if is_first_process():
         print_result(f"weights  {folder / WEIGHTS}")
-
-
-def is_first_process() -> bool:
-    """Return whether this is the process that prints, of those that torchrun started."""
-    return os.environ.get("RANK", "0") == "0"
-
-
-@contextmanager
-def first_process_progress(task: str, unit: str) -> Iterator[Progress]:
-    """Show progress in the first process, and nothing in the others."""
-    if not is_first_process():
-        yield lambda _stage, _done, _total: None
-        return
-    with progress(task, unit) as report:
-        yield report
 
 
 def _clear(folder: Path) -> None:
