@@ -20,6 +20,10 @@ def simulate(
         float | None, typer.Option("--length-m", help="Length of the path in metres, instead of --seconds.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Random seed of road, town, traffic and noise.")] = 1,
+    drive_seed: Annotated[
+        int | None,
+        typer.Option("--drive-seed", help="Drive through the same town again: other traffic, parked cars, noise."),
+    ] = None,
     speed: Annotated[float, typer.Option(help="Cruising speed in m/s.")] = 10.0,
     driving: Annotated[str, typer.Option(help="calm, or hard: brakes late and takes bends fast.")] = "calm",
     scene: Annotated[
@@ -70,7 +74,7 @@ def simulate(
     common = {"seconds": seconds, "seed": seed, "scene": scene, "lidar": lidar, "start_moving": not start_at_rest}
     road = {
         "length_m": length_m, "speed_m_s": speed, "driving": driving, "gps": gps, "loops": loops, "poses": poses,
-        "poses_frame": poses_frame, "motion_distortion": distortion,
+        "poses_frame": poses_frame, "motion_distortion": distortion, "drive_seed": drive_seed,
     }  # fmt: skip
     body = {"platform": platform, "imu": imu}
     is_road = scene in get_args(Scene)

@@ -20,6 +20,8 @@ class SimulationConfig(BaseModel):
         seconds: duration, at most a day; by default 60 s, or with ``poses`` the whole file.
         length_m: length of the drive, instead of ``seconds``.
         seed: of road, world, traffic and noise.
+        drive_seed: of traffic, parked cars, the driver and noise, by default ``seed``. Another one is another drive
+            through the same town, whose cars have come and gone.
         speed_m_s: cruising speed; bends, junctions and stops are slower. Not used along a pose file.
         driving: ``calm``, or ``hard``: bends at 6 m/s² lateral acceleration, braking at 7 m/s². Not used along a pose
             file.
@@ -45,6 +47,7 @@ class SimulationConfig(BaseModel):
     seconds: float | None = Field(default=None, gt=0.0, le=86_400.0, allow_inf_nan=False)
     length_m: float | None = Field(default=None, gt=0.0, le=1e6, allow_inf_nan=False)
     seed: int = Field(default=1, ge=0)
+    drive_seed: int | None = Field(default=None, ge=0)
     speed_m_s: float = Field(default=10.0, ge=1.0, le=40.0)
     driving: Driving = "calm"
     scene: Scene = "town"
@@ -67,6 +70,16 @@ class SimulationConfig(BaseModel):
         if name not in LIDAR_MODELS:
             raise ValueError(f"unknown lidar {name!r}; choose one of {', '.join(LIDAR_MODELS)}")
         return name
+
+    @property
+    def own_seed(self) -> int:
+        """The seed of all that differs between drives through one town."""
+        return self.seed if self.drive_seed is None else self.drive_seed
+
+    @property
+    def is_first_drive(self) -> bool:
+        """Whether the town is as its own seed makes it; False at another drive through it."""
+        return self.own_seed == self.seed
 
     @property
     def lidar_model(self) -> LidarModel:

@@ -32,7 +32,7 @@ def imu_ticks(drive: Drive) -> Index:
 def imu_samples(drive: Drive, config: SimulationConfig) -> ImuSamples:
     """Simulate the IMU's samples of a drive, with errors."""
     ticks = imu_ticks(drive)
-    rng = np.random.default_rng([config.seed, RandomStream.IMU])
+    rng = np.random.default_rng([config.own_seed, RandomStream.IMU])
     gyro, accel = add_noise(*ideal_imu(drive.path, ticks / IMU_RATE_HZ), config.imu_noise, IMU_RATE_HZ, rng)
     return ImuSamples(START_NS + ticks * (NS_PER_S // IMU_RATE_HZ), gyro, accel)
 
@@ -61,6 +61,6 @@ def scan_at(
     poses = drive.path.poses(stamp_s + offsets_s) @ T_IMU_LIDAR
     scene = drive.world.scene_around(drive.path.poses(stamp_s)[0, :3, 3])
     hits = first_hits(scene, drive.cars, pattern, poses, stamp_s + offsets_s)
-    rng = np.random.default_rng([config.seed, RandomStream.SCAN, index])
+    rng = np.random.default_rng([config.own_seed, RandomStream.SCAN, index])
     stamp_ns = START_NS + round(stamp_s * NS_PER_S)
     return measure(hits, pattern, lidar or config.lidar_model, stamp_ns, config.motion_distortion, rng)

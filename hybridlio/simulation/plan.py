@@ -110,6 +110,8 @@ def _driven(config: SimulationConfig, length: float, stretch: float, times: Arra
     flat = _CORRIDOR_SHARE if config.scene == "corridor" else 1.0
     land = waves(np.random.default_rng([config.seed, RandomStream.LAND]), count, lengths, slope * flat)
     ground = _ground(land, centreline, config)
+    if not config.is_first_drive:  # the road is the town's, the driver another one
+        rng = np.random.default_rng([config.own_seed, RandomStream.ROAD])
     lane = lane_of(centreline, rng)
     manner = MANNERS[config.driving]
     s = _BEHIND_M + drive(lane, _BEHIND_M, config.speed_m_s, times, config.start_moving, rng, manner)
@@ -162,12 +164,13 @@ def _with_world(
         config.scene,
         config.parked,
         np.random.default_rng([config.seed, RandomStream.LAYOUT]),
+        None if config.is_first_drive else np.random.default_rng([config.own_seed, RandomStream.LAYOUT]),
     )
     scans = np.arange(max(round(seconds * SCAN_RATE_HZ), 2)) / SCAN_RATE_HZ
     times = np.arange(-0.5, scans[-1] + 0.6, _EGO_STEP_S)
     ego_xy = path.poses(times)[:, :2, 3]
     ego = EgoDrive(lane, times, _arc_length_of(lane, ego_xy), ego_xy)
-    cars = traffic(centreline, ego, ground, config.traffic_per_km, config.seed)
+    cars = traffic(centreline, ego, ground, config.traffic_per_km, config.own_seed)
     return Drive(path, scans, World(ground, items, config.seed), cars)
 
 

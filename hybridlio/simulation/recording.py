@@ -35,7 +35,7 @@ def drive_recording(drive: Drive, config: SimulationConfig, lidar: LidarModel | 
     model = lidar or config.lidar_model
     pattern, stamps = ray_pattern(model), scan_stamps_ns(drive)
     return Sequence(
-        f"simulated-{config.seed}",
+        f"simulated-{config.own_seed}",
         stamps,
         lambda k: scan_at(drive, k, pattern, config, model),
         imu_samples(drive, config),

@@ -69,7 +69,7 @@ def simulate(out: Path, config: SimulationConfig, progress: Progress | None = No
     """
     check_output(out, may_hold=True)
     description = describe(config)
-    done = DriveFolders(Path(out), config.seed % 10000)
+    done = DriveFolders(Path(out), config.own_seed % 10000)
     if done.sync.exists():
         _require_same(done.sync, description)
         return done.sync
@@ -165,7 +165,7 @@ def _write_measurements(folders: DriveFolders, drive: Drive, config: SimulationC
     write_atomically(folders.sync / "poses.txt", pose_rows(lidar_poses(drive)))
     if config.gps:
         fix_times = np.arange(0.0, drive.scan_times_s[-1] + 1e-9, 1.0 / config.gps_rate_hz)
-        noise = np.random.default_rng([config.seed, RandomStream.GPS])
+        noise = np.random.default_rng([config.own_seed, RandomStream.GPS])
         place = origin_of(origin, FIRST_PLACE)
         fixes = gps_fixes(drive.path, fix_times, START_NS, config.gps_sigma_m, noise, place)
         write_atomically(folders.sync / "gps.csv", gps_csv(fixes))

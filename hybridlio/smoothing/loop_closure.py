@@ -30,6 +30,7 @@ from hybridlio.smoothing.loop_consistency import (
 )
 from hybridlio.smoothing.loop_verification import Verdict, VerificationSettings, Verifier
 from hybridlio.smoothing.loops import Loop, LoopSearch, RejectedLoop
+from hybridlio.smoothing.places import KeyframePlaces
 from hybridlio.smoothing.step_uncertainty import OdometryChain
 
 
@@ -60,11 +61,12 @@ def find_loops(record: Record, settings: LoopSettings | None = None, progress: P
         DataError: the record has no keyframes, or they do not belong to it.
     """
     settings = settings or LoopSettings()
-    keyframes = _keyframes_of(record)
+    keyframes = keyframes_of(record)
     chain = OdometryChain(record.online, record.relative)
     rows = keyframes.rows
-    verifier = Verifier(keyframes, chain, settings.verification)
-    finder = CandidateFinder(chain, rows, _up(record), verifier.surroundings, settings.candidates)
+    places = KeyframePlaces(keyframes, chain, up_of(record), settings.verification.reach_m)
+    verifier = Verifier(places, places, settings.verification)
+    finder = CandidateFinder(chain, rows, places, settings.candidates)
     seconds = {"candidates": 0.0, "verification": 0.0, "consistency": 0.0}
     found: list[tuple[Candidate, Verdict]] = []
     for k in range(len(keyframes)):
@@ -112,7 +114,12 @@ def select_consistent(
     return tuple(one for one, is_kept in zip(left, kept, strict=True) if is_kept), tuple(rejected)
 
 
-def _keyframes_of(record: Record) -> LoopKeyframes:
+def keyframes_of(record: Record) -> LoopKeyframes:
+    """Return the record's keyframes.
+
+    Raises:
+        DataError: it has none, or they do not belong to it.
+    """
     keyframes = record.keyframes
     if keyframes is None:
         raise DataError("the record has no keyframes, which loop closure needs; run the odometry again")
@@ -122,8 +129,8 @@ def _keyframes_of(record: Record) -> LoopKeyframes:
     return keyframes
 
 
-def _up(record: Record) -> Array:
-    """Up ``(3,)`` in the first scan's frame; the lidar's z axis without inertial data."""
+def up_of(record: Record) -> Array:
+    """Return up ``(3,)`` in the first scan's frame; the lidar's z axis without inertial data."""
     if not record.start.has_imu:
         return np.array([0.0, 0.0, 1.0])
     return np.asarray(record.calibration.T_imu_lidar[:3, :3].T @ -record.start.gravity_m_s2)

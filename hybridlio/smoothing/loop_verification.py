@@ -18,15 +18,14 @@ import small_gicp
 from hybridlio.cloud.plane_fitting import MIN_NEIGHBOURS
 from hybridlio.cloud.voxel import voxel_average, voxel_pick
 from hybridlio.core import se3
-from hybridlio.core.arrays import Array, Index
+from hybridlio.core.arrays import Array
 from hybridlio.core.setting_checks import check_fraction, check_not_negative, check_positive, check_setting
-from hybridlio.record.loop_keyframes import LoopKeyframes
 from hybridlio.registration.icp import Fit, Registration, fit_at, register
 from hybridlio.registration.information import NORMAL_NOISE, covariance_of, degenerate_directions
 from hybridlio.registration.motion_search import CoarseSearch, refine_best
 from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Surface
-from hybridlio.smoothing.step_uncertainty import OdometryChain
+from hybridlio.smoothing.places import Places
 
 
 def _registration() -> RegistrationSettings:
@@ -38,7 +37,7 @@ class VerificationSettings:
     """When a candidate is accepted as a loop; the limits favour no false loop over many loops (benchmarks/loops.py).
 
     Attributes:
-        reach_m: keyframes this near along the path on either side are merged to the surroundings.
+        reach_m: places this near along the path on either side are merged to the surroundings.
         surface_voxel_m, source_voxel_m: voxel sides of the surroundings and of the cloud registered to them.
         neighbours: points to which a plane is fitted for a normal.
         min_above_ground: a keyframe with fewer points above the ground closes no loop.
@@ -111,63 +110,16 @@ _SURFACES_KEPT = 64  # a second pass over a place needs the same surfaces repeat
 _UNKNOWN = np.full((6, 6), np.nan)  # the covariance of a rejected candidate
 
 
-class Verifier:
-    """Registers keyframes to each other's surroundings.
+class _PreparedPlaces:
+    """Surfaces and points of places, made when first needed."""
 
-    Args:
-        keyframes: of the run.
-        chain: its odometry; only relative poses of nearby keyframes are used.
-        settings: limits.
-    """
-
-    def __init__(self, keyframes: LoopKeyframes, chain: OdometryChain, settings: VerificationSettings) -> None:
-        self._keyframes, self._chain, self._settings = keyframes, chain, settings
-        self._surface = lru_cache(_SURFACES_KEPT)(self._make_surface)
-        self._source = lru_cache(_SURFACES_KEPT)(self._make_source)
-
-    def surroundings(self, k: int) -> Array:
-        """Return the points ``(N, 3)`` of keyframe ``k`` and its neighbours along the path, in its frame."""
-        near, rows = self._near(k), self._keyframes.rows
-        relative = self._chain.relative(rows[k], rows[near])
-        clouds = [self._keyframes.points(int(j)) for j in near]
-        return np.concatenate([se3.transform(T, points) for T, points in zip(relative, clouds, strict=True)])
-
-    def verify(self, earlier: int, later: int, guesses: Sequence[Array]) -> Verdict:
-        """Find the relative pose of two keyframes from several starts, and judge it.
-
-        Args:
-            earlier, later: numbers of the keyframes.
-            guesses: ``(4, 4)`` poses ``T_earlier_later`` near which to search.
-        """
-        one, other, settings = self._source(earlier), self._source(later), self._settings.registration
-        if min(len(one.above_ground), len(other.above_ground)) < self._settings.min_above_ground:
-            return Verdict("too few points above the ground", guesses[0], _UNKNOWN, 0.0, 1.0)
-        surface = self._surface(earlier)
-        there = register(surface, other.points, self._search(surface, other, guesses), settings, _FINE_START_M)
-        fit = self._fit(surface, other, there)
-        if reason := self._misfit(there, fit):
-            return Verdict(reason, there.pose, _UNKNOWN, fit.matched, fit.cost)
-        surface = self._surface(later)
-        back = register(surface, one.points, se3.inverse(there.pose), settings)
-        reverse = self._fit(surface, one, back)
-        worse = Fit(cost=max(fit.cost, reverse.cost), matched=min(fit.matched, reverse.matched))
-        if reason := self._misfit(back, reverse) or self._difference(there, back):
-            return Verdict(reason, there.pose, _UNKNOWN, worse.matched, worse.cost)
-        return self._accepted(earlier, later, there, back, worse)
-
-    def _near(self, k: int) -> Index:
-        """Keyframes within reach of keyframe ``k`` along the path, itself included."""
-        travelled = self._chain.travelled_m[self._keyframes.rows]
-        return np.flatnonzero(np.abs(travelled - travelled[k]) <= self._settings.reach_m)
-
-    def _distortion(self, k: int) -> Array:
-        """Error of merged surroundings: the mean covariance ``(6, 6)`` of odometry to the merged keyframes."""
-        rows = self._keyframes.rows
-        near = rows[self._near(k)]
-        return np.asarray(self._chain.covariance(near, np.full(len(near), rows[k])).mean(axis=0))
+    def __init__(self, places: Places, settings: VerificationSettings) -> None:
+        self.places, self._settings = places, settings
+        self.surface = lru_cache(_SURFACES_KEPT)(self._make_surface)
+        self.source = lru_cache(_SURFACES_KEPT)(self._make_source)
 
     def _make_surface(self, k: int) -> Surface:
-        thinned = voxel_average(self.surroundings(k), None, self._settings.surface_voxel_m)[0].astype(np.float64)
+        thinned = voxel_average(self.places.surroundings(k), None, self._settings.surface_voxel_m)[0].astype(np.float64)
         cloud = small_gicp.PointCloud(thinned)
         threads = self._settings.registration.threads
         small_gicp.estimate_normals(cloud, None, self._settings.neighbours, threads)
@@ -176,14 +128,51 @@ class Verifier:
         return Surface(points[known], normals[known], threads)
 
     def _make_source(self, k: int) -> _Source:
-        """The keyframe's thinned points, those of the ground thinned further to as many as the others."""
-        points = self._keyframes.points(k).astype(np.float64)
+        """The place's thinned points, those of the ground thinned further to as many as the others."""
+        points = self.places.points(k).astype(np.float64)
         points = points.take(voxel_pick(points, self._settings.source_voxel_m), axis=0)
-        surface = self._surface(k)
+        surface = self.surface(k)
         index, _ = surface.nearest(points, self._settings.registration.threads)
         is_ground = np.abs(surface.normals[index][:, 2]) > _HORIZONTAL
         ground = points[is_ground][:: max(1, int(is_ground.sum()) // max(1, int((~is_ground).sum())))]
         return _Source(np.concatenate([points[~is_ground], ground]), points[~is_ground])
+
+
+class Verifier:
+    """Registers keyframes to each other's surroundings.
+
+    Args:
+        earlier, later: the places, of one run or of two.
+        settings: limits.
+    """
+
+    def __init__(self, earlier: Places, later: Places, settings: VerificationSettings) -> None:
+        self._settings = settings
+        self._earlier = _PreparedPlaces(earlier, settings)
+        self._later = self._earlier if later is earlier else _PreparedPlaces(later, settings)
+
+    def verify(self, earlier: int, later: int, guesses: Sequence[Array]) -> Verdict:
+        """Find the relative pose of two keyframes from several starts, and judge it.
+
+        Args:
+            earlier, later: numbers of the places.
+            guesses: ``(4, 4)`` poses ``T_earlier_later`` near which to search.
+        """
+        one, other, settings = self._earlier.source(earlier), self._later.source(later), self._settings.registration
+        if min(len(one.above_ground), len(other.above_ground)) < self._settings.min_above_ground:
+            return Verdict("too few points above the ground", guesses[0], _UNKNOWN, 0.0, 1.0)
+        surface = self._earlier.surface(earlier)
+        there = register(surface, other.points, self._search(surface, other, guesses), settings, _FINE_START_M)
+        fit = self._fit(surface, other, there)
+        if reason := self._misfit(there, fit):
+            return Verdict(reason, there.pose, _UNKNOWN, fit.matched, fit.cost)
+        surface = self._later.surface(later)
+        back = register(surface, one.points, se3.inverse(there.pose), settings)
+        reverse = self._fit(surface, one, back)
+        worse = Fit(cost=max(fit.cost, reverse.cost), matched=min(fit.matched, reverse.matched))
+        if reason := self._misfit(back, reverse) or self._difference(there, back):
+            return Verdict(reason, there.pose, _UNKNOWN, worse.matched, worse.cost)
+        return self._accepted(earlier, later, there, back, worse)
 
     def _search(self, surface: Surface, source: _Source, guesses: Sequence[Array]) -> Array:
         """Return the best pose after a coarse registration from starts around each guess."""
@@ -224,6 +213,6 @@ class Verifier:
         """
         pose = se3.interpolate(there.pose, se3.inverse(back.pose), 0.5)
         covariance = covariance_of(there.hessian, there.sigma_m, self._settings.covariance_scale) / 2
-        seen_from_later = se3.rotate_covariance(self._distortion(earlier), se3.inverse(pose))
-        covariance = covariance + (seen_from_later + self._distortion(later)) / 4
+        seen_from_later = se3.rotate_covariance(self._earlier.places.distortion(earlier), se3.inverse(pose))
+        covariance = covariance + (seen_from_later + self._later.places.distortion(later)) / 4
         return Verdict("", pose, covariance, fit.matched, fit.cost)

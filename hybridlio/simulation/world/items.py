@@ -21,6 +21,7 @@ class Item:
         yaw: rotation about z in radians.
         radius: of its outline, in metres.
         build: makes the mesh, when the object first comes into sight.
+        number: of the random stream that decides its shape; by default its index in the world.
     """
 
     x: float
@@ -28,3 +29,4 @@ class Item:
     yaw: float
     radius: float
     build: Build
+    number: int | None = None

@@ -6,85 +6,22 @@ Spacings, setbacks and chances are plausible for a European town; they were chos
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from hybridlio.core.arrays import Array
 from hybridlio.simulation.choices import Scene
 from hybridlio.simulation.world import street
 from hybridlio.simulation.world.ground import CURB_OFFSET_M, SIDEWALK_END_M
 from hybridlio.simulation.world.items import Build, Item
+from hybridlio.simulation.world.parking import park_again, parked_car
+from hybridlio.simulation.world.placing import Layout
 from hybridlio.simulation.world.roads import Road
 
 _SAME_STREET_M = 6.0  # a point nearer than this to an earlier piece of the route is on the same street
 _SAMPLE_M = 2.0  # distance of the points at which the route is searched for streets driven before
-_CAR_CLEARANCE_M = 3.3  # from every centreline to a parked car, which may reach 0.2 m into the lane
-_HOUSE_TOLERANCE = 0.95  # neighbouring houses may touch: circles of their size may overlap by 5 %
-_HOUSE_MARGIN, _OBJECT_OVERLAP = 1.15, 0.6  # an object keeps off a house's circle, but its own outline may reach in
-_NEAREST_HOUSES = 60  # the last ones placed; only these can be near
-
-
-@dataclass(eq=False)
-class Layout:
-    """Objects placed so far, each clear of the road and of the houses before it."""
-
-    road: Road
-    centre: cKDTree
-    rng: np.random.Generator
-    items: list[Item] = field(default_factory=list)
-    _houses: list[tuple[float, float, float]] = field(default_factory=list)
-
-    def place(self, s: float, left_m: float, yaw: float, radius: float, build: Build, clear_m: float) -> bool:
-        """Place an object beside the road, unless it is too near to a centreline or in a house.
-
-        Args:
-            s, left_m: arc length, and metres to the left of the centreline.
-            yaw: rotation from the road's heading, in radians.
-            radius: of the object's outline, in metres.
-            build: makes the mesh.
-            clear_m: distance that the outline must keep from every centreline.
-
-        Returns:
-            Whether it was placed.
-        """
-        at, heading = self._at(s, left_m)
-        if self.centre.query(at)[0] < clear_m + radius - 1e-6 or self._in_a_house(at, radius):
-            return False
-        self.items.append(Item(float(at[0]), float(at[1]), heading + yaw, radius, build))
-        return True
-
-    def place_house(self, s: float, left_m: float, width: float, depth: float, height: float, detached: bool) -> bool:
-        """Place a house with its front ``left_m`` from the centreline, facing the road, unless it is in the way."""
-        side = 1.0 if left_m > 0 else -1.0
-        front, heading = self._at(s, left_m)
-        yaw = heading if side > 0 else heading + np.pi
-        c, sn = np.cos(yaw), np.sin(yaw)
-        u, v = np.meshgrid(np.linspace(-width / 2, width / 2, 6), np.linspace(0.0, depth, 5))
-        outline = front + np.column_stack([c * u.ravel() - sn * v.ravel(), sn * u.ravel() + c * v.ravel()])
-        if self.centre.query(outline)[0].min() < min(abs(left_m), SIDEWALK_END_M) - 0.05:
-            return False
-        middle, radius = outline.mean(axis=0), float(min(width, depth) / 2)
-        if any(
-            (middle[0] - x) ** 2 + (middle[1] - y) ** 2 < (_HOUSE_TOLERANCE * (r + radius)) ** 2
-            for x, y, r in self._houses
-        ):
-            return False
-        self._houses.append((float(middle[0]), float(middle[1]), radius))
-        build = partial(street.house, width, depth, height, detached)
-        self.items.append(Item(float(front[0]), float(front[1]), float(yaw), 0.0, build))
-        return True
-
-    def _at(self, s: float, left_m: float) -> tuple[Array, float]:
-        where = np.array([s])
-        return self.road.beside(where, left_m)[0], float(self.road.heading(where)[0])
-
-    def _in_a_house(self, at: Array, radius: float) -> bool:
-        near = np.array(self._houses[-_NEAREST_HOUSES:]).reshape(-1, 3)
-        distance = np.hypot(near[:, 0] - at[0], near[:, 1] - at[1])
-        return bool((distance < near[:, 2] * _HOUSE_MARGIN + radius * _OBJECT_OVERLAP).any())
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +55,14 @@ _ROW_HOUSES = _HouseStyle(detached=False, gaps=(0.0, 3.0), widths=(8.0, 17.0), h
 _DETACHED_HOUSES = _HouseStyle(detached=True, gaps=(4.0, 12.0), widths=(8.0, 13.0), heights=(4.0, 8.5))
 
 
-def lay_out(road: Road, centre: cKDTree, scene: Scene, parked: float, rng: np.random.Generator) -> list[Item]:
+def lay_out(
+    road: Road,
+    centre: cKDTree,
+    scene: Scene,
+    parked: float,
+    rng: np.random.Generator,
+    again: np.random.Generator | None = None,
+) -> list[Item]:
     """Place all objects along the road. Streets that the route passes twice are furnished once.
 
     Args:
@@ -127,6 +71,7 @@ def lay_out(road: Road, centre: cKDTree, scene: Scene, parked: float, rng: np.ra
         scene: kind of surroundings.
         parked: share of parking places that are taken.
         rng: decides what stands where.
+        again: decides which cars are parked otherwise, at another drive through the town; None at the first.
     """
     layout = Layout(road, centre, rng)
     if scene == "corridor":
@@ -142,6 +87,8 @@ def lay_out(road: Road, centre: cKDTree, scene: Scene, parked: float, rng: np.ra
                 kind = rng.choice(["row", "detached", "park", "open"], p=[0.4, 0.32, 0.14, 0.14])
                 _furnish(layout, _Stretch(s, min(s + length, road.length_m), side, is_first), str(kind), parked)
             s += length
+    if again is not None:
+        park_again(layout, parked, again)
     return layout.items
 
 
@@ -163,7 +110,7 @@ def _furnish(layout: Layout, stretch: _Stretch, kind: str, parked: float) -> Non
         (_sign, 25.0, 90.0),
     ]
     if kind in ("row", "detached") and parked > 0:
-        fittings.append((partial(_parked_car, chance=parked), 5.2, 7.5))
+        fittings.append((partial(parked_car, chance=parked), 5.2, 7.5))
     if rng.random() < 0.45:
         fittings.append((_street_tree, 8.0, 16.0))
     if kind == "row":
@@ -210,13 +157,6 @@ def _lamp(layout: Layout, s: float, side: float) -> None:
 def _sign(layout: Layout, s: float, side: float) -> None:
     yaw = 0.0 if side < 0 else np.pi
     layout.place(s, side * (CURB_OFFSET_M + 0.6), yaw, 0.1, street.sign, CURB_OFFSET_M + 0.2)
-
-
-def _parked_car(layout: Layout, s: float, side: float, chance: float) -> None:
-    rng = layout.rng
-    if rng.random() < chance:
-        yaw = (0.0 if side < 0 else np.pi) + rng.normal(0.0, 0.03)
-        layout.place(s, side * (CURB_OFFSET_M - 1.05 + rng.normal(0, 0.08)), yaw, 0.9, street.car, _CAR_CLEARANCE_M)
 
 
 def _street_tree(layout: Layout, s: float, side: float) -> None:

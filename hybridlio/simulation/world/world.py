@@ -70,6 +70,7 @@ class World:
         parts = [self.ground.patch(low, TILE_M, FINE_CELL_M if fine else COARSE_CELL_M)]
         for index in self._by_tile.get(tile, ()):
             item = self.items[index]
-            rng = np.random.default_rng([self.seed, RandomStream.ITEM, index])
+            number = index if item.number is None else item.number
+            rng = np.random.default_rng([self.seed, RandomStream.ITEM, number])
             parts.append(item.build(rng).placed(item.x, item.y, float(self._item_z[index]), item.yaw))
         return merge(parts)

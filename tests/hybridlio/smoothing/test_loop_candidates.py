@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from hybridlio.core import se3
-from hybridlio.smoothing.loop_candidates import Candidate, CandidateFinder, CandidateSettings, levelling_rotations
-from hybridlio.smoothing.loop_verification import VerificationSettings, Verifier
+from hybridlio.smoothing.loop_candidates import Candidate, CandidateFinder, CandidateSettings
+from hybridlio.smoothing.loop_verification import VerificationSettings
+from hybridlio.smoothing.places import KeyframePlaces, levelling_rotations
 from hybridlio.smoothing.step_uncertainty import OdometryChain
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -16,8 +17,8 @@ UP = np.array([0.0, 0.0, 1.0])
 
 def candidates(record: Any, settings: CandidateSettings | None = None) -> list[Candidate]:
     chain, rows = OdometryChain(record.online, record.relative), record.keyframes.rows
-    verifier = Verifier(record.keyframes, chain, VerificationSettings())
-    finder = CandidateFinder(chain, rows, UP, verifier.surroundings, settings or CandidateSettings())
+    places = KeyframePlaces(record.keyframes, chain, UP, VerificationSettings().reach_m)
+    finder = CandidateFinder(chain, rows, places, settings or CandidateSettings())
     return [one for k in range(len(rows)) for one in finder.add(k)]
 
 

@@ -9,13 +9,19 @@ import pytest
 from hybridlio.core import se3
 from hybridlio.record.loop_keyframes import RESOLUTION_M, LoopKeyframes
 from hybridlio.smoothing.loop_verification import VerificationSettings, Verifier
+from hybridlio.smoothing.places import KeyframePlaces
 from hybridlio.smoothing.step_uncertainty import OdometryChain
+
+
+def verifier_of(keyframes: LoopKeyframes, chain: OdometryChain) -> Verifier:
+    places = KeyframePlaces(keyframes, chain, np.array([0.0, 0.0, 1.0]), VerificationSettings().reach_m)
+    return Verifier(places, places, VerificationSettings())
 
 
 @pytest.fixture(scope="module")
 def verifier(round_trip: Any) -> Verifier:
     record = round_trip.record
-    return Verifier(record.keyframes, OdometryChain(record.online, record.relative), VerificationSettings())
+    return verifier_of(record.keyframes, OdometryChain(record.online, record.relative))
 
 
 def keyframe_at(drive: Any, row: int) -> int:
@@ -62,7 +68,7 @@ def test_bare_ground_is_rejected(round_trip: Any, rng: np.random.Generator):
     flat = np.column_stack([rng.uniform(-40, 40, (4000, 2)), rng.normal(-1.8, 0.01, 4000)])
     clouds = tuple(np.round(flat / RESOLUTION_M).astype(np.int16) for _ in rows)
     chain = OdometryChain(round_trip.record.online, round_trip.record.relative)
-    verdict = Verifier(LoopKeyframes(rows, stamps, clouds), chain, VerificationSettings()).verify(3, 70, [np.eye(4)])
+    verdict = verifier_of(LoopKeyframes(rows, stamps, clouds), chain).verify(3, 70, [np.eye(4)])
     assert verdict.reason == "too few points above the ground"
 
 
@@ -74,15 +80,16 @@ def test_a_single_wall_is_rejected_as_degenerate(round_trip: Any, rng: np.random
     cloud = np.concatenate([flat, wall]) + rng.normal(0.0, 0.01, (5000, 3))
     clouds = tuple(np.round(cloud / RESOLUTION_M).astype(np.int16) for _ in rows)
     chain = OdometryChain(straight, round_trip.record.relative)
-    verdict = Verifier(LoopKeyframes(rows, stamps, clouds), chain, VerificationSettings()).verify(3, 70, [np.eye(4)])
+    verdict = verifier_of(LoopKeyframes(rows, stamps, clouds), chain).verify(3, 70, [np.eye(4)])
     assert verdict.reason == "a direction is not constrained"
 
 
-def test_the_surroundings_are_the_merged_neighbours(round_trip: Any, verifier: Verifier):
+def test_the_surroundings_are_the_merged_neighbours(round_trip: Any):
     k = keyframe_at(round_trip, 40)
-    keyframes = round_trip.record.keyframes
+    record, keyframes = round_trip.record, round_trip.record.keyframes
+    chain = OdometryChain(record.online, record.relative)
     own = keyframes.points(k)
-    around = verifier.surroundings(k)
+    around = KeyframePlaces(keyframes, chain, np.array([0.0, 0.0, 1.0]), reach_m=10.0).surroundings(k)
     assert len(around) == sum(len(keyframes.clouds[j]) for j in (k - 2, k - 1, k, k + 1, k + 2))
     nearest = np.linalg.norm(around[:, None, :] - own[None, ::500], axis=-1).min(axis=0)
     np.testing.assert_allclose(nearest, 0.0, atol=1e-9)

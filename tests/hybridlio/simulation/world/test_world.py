@@ -11,6 +11,7 @@ from hybridlio.simulation.rig import LIDAR_HEIGHT_M, T_IMU_LIDAR
 from hybridlio.simulation.sensors.lidar import ray_pattern
 from hybridlio.simulation.world.ground import CURB_HEIGHT_M, CURB_OFFSET_M, Ground, land_along, waves
 from hybridlio.simulation.world.rays import RayScene
+from hybridlio.simulation.world.street import car as street_car
 from hybridlio.simulation.world.world import TILE_M, World
 
 
@@ -119,6 +120,26 @@ def test_a_corridor_has_walls_and_a_field_is_nearly_empty():
     assert walls.range_m.max() < 12.0
     assert len(field.world.items) < 250
     assert isinstance(field.world.scene_around(pose[:3, 3]), RayScene)
+
+
+def test_another_drive_finds_the_same_town_with_other_cars(town: Drive):
+    again = plan(SimulationConfig(seconds=20.0, seed=2, drive_seed=3))
+    (standing, parked), (standing_again, parked_again) = (objects(drive) for drive in (town, again))
+    assert standing == standing_again
+    assert 0.1 < len(parked & parked_again) / len(parked) < 0.6
+    assert len(parked_again) > 0.5 * len(parked)
+    tile = next(iter(town.world._by_tile))
+    houses = [tuple(drive.world.tile_mesh(tile).vertices[0]) for drive in (town, again)]
+    assert houses[0] == houses[1]
+    assert [car.shape_seed for car in town.cars] != [car.shape_seed for car in again.cars]
+    where = [drive.path.poses(np.array([0.0]))[0, :2, 3] for drive in (town, again)]
+    assert np.linalg.norm(where[1] - where[0]) < 5.0
+
+
+def objects(drive: Drive) -> tuple[set[tuple[float, float]], set[tuple[float, float]]]:
+    """Return the positions of what stands, and of the parked cars."""
+    cars = {(item.x, item.y) for item in drive.world.items if item.build is street_car}
+    return {(item.x, item.y) for item in drive.world.items} - cars, cars
 
 
 def test_moving_cars_move_and_keep_clear_of_the_ego_car(town: Drive):
