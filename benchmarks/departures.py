@@ -23,7 +23,8 @@ from hybridlio.learned.networks.odometry_network import OdometryNetwork, paramet
 from hybridlio.learned.presets import DEFAULT, DEPARTURES
 from hybridlio.learned.settings import Recipe
 from hybridlio.learned.training.driving import drive
-from hybridlio.learned.training.train import RunOptions, train
+from hybridlio.learned.training.run_options import RunOptions
+from hybridlio.learned.training.train import train
 from hybridlio.learned.training.validation import step_errors
 from hybridlio.runs.training.recipes import for_steps
 from hybridlio.runs.training.training_data import DataOptions, prepare_shards

@@ -35,7 +35,8 @@ from hybridlio.learned.data.shards import Shard
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
 from hybridlio.learned.networks.weights import Weights, load_weights, weights_path
 from hybridlio.learned.training.driving import drive
-from hybridlio.learned.training.train import RunOptions, train
+from hybridlio.learned.training.run_options import RunOptions
+from hybridlio.learned.training.train import train
 from hybridlio.learned.training.validation import step_errors
 from hybridlio.runs.training.recipes import adaptation_recipe
 from hybridlio.runs.training.training_data import DataOptions, prepare_shards

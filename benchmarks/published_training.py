@@ -30,7 +30,8 @@ from hybridlio.learned.presets import preset
 from hybridlio.learned.settings import Recipe
 from hybridlio.learned.training import checkpoints
 from hybridlio.learned.training.driving import drive
-from hybridlio.learned.training.train import RunOptions, TrainingProgress, Watchers, train
+from hybridlio.learned.training.run_options import RunOptions, TrainingProgress, Watchers
+from hybridlio.learned.training.train import train
 from hybridlio.learned.training.validation import step_errors
 from hybridlio.learned.training.validation_result import Validation
 

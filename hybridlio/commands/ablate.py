@@ -162,7 +162,7 @@ def _row_runner(
 ) -> RunRow:
     """Return a function that trains and evaluates a row with each of its recipes."""
     from hybridlio.learned.training.ablation import RowData, run_rows
-    from hybridlio.learned.training.train import RunOptions
+    from hybridlio.learned.training.run_options import RunOptions
     from hybridlio.runs.training.training_data import prepare_shards, split_options
 
     run_options = RunOptions(device=None if device == "auto" else device)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from hybridlio.learned.data.pairs import Pairs
     from hybridlio.learned.networks.weights import Weights
     from hybridlio.learned.settings import Recipe
-    from hybridlio.learned.training.train import TrainingProgress
+    from hybridlio.learned.training.run_options import RunOptions, TrainingProgress
     from hybridlio.learned.training.validation_result import Validation
     from hybridlio.runs.training.training_data import DataOptions
 
@@ -79,6 +80,14 @@ Out = Annotated[
 Cache = Annotated[Path | None, typer.Option(metavar="DIR", help="The folder for prepared recordings; default: in -o.")]
 Epochs = Annotated[int | None, typer.Option(min=1, help="Passes over the data.")]
 Steps = Annotated[int | None, typer.Option(min=1, help="Optimiser steps in all; replaces --epochs.")]
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        min=0,
+        metavar="N",
+        help="Processes that read batches; by default one a core up to 8 on a GPU, and a thread (0) on a CPU.",
+    ),
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Delete an existing run in -o and start again.")]
 
 
@@ -102,6 +111,7 @@ def train(
     epochs: Epochs = None,
     steps: Steps = None,
     device: Device = "auto",
+    workers: Workers = None,
     overwrite: Overwrite = False,
     topics: BagTopics = NO_CHOICE,
     _verbosity: common.Verbose = 0,
@@ -113,18 +123,14 @@ def train(
     from hybridlio.datasets.protection import check_output
     from hybridlio.learned.networks.devices import pick_device
     from hybridlio.learned.networks.weights import load_weights, weights_path
+    from hybridlio.learned.training.run_options import RunOptions
     from hybridlio.runs.new_folder import claimed
     from hybridlio.runs.own_files import TRAINING
     from hybridlio.runs.training.recipes import choose_recipe, for_steps
     from hybridlio.runs.training.training_data import DataOptions, training_pairs
 
     pick_device(device)
-    if not data and simulate is None:
-        raise ConfigError("nothing to train on: give recordings, or --simulate N for simulated drives")
-    if lidar not in LIDAR_MODELS:
-        raise ConfigError(f"--lidar: unknown lidar {lidar!r}; choose one of {', '.join(LIDAR_MODELS)}")
-    if steps is not None and epochs is not None:
-        raise ConfigError("--steps and --epochs both set the length of the training; give one of them")
+    _check_options(data, simulate, lidar, steps, epochs)
     start = load_weights(weights_path(init_from)) if init_from is not None else None
     recipe = choose_recipe(preset, start.recipe if start else None, config, initial_pose, epochs)
     folder = out or Path("training") / recipe.name
@@ -140,7 +146,19 @@ def train(
             pairs, tests = training_pairs(data, validate, split, recipe, options, report)
         if steps is not None:
             recipe = for_steps(recipe, steps, len(pairs))
-        _run(recipe, pairs, tests, folder, (init_from, start), device, steps)
+        run_options = RunOptions(None if device == "auto" else device, max_steps=steps, workers=workers)
+        _run(recipe, pairs, tests, folder, (init_from, start), run_options)
+
+
+def _check_options(
+    data: list[Path] | None, simulate: int | None, lidar: str, steps: int | None, epochs: int | None
+) -> None:
+    if not data and simulate is None:
+        raise ConfigError("nothing to train on: give recordings, or --simulate N for simulated drives")
+    if lidar not in LIDAR_MODELS:
+        raise ConfigError(f"--lidar: unknown lidar {lidar!r}; choose one of {', '.join(LIDAR_MODELS)}")
+    if steps is not None and epochs is not None:
+        raise ConfigError("--steps and --epochs both set the length of the training; give one of them")
 
 
 def _with_simulated(
@@ -167,16 +185,16 @@ def _run(
     tests: Pairs | None,
     folder: Path,
     init_from: tuple[str | None, Weights | None],
-    device: str,
-    steps: int | None,
+    options: RunOptions,
 ) -> None:
-    from hybridlio.learned.training.train import WEIGHTS, RunOptions, Watchers
+    from hybridlio.learned.training.run_options import Watchers
+    from hybridlio.learned.training.train import WEIGHTS
     from hybridlio.learned.training.train import train as run
     from hybridlio.runs.training.recipes import describe_origin
 
     name, start = init_from
     about = {} if start is None else {"init_from": describe_origin(name or "", start)}
-    options = RunOptions(device=None if device == "auto" else device, max_steps=steps, about=about)
+    options = replace(options, about=about)
     tensors = None if start is None else start.fitting(recipe.network)
     if is_first_process():
         print_result(f"{recipe.name}: {len(pairs)} pairs of {len(pairs.shards)} recordings, in {folder}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -41,15 +41,20 @@ class PairBatch:
 
     def to(self, device: torch.device | str) -> PairBatch:
         """Return the batch on another device."""
-        moved: PairBatch = _moved(self, device)
+        moved: PairBatch = _changed(self, lambda tensor: tensor.to(device, non_blocking=True))
         return moved
 
+    def pin_memory(self) -> PairBatch:
+        """Return the batch in pinned memory, as a ``DataLoader`` asks for."""
+        pinned: PairBatch = _changed(self, Tensor.pin_memory)
+        return pinned
 
-def _moved(value: Any, device: torch.device | str) -> Any:
+
+def _changed(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
     if isinstance(value, Tensor):
-        return value.to(device, non_blocking=True)
+        return change(value)
     if isinstance(value, PairBatch | NetworkInput | Clouds):
-        return replace(value, **{f.name: _moved(getattr(value, f.name), device) for f in fields(value)})
+        return replace(value, **{f.name: _changed(getattr(value, f.name), change) for f in fields(value)})
     return value
 
 

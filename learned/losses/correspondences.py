@@ -79,10 +79,9 @@ def nearest(
         there: ``(B, M)`` which targets are points; without any, distances are infinite.
         max_distance_m: neighbours farther away may be returned at infinite distance, which shortens a CPU's search.
     """
-    if queries.device.type == "cpu":
-        pairs = [_by_tree(q, t, h, max_distance_m) for q, t, h in zip(queries, targets, there, strict=True)]
-    else:
-        pairs = [_by_distances(q, t, h) for q, t, h in zip(queries, targets, there, strict=True)]
+    if queries.device.type != "cpu":
+        return _by_distances(queries, targets, there)
+    pairs = [_by_tree(q, t, h, max_distance_m) for q, t, h in zip(queries, targets, there, strict=True)]
     return torch.stack([index for index, _ in pairs]), torch.stack([distance for _, distance in pairs])
 
 
@@ -102,12 +101,13 @@ def _by_tree(queries: Tensor, targets: Tensor, there: Tensor, limit_m: float = f
 
 
 def _by_distances(queries: Tensor, targets: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
+    """Return index and distance ``(B, N)`` of the nearest target by all distances, of the whole batch at once."""
     best = []
-    for part in torch.split(queries, max(_CHUNK // max(len(targets), 1), 1)):
+    for part in torch.split(queries, max(_CHUNK // max(targets.shape[0] * targets.shape[1], 1), 1), dim=1):
         # exact mode: distances by matrix products are off by centimetres at ranges of 100 m
         distance = torch.cdist(part, targets, compute_mode="donot_use_mm_for_euclid_dist")
-        best.append(distance.masked_fill_(~there, torch.inf).min(dim=1))
-    return torch.cat([b.indices for b in best]), torch.cat([b.values for b in best])
+        best.append(distance.masked_fill_(~there[:, None], torch.inf).min(dim=2))
+    return torch.cat([b.indices for b in best], dim=1), torch.cat([b.values for b in best], dim=1)
 
 
 def match_nearest(pose: Tensor, last: Clouds, current: Clouds, max_distance_m: float = float("inf")) -> Matches:

@@ -20,7 +20,8 @@ from hybridlio.learned.settings import Recipe
 from hybridlio.learned.training import checkpoints
 from hybridlio.learned.training.ablation_results import RowResult
 from hybridlio.learned.training.driving import drive
-from hybridlio.learned.training.train import RunOptions, TrainingProgress, Watchers, train
+from hybridlio.learned.training.run_options import RunOptions, TrainingProgress, Watchers
+from hybridlio.learned.training.train import train
 
 RESULT = "result.json"
 

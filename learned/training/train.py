@@ -10,12 +10,14 @@ in the same folder resumes exactly at its last checkpoint.
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import os
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -35,7 +37,9 @@ from hybridlio.learned.training.checkpoints import Checkpoint
 from hybridlio.learned.training.feed import Feed
 from hybridlio.learned.training.objective import Objective
 from hybridlio.learned.training.processes import Processes, processes
+from hybridlio.learned.training.run_options import RunOptions, TrainingProgress, Watchers
 from hybridlio.learned.training.schedule import learning_rate
+from hybridlio.learned.training.step_figures import StepFigures, is_finite, sums_over_pairs
 from hybridlio.learned.training.training_log import TrainingLog
 from hybridlio.learned.training.validation import validate
 from hybridlio.learned.training.validation_result import Validation
@@ -43,64 +47,6 @@ from hybridlio.learned.training.validation_result import Validation
 CHECKPOINT = "checkpoint.pt"
 WEIGHTS = "weights.safetensors"
 BEST = "best.safetensors"
-
-
-@dataclass(frozen=True)
-class TrainingProgress:
-    """State of a run after a step.
-
-    Attributes:
-        step, steps: steps done, and steps in total.
-        epoch: index of the epoch, from 0.
-        loss: mean loss of the step's pairs.
-        po2pl_m: mean distance to the matched planes, in metres.
-        learning_rate: learning rate of the step.
-        pairs_per_s: average since the run was started or resumed.
-        remaining_s: time for the remaining steps at that rate.
-    """
-
-    step: int
-    steps: int
-    epoch: int
-    loss: float
-    po2pl_m: float
-    learning_rate: float
-    pairs_per_s: float
-    remaining_s: float
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """Options of a run that do not change its steps.
-
-    Attributes:
-        device: name of the device; None selects a GPU if available, else the CPU.
-        checkpoint_every: steps between checkpoints; the end of each epoch has one, too.
-        validate_every: epochs between validations.
-        max_steps: end the run after this many steps in total.
-        max_seconds: stop with a checkpoint after this time.
-        about: text for the metadata of the weights.
-    """
-
-    device: str | None = None
-    checkpoint_every: int = 200
-    validate_every: int = 1
-    max_steps: int | None = None
-    max_seconds: float | None = None
-    about: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Watchers:
-    """Functions that a run calls in the first process.
-
-    Attributes:
-        progress: called after every step.
-        validated: called after every validation, with the steps done and the figures.
-    """
-
-    progress: Callable[[TrainingProgress], None] | None = None
-    validated: Callable[[int, Validation], None] | None = None
 
 
 def train(
@@ -157,7 +103,7 @@ class _Run:
         self.optimiser = torch.optim.Adam(
             self.network.parameters(), settings.learning_rate, settings.betas, weight_decay=settings.weight_decay
         )
-        self.feed = Feed(pairs, settings, place.rank, place.count)
+        self.feed = Feed(pairs, settings, place.rank, place.count, place.readers(options.workers))
         self.steps_an_epoch = math.ceil(len(pairs) / settings.batch)
         whole = self.steps_an_epoch * settings.epochs
         self.steps = min(whole, options.max_steps or whole)
@@ -165,6 +111,8 @@ class _Run:
         self.best = BestWeights(out / BEST)
         self.log: TrainingLog | None = None
         self.objective: nn.Module = self.network
+        self._unread: deque[StepFigures] = deque()
+        self._began, self._first = time.monotonic(), 0
 
     def begin(self, start: Mapping[str, Tensor] | None) -> None:
         """Go on from the folder's checkpoint, or start from the given weights, and write the recipe."""
@@ -179,21 +127,31 @@ class _Run:
             write_atomically(self.out / "recipe.json", json.dumps(to_dict(self.recipe), indent=2) + "\n")
             self.log = TrainingLog(self.out, self.step)
             self.best.forget_after(self.step)
-        self.objective = self.place.joined(Objective(self.network, self.recipe.loss))
+        objective = Objective(self.network, self.recipe.loss)
+        unused = self.place.count > 1 and self._leaves_parameters_unused(objective)
+        self.objective = self.place.joined(objective, unused)
+
+    def _leaves_parameters_unused(self, objective: Objective) -> bool:
+        """Return whether a pair gives some parameters no gradient, such as LSTMs before steps without it."""
+        tried = copy.deepcopy(objective)  # batch normalisation keeps statistics of what it sees
+        tried(self.pairs.batch([0]).to(self.place.device)).total.sum().backward()
+        return any(parameter.grad is None for parameter in tried.parameters())
 
     def train(self, validation: Pairs | None) -> None:
         """Take the remaining steps."""
-        began, first = time.monotonic(), self.step
+        self._began, self._first = time.monotonic(), self.step
         self.network.train()
+        asked = time.monotonic()
         try:
             for indices, batch in self.feed.batches(self.step, self.steps):
-                loss, po2pl = self._step(indices, batch)
-                seconds = time.monotonic() - began
-                self._after_step(loss, po2pl, (self.step - first) / seconds)
+                self._step(indices, batch, asked)
+                if self.step % self.options.checkpoint_every == 0:
+                    self._save()
                 if self.step % self.steps_an_epoch == 0:
                     self._after_epoch(validation)
-                if self.options.max_seconds is not None and self._agreed(seconds > self.options.max_seconds):
+                if self._is_out_of_time():
                     break
+                asked = time.monotonic()
         except KeyboardInterrupt:
             if self._between_steps:  # otherwise weights are half updated: keep the last checkpoint
                 self._save()
@@ -202,68 +160,96 @@ class _Run:
         if self.step >= self.steps and self.place.leads:
             save_weights(self.out / WEIGHTS, self.network, self.recipe, self._origin())
 
-    def _step(self, indices: list[int], batch: PairBatch) -> tuple[float, float]:
-        """Take one step; return the mean loss and the mean distance over the pairs of all processes."""
-        settings = self.recipe.optimiser
+    def _step(self, indices: list[int], batch: PairBatch, asked: float) -> None:
+        """Take one step with a batch that was asked for at a time, and report the figures that are there."""
+        settings, waited_s = self.recipe.optimiser, time.monotonic() - asked
+        rate = learning_rate(settings, self.step / self.steps_an_epoch)
         for group in self.optimiser.param_groups:
-            group["lr"] = learning_rate(settings, self.step / self.steps_an_epoch)
-        batch = batch.to(self.place.device)
-        value: LossValue = self.objective(batch)
+            group["lr"] = rate
+        value: LossValue = self.objective(batch.to(self.place.device))
         counted = self.place.rank < len(indices)  # otherwise this share repeats a pair, see Feed
         share = value.total.sum() / len(indices) * float(counted)
         self.optimiser.zero_grad(set_to_none=True)
         torch.autograd.backward(share * self.place.count)  # gradients are averaged over processes
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), settings.clip_norm or math.inf)
-        sums = torch.stack([share.detach(), value.po2pl_m.sum() / len(indices) * float(counted)])
-        loss, po2pl = self.place.total(sums).tolist()
-        if not (math.isfinite(loss) and bool(torch.isfinite(norm))):
-            raise EstimationError(self._diverged(loss, float(norm), indices))
+        means = self.place.total(sums_over_pairs(value, len(indices), counted))
+        took_s = time.monotonic() - asked
+        self._unread.append(StepFigures(self.step + 1, indices, rate, waited_s, took_s, means, norm))
+        ready = self._checked(keep=self.place.reads_late)
         self._between_steps = False
         self.optimiser.step()
         self.step += 1
         self._between_steps = True
-        return loss, po2pl
+        self._report(ready)
 
-    def _diverged(self, loss: float, norm: float, indices: list[int]) -> str:
+    def _checked(self, keep: int = 0) -> list[tuple[int, dict[str, float]]]:
+        """Read the figures of all but the last ``keep`` steps, and return them by their step.
+
+        Raises:
+            EstimationError: a loss or gradient is not finite.
+        """
+        ready = []
+        while len(self._unread) > keep:
+            figures = self._unread.popleft()
+            values = figures.values()
+            if not is_finite(values):
+                self._unread.clear()
+                raise EstimationError(self._diverged(figures, values))
+            ready.append((figures.step, values))
+        return ready
+
+    def _diverged(self, figures: StepFigures, values: Mapping[str, float]) -> str:
         kept = self.out / CHECKPOINT
-        pairs = [f"{shard.info.name} {k}" for shard, k in map(self.pairs.where, indices[:3])]
+        pairs = [f"{shard.info.name} {k}" for shard, k in map(self.pairs.where, figures.pairs[:3])]
         return (
-            f"training diverged at step {self.step + 1} (loss {loss}, gradient {norm}; pairs {', '.join(pairs)} …); "
+            f"training diverged at step {figures.step} (loss {values['loss']}, gradient {values['gradient_norm']}; "
+            f"pairs {', '.join(pairs)} …); "
             + (f"the last good checkpoint is {kept}; " if kept.is_file() else "there is no checkpoint yet; ")
             + "lower optimiser.learning_rate or set optimiser.clip_norm"
         )
 
-    def _after_step(self, loss: float, po2pl: float, steps_per_s: float) -> None:
-        rate = float(self.optimiser.param_groups[0]["lr"])
-        if self.log is not None:
-            self.log.write(self.step, loss=loss, po2pl_m=po2pl, learning_rate=rate)
-        if self.watchers.progress is not None and self.place.leads:
-            epoch = (self.step - 1) // self.steps_an_epoch
-            left = (self.steps - self.step) / steps_per_s
-            pairs_per_s = steps_per_s * self.recipe.optimiser.batch
-            self.watchers.progress(TrainingProgress(self.step, self.steps, epoch, loss, po2pl, rate, pairs_per_s, left))
-        if self.step % self.options.checkpoint_every == 0:
-            self._save()
+    def _report(self, ready: list[tuple[int, dict[str, float]]]) -> None:
+        """Log the figures of steps, and show the progress."""
+        for step, values in ready:
+            if self.log is not None:
+                self.log.write(step, **values)
+            if self.watchers.progress is not None and self.place.leads:
+                self.watchers.progress(self._progress(step, values))
+
+    def _progress(self, step: int, values: Mapping[str, float]) -> TrainingProgress:
+        steps_per_s = (step - self._first) / (time.monotonic() - self._began)
+        epoch, left = (step - 1) // self.steps_an_epoch, (self.steps - step) / steps_per_s
+        pairs_per_s = steps_per_s * self.recipe.optimiser.batch
+        loss, po2pl_m, rate = values["loss"], values["po2pl_m"], values["learning_rate"]
+        return TrainingProgress(step, self.steps, epoch, loss, po2pl_m, rate, pairs_per_s, left)
 
     def _after_epoch(self, validation: Pairs | None) -> None:
         due = self.step // self.steps_an_epoch % self.options.validate_every == 0
-        if validation is not None and due and self.log is not None:
-            found = validate(self.network, validation, self.recipe, self.place.device)
-            self.log.write(self.step, **{f"validation/{name}": value for name, value in asdict(found).items()})
-            self.best.offer(found, self.step, self.network, self.recipe, self._origin())
-            if self.watchers.validated is not None:
-                self.watchers.validated(self.step, found)
+        self._report(self._checked())
+        if validation is not None and due:
+            found = validate(self.network, validation, self.recipe, self.place)
+            if self.log is not None:
+                self._keep_validation(found)
         self._save()
+
+    def _keep_validation(self, found: Validation) -> None:
+        if self.log is not None:
+            self.log.write(self.step, **{f"validation/{name}": value for name, value in asdict(found).items()})
+        self.best.offer(found, self.step, self.network, self.recipe, self._origin())
+        if self.watchers.validated is not None:
+            self.watchers.validated(self.step, found)
 
     def _origin(self) -> dict[str, str]:
         data = ", ".join(f"{shard.info.name} ({len(shard)} scans)" for shard in self.pairs.shards)
         return {"data": data, "pairs": str(len(self.pairs)), "steps": str(self.step), **self.options.about}
 
-    def _agreed(self, mine: bool) -> bool:
-        """Return whether any process asks to stop, so that all stop at the same step."""
-        return bool(self.place.total(torch.tensor(float(mine), device=self.place.device)) > 0)
+    def _is_out_of_time(self) -> bool:
+        """Return whether any process has no time left, so that all stop at the same step."""
+        limit_s = self.options.max_seconds
+        return limit_s is not None and self.place.any(time.monotonic() - self._began > limit_s)
 
     def _save(self) -> None:
+        self._report(self._checked())  # a checkpoint is good: no step before it has diverged
         if self.place.leads:
             checkpoints.save(self.out / CHECKPOINT, self._checkpoint())
 

@@ -16,6 +16,7 @@ from hybridlio.learned.networks.odometry_network import OdometryNetwork
 from hybridlio.learned.settings import Recipe
 from hybridlio.learned.training.driving import drift_of
 from hybridlio.learned.training.objective import objective
+from hybridlio.learned.training.processes import ALONE, Processes
 from hybridlio.learned.training.validation_result import Validation
 
 
@@ -40,16 +41,21 @@ def run_steps(
     network: OdometryNetwork,
     pairs: Pairs,
     recipe: Recipe,
-    device: torch.device | str = "cpu",
+    place: Processes | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Steps:
-    """Estimate every pair, with initial poses perturbed as in training (seed 0, so that validations compare)."""
+    """Estimate every pair, with initial poses perturbed as in training (seed 0, so that validations compare).
+
+    Several processes share the batches; each gets all estimates.
+    """
+    place = place or ALONE
     was_training, size = network.training, recipe.optimiser.batch
     network.eval()
     parts: list[tuple[Array, ...]] = []
-    for start in range(0, len(pairs), size):
+    starts = range(0, len(pairs), size)
+    for start in starts[place.rank :: place.count]:
         batch = pairs.batch(range(start, min(start + size, len(pairs))))
-        batch = perturbed(batch, recipe.optimiser, seed=0).to(device)
+        batch = perturbed(batch, recipe.optimiser, seed=0).to(place.device)
         out = network(batch.network)
         value = objective(out, batch, recipe.loss, recipe.network.geometry)
         tensors = (out.pose, out.initial, batch.reference, value.total, value.po2pl_m)
@@ -57,12 +63,14 @@ def run_steps(
         if progress is not None:
             progress(min(start + size, len(pairs)), len(pairs))
     network.train(was_training)
-    return Steps(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    shares = place.gathered(parts)
+    in_order = [shares[number % place.count][number // place.count] for number in range(len(starts))]
+    return Steps(*(np.concatenate(column) for column in zip(*in_order, strict=True)))
 
 
-def validate(network: OdometryNetwork, pairs: Pairs, recipe: Recipe, device: torch.device | str = "cpu") -> Validation:
+def validate(network: OdometryNetwork, pairs: Pairs, recipe: Recipe, place: Processes | None = None) -> Validation:
     """Run the network on pairs; return loss, and errors for pairs with a reference."""
-    steps = run_steps(network, pairs, recipe, device)
+    steps = run_steps(network, pairs, recipe, place)
     known = np.isfinite(steps.reference).all(axis=(1, 2))
     loss, po2pl = float(steps.loss.mean()), float(steps.po2pl_m.mean())
     if not known.any():

@@ -159,16 +159,16 @@ def test_a_corridor_does_not_constrain_motion_along_it():
     assert found.hessian[0, 4, 4].item() > 1.0
 
 
-def test_tree_and_chunked_distances_find_the_same_neighbours(monkeypatch):
+def test_trees_and_all_distances_find_the_same_neighbours_of_a_batch(monkeypatch):
     monkeypatch.setattr(correspondences, "_CHUNK", 5000)
     generator = torch.Generator().manual_seed(1)
-    queries, targets = torch.randn(300, 3, generator=generator), torch.randn(200, 3, generator=generator)
-    there = torch.rand(200, generator=generator) > 0.3
-    tree = correspondences._by_tree(queries, targets, there)
-    chunked = correspondences._by_distances(queries, targets, there)
-    assert torch.equal(tree[0], chunked[0])
-    assert torch.allclose(tree[1], chunked[1], atol=1e-6)
-    assert there[tree[0]].all()
+    queries, targets = torch.randn(3, 300, 3, generator=generator), torch.randn(3, 200, 3, generator=generator)
+    there = torch.rand(3, 200, generator=generator) > 0.3
+    index, distance = nearest(queries, targets, there)
+    by_distances = correspondences._by_distances(queries, targets, there)
+    assert torch.equal(index, by_distances[0])
+    assert torch.allclose(distance, by_distances[1], atol=1e-6)
+    assert there.gather(1, index).all()
 
 
 def test_a_limit_changes_nothing_but_neighbours_beyond_it():

@@ -9,7 +9,8 @@ from hybridlio.core import se3
 from hybridlio.learned.data.pairs import Pairs
 from hybridlio.learned.networks import maps
 from hybridlio.learned.networks.projective_steps import ProjectiveSteps, weighted_step
-from hybridlio.learned.training.train import RunOptions, train
+from hybridlio.learned.training.run_options import RunOptions
+from hybridlio.learned.training.train import train
 from hybridlio.learned.training.validation import step_errors
 
 GEOMETRY = MapGeometry(20.0, -20.0, 40, 180)

@@ -14,7 +14,7 @@ from hybridlio.learned.presets import PRESETS
 from hybridlio.learned.training.ablation import RowData, reduced, run_rows
 from hybridlio.learned.training.ablation_results import RowResult
 from hybridlio.learned.training.driving import drift_of, drive
-from hybridlio.learned.training.train import RunOptions
+from hybridlio.learned.training.run_options import RunOptions
 
 CPU = RunOptions(device="cpu")
 

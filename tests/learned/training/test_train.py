@@ -16,8 +16,11 @@ from hybridlio.learned.networks.weights import load_weights
 from hybridlio.learned.setting_values import to_dict
 from hybridlio.learned.settings import OptimiserSettings
 from hybridlio.learned.training import checkpoints
+from hybridlio.learned.training.feed import Feed
+from hybridlio.learned.training.processes import Processes
+from hybridlio.learned.training.run_options import RunOptions, Watchers
 from hybridlio.learned.training.schedule import epoch_order, learning_rate
-from hybridlio.learned.training.train import RunOptions, Watchers, train
+from hybridlio.learned.training.train import train
 from hybridlio.learned.training.training_log import TrainingLog, read_log
 from hybridlio.learned.training.validation import validate
 
@@ -26,6 +29,12 @@ CPU = RunOptions(device="cpu")
 
 def losses(folder):
     return [row["loss"] for row in read_log(folder / "log.jsonl") if "loss" in row]
+
+
+def validations(folder):
+    """Return the rows of the validations, without figures that a short recording lacks."""
+    rows = [row for row in read_log(folder / "log.jsonl") if "validation/loss" in row]
+    return [{name: value for name, value in row.items() if value is not None} for row in rows]
 
 
 def with_optimiser(recipe, **changes):
@@ -62,6 +71,62 @@ def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit(rooms, tiny_recipe, 
         assert torch.equal(a, b)
 
 
+@pytest.mark.parametrize("workers", [1, 2])
+def test_batches_are_the_same_whoever_reads_them(rooms, tiny_recipe, tmp_path, workers):
+    settings = replace(tiny_recipe.optimiser, initial_noise_m=0.1, mirrored=0.5, points=50)
+    pairs = Pairs(rooms[:1], tiny_recipe.network)
+    by_thread = list(Feed(pairs, settings).batches(2, 6))
+    by_workers = list(Feed(pairs, settings, workers=workers).batches(2, 6))
+    assert [indices for indices, _ in by_thread] == [indices for indices, _ in by_workers]
+    for (_, a), (_, b) in zip(by_thread, by_workers, strict=True):
+        assert torch.equal(a.network.last, b.network.last)
+        assert torch.equal(a.network.perturbation, b.network.perturbation)
+        assert torch.equal(a.current.points, b.current.points)
+
+
+def test_figures_read_a_step_late_are_the_same_and_none_is_left_out(rooms, tiny_recipe, tmp_path, monkeypatch):
+    pairs = Pairs(rooms[:1], tiny_recipe.network)
+    train(tiny_recipe, pairs, tmp_path / "at-once", options=CPU)
+    monkeypatch.setattr(Processes, "reads_late", 1)
+    steps = []
+    watchers = Watchers(lambda progress: steps.append(progress.step))
+    train(tiny_recipe, pairs, tmp_path / "late", validation=pairs, options=CPU, watchers=watchers)
+    assert losses(tmp_path / "late") == losses(tmp_path / "at-once")
+    assert steps == list(range(1, 13))
+    late = [row["step"] for row in read_log(tmp_path / "late" / "log.jsonl")]
+    assert late == sorted(late)
+
+
+def test_read_a_step_late_a_diverged_step_still_stays_out_of_checkpoints(rooms, tiny_recipe, tmp_path, monkeypatch):
+    monkeypatch.setattr(Processes, "reads_late", 1)
+    pairs = Pairs(rooms[:1], tiny_recipe.network)
+    train(tiny_recipe, pairs, tmp_path, options=replace(CPU, max_steps=5))
+    batch, asked = pairs.batch, []
+
+    def broken_at_the_second(*indices):
+        good = batch(*indices)
+        asked.append(1)
+        factor = torch.nan if len(asked) == 2 else 1.0
+        return replace(good, network=replace(good.network, imu=good.network.imu * factor))
+
+    monkeypatch.setattr(pairs, "batch", broken_at_the_second)
+    with pytest.raises(EstimationError, match="step 7"):
+        train(tiny_recipe, pairs, tmp_path, options=replace(CPU, checkpoint_every=1))
+    kept = checkpoints.load(tmp_path / "checkpoint.pt")
+    assert kept.step == 6
+    assert all(tensor.isfinite().all() for tensor in kept.network.values())
+
+
+def test_the_log_has_every_term_the_gradient_and_the_time_of_each_step(rooms, tiny_recipe, tmp_path):
+    recipe = with_optimiser(tiny_recipe, epochs=1)
+    train(recipe, Pairs(rooms[:1], recipe.network), tmp_path, options=CPU)
+    rows = read_log(tmp_path / "log.jsonl")
+    names = {"step", "loss", "po2pl_m", "pl2pl", "matched", "gradient_norm", "learning_rate", "waited_s", "step_s"}
+    assert all(set(row) == names for row in rows)
+    assert all(0 < row["matched"] <= 1 and row["gradient_norm"] > 0 for row in rows)
+    assert all(0 <= row["waited_s"] <= row["step_s"] for row in rows)
+
+
 def test_given_initial_poses_get_the_same_perturbation_after_resuming(rooms, tiny_recipe, tmp_path):
     recipe = with_optimiser(
         replace(tiny_recipe, network=replace(tiny_recipe.network, imu="given")), initial_noise_m=0.1, epochs=2
@@ -76,7 +141,8 @@ def test_given_initial_poses_get_the_same_perturbation_after_resuming(rooms, tin
 def test_two_processes_agree_with_one_on_the_same_batches(rooms, room_shards, tiny_recipe, tmp_path, project_root):
     # 15 pairs in batches of 4: the last batch has 3, shared unevenly; this loss gives the LSTMs no gradient
     tiny_recipe = replace(tiny_recipe, network=replace(tiny_recipe.network, projective_steps=1))
-    train(tiny_recipe, Pairs(rooms[:1], tiny_recipe.network), tmp_path / "one", options=CPU)
+    pairs = Pairs(rooms[:1], tiny_recipe.network)
+    train(tiny_recipe, pairs, tmp_path / "one", validation=pairs, options=CPU)
     script = tmp_path / "run.py"
     script.write_text(
         "import json, sys, torch\n"
@@ -84,10 +150,12 @@ def test_two_processes_agree_with_one_on_the_same_batches(rooms, room_shards, ti
         "from hybridlio.learned.setting_values import from_dict\n"
         "from hybridlio.learned.settings import Recipe\n"
         "from hybridlio.learned.data.shards import Shard\n"
-        "from hybridlio.learned.training.train import RunOptions, train\n"
+        "from hybridlio.learned.training.run_options import RunOptions\n"
+        "from hybridlio.learned.training.train import train\n"
         "torch.set_num_threads(1)\n"
         "recipe = from_dict(Recipe, json.loads(sys.argv[1]))\n"
-        "train(recipe, Pairs([Shard(sys.argv[2])], recipe.network), sys.argv[3], options=RunOptions(device='cpu'))\n"
+        "pairs = Pairs([Shard(sys.argv[2])], recipe.network)\n"
+        "train(recipe, pairs, sys.argv[3], validation=pairs, options=RunOptions(device='cpu'))\n"
     )
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", str(script)]
     arguments = [json.dumps(to_dict(tiny_recipe)), str(room_shards[0]), str(tmp_path / "two")]
@@ -96,6 +164,9 @@ def test_two_processes_agree_with_one_on_the_same_batches(rooms, room_shards, ti
     done = subprocess.run([*command, *arguments], env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr[-2000:]
     assert np.allclose(losses(tmp_path / "two"), losses(tmp_path / "one"), rtol=1e-3)
+    one, two = (validations(tmp_path / name) for name in ("one", "two"))
+    assert len(one) == 3
+    assert all(a == pytest.approx(b, rel=1e-2, abs=1e-4) for a, b in zip(one, two, strict=True))
     weights = [load_weights(tmp_path / name / "weights.safetensors").tensors for name in ("one", "two")]
     assert max(float((weights[0][name] - weights[1][name]).abs().max()) for name in weights[0]) < 1e-3
 
