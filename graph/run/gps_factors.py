@@ -6,7 +6,8 @@ scan to its time is taken from the path (:class:`hybridlio.core.pose_interpolati
 time shift moves along the velocity. Within 50 ms the path is known to millimetres and a fix to decimetres, so the
 interpolation adds no variable and no noise; each round recomputes the lever arms.
 
-Keys: ``e`` pose of the run's world in the frame of the fixes; ``t`` time shift in seconds; for each fix the antenna's
+Keys: ``e`` pose of the run's world in the frame of the fixes; ``t`` time shift in seconds; ``o`` the antenna in the IMU
+frame, if it is calibrated; for each fix the antenna's
 position in three frames, ``a`` in the scan's, ``w`` in the run's world, ``p`` in the fixes'. These points let GTSAM's
 own factors connect a scan to a fix. One factor written in Python would need no points, but it gets a copy of all values
 at every evaluation, which takes longer than everything else on a long run.
@@ -20,7 +21,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import A, E, G, P, T, W, X
+from gtsam.symbol_shorthand import A, E, G, O, P, T, W, X
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Index, Mask
@@ -29,6 +30,7 @@ from hybridlio.core.pose_interpolation import PosePath
 from hybridlio.core.sensors import NS_PER_S, GpsFix
 from hybridlio.graph.base import noise
 from hybridlio.graph.model import coordinates as co
+from hybridlio.graph.run.antenna import Antenna
 from hybridlio.graph.run.factor_groups import GroupFactors, GroupSolution, PossibleOutlier
 from hybridlio.record.record import Record
 from hybridlio.smoothing.gps_alignment import LEVEL_SIGMA_RAD, FixAlignment, align_fixes, fix_stamps
@@ -54,19 +56,27 @@ class GpsGroup:
     Args:
         record: of the run, with its fixes.
         options: how to use them.
+        antenna_sigma_m: standard deviation of the antenna's stated position, to calibrate it; None takes it as it is.
     """
 
     name = "gps"
 
-    def __init__(self, record: Record, options: GpsOptions | None = None) -> None:
+    def __init__(
+        self, record: Record, options: GpsOptions | None = None, antenna_sigma_m: float | None = None
+    ) -> None:  # fmt: skip
         self._options = options or GpsOptions()
         self.robust = self._options.robust
         self._fixes = record.gps
-        self._T_imu_lidar = record.calibration.T_imu_lidar
-        antenna = self._options.antenna_m if self._options.antenna_m is not None else record.calibration.antenna_imu_m
-        self._antenna = np.zeros(3) if antenna is None else np.asarray(antenna, dtype=np.float64)
+        self.T_imu_lidar = record.calibration.T_imu_lidar
+        stated = self._options.antenna_m if self._options.antenna_m is not None else record.calibration.antenna_imu_m
+        self.antenna = Antenna(np.zeros(3) if stated is None else np.asarray(stated, np.float64), antenna_sigma_m)
         self._scale: float | None = None
         self._rows: Index = np.empty(0, np.int64)
+
+    @property
+    def max_shift_s(self) -> float:
+        """Standard deviation of the clock's shift before."""
+        return max(self._options.max_shift_s, _LEAST_SHIFT_SIGMA_S)
 
     def build(self, states: Sequence[State], previous: gtsam.Values | None) -> GroupFactors:
         """Return one possible outlier per fix, with the factors and initial values of frame and clock.
@@ -85,6 +95,7 @@ class GpsGroup:
         values.insert(E(0), gtsam.Pose3(T_enu_world))
         values.insert(T(0), np.array([shift]))
         group = GroupFactors([*self._priors(T_enu_world), _plumb_factor(states[0])], values=values)
+        self.antenna.add_to(group)
         self._add_fixes(group, path, shift, T_enu_world)
         return group
 
@@ -97,7 +108,7 @@ class GpsGroup:
         self._rows = np.flatnonzero(~out)
         up, sigma = _up_of(start)
         aligned = align_fixes(
-            path, [self._fixes[k] for k in self._rows], self._antenna, up, sigma, self._options.max_shift_s
+            path, [self._fixes[k] for k in self._rows], self.antenna.position_m, up, sigma, self._options.max_shift_s
         )
         self._rows = self._rows[aligned.used]
         kept = aligned.used
@@ -109,7 +120,7 @@ class GpsGroup:
     def _priors(self, T_enu_world: Array) -> list[gtsam.NonlinearFactor]:
         """Priors: the frame may be anywhere, the shift is within the searched range."""
         anywhere = noise.sigmas(_FRAME_SIGMAS)
-        shift = noise.sigmas(np.array([max(self._options.max_shift_s, _LEAST_SHIFT_SIGMA_S)]))
+        shift = noise.sigmas(np.array([self.max_shift_s]))
         return [
             gtsam.PriorFactorPose3(E(0), gtsam.Pose3(T_enu_world), anywhere),
             gtsam.PriorFactorVector(T(0), np.zeros(1), shift),
@@ -120,17 +131,18 @@ class GpsGroup:
         fixes = [self._fixes[k] for k in self._rows]
         stamps = fix_stamps(fixes, shift_s)
         near = path.nearest(stamps)
-        points, velocities = path.points(stamps, self._antenna)
+        points, velocities = path.points(stamps, self.antenna.position_m)
         placed = se3.transform(T_enu_world, points)
         T_scan_world = se3.inverse(path.poses[near])
         levers = (T_scan_world @ np.column_stack([points, np.ones(len(points))])[..., None])[:, :3, 0]
         lever_rates = (T_scan_world[:, :3, :3] @ velocities[..., None])[..., 0]
+        turns = T_scan_world[:, :3, :3] @ path.at(stamps)[:, :3, :3]  # of the IMU from the fix to the scan
         link = noise.sigmas(np.full(3, _LINK_SIGMA_M))
         for n, (k, fix) in enumerate(zip(near.tolist(), fixes, strict=True)):
             for key, value in ((A(n), levers[n]), (W(n), points[n]), (P(n), placed[n])):
                 group.values.insert(key, value)
             links = [
-                _lever_factor(n, levers[n], lever_rates[n], shift_s, link),
+                self._lever_factor(n, levers[n], (lever_rates[n], turns[n]), shift_s, link),
                 gtsam.ReferenceFrameFactorPoint3Pose3(A(n), X(k), W(n), link),
                 gtsam.ReferenceFrameFactorPoint3Pose3(W(n), E(0), P(n), link),
             ]
@@ -142,6 +154,20 @@ class GpsGroup:
                 )
             )
 
+    def _lever_factor(
+        self, n: int, lever: Array, rates: tuple[Array, Array], shift_s: float, model: gtsam.noiseModel.Base
+    ) -> gtsam.NonlinearFactor:
+        """The linear factor ``a = lever + velocity · (t - shift) + turn · (o - antenna)``; velocity and turn: rates."""
+        at, (velocity, turn) = gtsam.Values(), rates
+        at.insert(A(n), lever)
+        at.insert(T(0), np.array([shift_s]))
+        terms = [A(n), np.eye(3), T(0), -velocity[:, None]]
+        if self.antenna.is_variable:
+            at.insert(O(0), self.antenna.position_m)
+            terms += [O(0), -turn]
+        make: Any = gtsam.JacobianFactor  # its stubs lack this overload
+        return gtsam.LinearContainerFactor(make(*terms, np.zeros(3), model), at)
+
     def read(self, solution: GroupSolution) -> GpsFit:
         """Return frame, clock, and how each fix fits."""
         T_enu_imu = solution.values.atPose3(E(0)).matrix()
@@ -152,15 +178,15 @@ class GpsGroup:
         used[self._rows] = True
         weights[self._rows] = solution.weights
         points, _ = _path_of(solution.states).points(
-            fix_stamps([self._fixes[k] for k in self._rows], shift), self._antenna
+            fix_stamps([self._fixes[k] for k in self._rows], shift), self.antenna.position_m
         )
         positions = np.array([self._fixes[k].position_m for k in self._rows])
         residuals[self._rows] = se3.transform(T_enu_imu, points) - positions
-        T_imu_lidar = self._T_imu_lidar
+        T_imu_lidar = self.T_imu_lidar
         covariance = se3.rotate_covariance(joint[:6, :6], se3.inverse(T_imu_lidar))
         return GpsFit(
             T_enu_imu @ T_imu_lidar, covariance, shift, float(np.sqrt(joint[6, 6])), residuals, used, weights,
-            self._scale or 1.0,
+            self._scale or 1.0, self.antenna.position_m,
         )  # fmt: skip
 
 
@@ -177,19 +203,6 @@ def _up_of(state: State) -> tuple[Array, float]:
         return co.UP, LEVEL_SIGMA_RAD
     spread = float(np.sqrt(np.trace(state.gravity_covariance) / 3)) / float(np.linalg.norm(state.gravity_m_s2))
     return -state.gravity_m_s2, float(np.hypot(spread, _PLUMB_SIGMA_RAD))
-
-
-def _lever_factor(
-    n: int, lever: Array, velocity: Array, shift_s: float, model: gtsam.noiseModel.Base
-) -> gtsam.NonlinearFactor:
-    """The linear factor ``a = lever + velocity · (t - shift)``, which needs no relinearisation."""
-    at = gtsam.Values()
-    at.insert(A(n), lever)
-    at.insert(T(0), np.array([shift_s]))
-    by_shift = -velocity[:, None]
-    make: Any = gtsam.JacobianFactor  # its stubs lack this overload
-    linear = make(A(n), np.eye(3), T(0), by_shift, np.zeros(3), model)
-    return gtsam.LinearContainerFactor(linear, at)
 
 
 def _plumb_factor(start: State) -> gtsam.NonlinearFactor:

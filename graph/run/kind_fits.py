@@ -7,7 +7,7 @@ import gtsam
 from hybridlio.graph.run.robust import AddedGroups
 from hybridlio.smoothing.verdict import IMU, ODOMETRY, KindFit
 
-_RELATIVE, _INERTIAL = {"x", "m"}, {"x", "v", "b"}  # letters of the keys that factors of each kind connect
+_RELATIVE, _INERTIAL = {"x", "m", "c"}, {"x", "v", "b"}  # letters of the keys that factors of each kind connect
 
 
 def kind_fits(graph: gtsam.NonlinearFactorGraph, own: int, values: gtsam.Values, added: AddedGroups) -> list[KindFit]:

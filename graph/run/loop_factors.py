@@ -28,7 +28,7 @@ class LoopClosures:
     robust: str | None = "gnc"
 
     def __init__(self, search: LoopSearch, T_imu_lidar: Array) -> None:
-        self._search, self._T_imu_lidar = search, T_imu_lidar
+        self._search, self.T_imu_lidar = search, T_imu_lidar
 
     def build(self, states: Sequence[State], previous: gtsam.Values | None) -> GroupFactors:
         """Return one between-factor for each loop."""
@@ -48,8 +48,8 @@ class LoopClosures:
         return ClosedLoops(self._search, kept, solution.chi2, (*self._search.rejected, *wrong))
 
     def _factor(self, loop: Loop) -> PossibleOutlier:
-        pose = gtsam.Pose3(self._T_imu_lidar @ loop.pose @ se3.inverse(self._T_imu_lidar))
-        covariance = se3.rotate_covariance(loop.covariance, self._T_imu_lidar)
+        pose = gtsam.Pose3(self.T_imu_lidar @ loop.pose @ se3.inverse(self.T_imu_lidar))
+        covariance = se3.rotate_covariance(loop.covariance, self.T_imu_lidar)
 
         def make(model: gtsam.noiseModel.Base) -> gtsam.NonlinearFactor:
             return gtsam.BetweenFactorPose3(X(loop.earlier), X(loop.later), pose, model)

@@ -28,8 +28,10 @@ from hybridlio.graph.run.kind_fits import kind_fits
 from hybridlio.graph.run.loop_factors import LoopClosures
 from hybridlio.graph.run.ordering import chain_order
 from hybridlio.graph.run.robust import AddedGroups, check_robust_method
+from hybridlio.graph.run.run_calibration import RunCalibration
 from hybridlio.graph.run.scan_numbers import ScanNumbers
 from hybridlio.record.record import Record
+from hybridlio.smoothing.calibration import CalibrationPriors
 from hybridlio.smoothing.gps_options import GpsOptions
 from hybridlio.smoothing.smoothed import Smoothed
 from hybridlio.smoothing.verdict import Verdict
@@ -39,9 +41,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_MAX_ITERATIONS = 50  # a bound against endless descent; Smoothed.converged says whether it was reached
 _ITERATIONS_A_STEP = 4  # while outliers are rejected: each step of GNC repeats until it converges anyway
-_ROUNDS = 2  # the second preintegrates the samples again, with the biases that the first found
 _RELATIVE_TOLERANCE = 1e-6  # decrease of the error at which iterations stop; a tenth of GTSAM's default
 
 
@@ -53,6 +53,7 @@ def smooth(
     gps: bool | GpsOptions = False,
     groups: Sequence[FactorGroup] = (),
     robust: str | None = None,
+    calibrate: Sequence[str] | CalibrationPriors = (),
 ) -> Smoothed:
     """Optimise all poses, velocities, biases and gravity of a run at once (Levenberg-Marquardt).
 
@@ -66,43 +67,59 @@ def smooth(
         groups: further measurements.
         robust: method against outliers among the measurements of all groups: ``huber``, ``cauchy``, ``geman-mcclure``,
             ``dcs`` or ``gnc``; None takes each group's default.
+        calibrate: names of parameters to estimate as well, of ``time_offset`` and ``extrinsics`` (of IMU and lidar),
+            ``lever_arm`` and ``gps_clock``; or a :class:`hybridlio.smoothing.calibration.CalibrationPriors`.
+            ``found["calibration"]`` is then a :class:`hybridlio.smoothing.calibration.Calibrated`. What the motion does
+            not determine stays as stated.
 
     Raises:
         GraphError: the graph cannot be solved.
         EstimationError: too few fixes lie in the run's time.
-        ConfigError: an unknown robust method, or something else than a record.
+        ConfigError: an unknown robust method or parameter, a parameter without its sensor, or something else than a
+            record.
         DataError: loops are asked for, and the record has no keyframes.
     """
     if not isinstance(record, Record):
         raise ConfigError(f"smooth takes a Record, got {type(record).__name__}; Record.load(path) reads a run's")
     report, robust = progress or _silent, check_robust_method(robust)  # checked before the long search for loops
-    fixes = [GpsGroup(record, gps if isinstance(gps, GpsOptions) else GpsOptions())] if gps else []
-    added = AddedGroups([*fixes, *_with_loops(groups, record, loops, report)], robust)
-    return on_deep_stack(len(record.online), lambda: _optimise(record, added, report))
+    priors = calibrate if isinstance(calibrate, CalibrationPriors) else CalibrationPriors(calibrate)
+    priors.check_sensors(has_imu=record.start.has_imu, has_gps=bool(gps))
+    options = gps if isinstance(gps, GpsOptions) else GpsOptions()
+    fixes = [GpsGroup(record, options, priors.antenna_sigma_m)] if gps else []
+    closures = _loop_closures(record, loops, report)
+    added = AddedGroups([*fixes, *groups, *closures], robust)
+    calibration = RunCalibration(record, priors, fixes, closures)
+    return on_deep_stack(len(record.online), lambda: _optimise(record, added, calibration, report))
 
 
-def _optimise(record: Record, added: AddedGroups, report: Progress) -> Smoothed:
+def _optimise(record: Record, added: AddedGroups, calibration: RunCalibration, report: Progress) -> Smoothed:
     """Solve the run's graph with the added groups, in rounds."""
     states = _online_states(record)
     error_before: float | None = None
-    for number in range(_ROUNDS):
-        report("optimising", number, _ROUNDS)
-        graph, values = _build(record, states)
+    for number in range(calibration.rounds):
+        report("optimising", number, calibration.rounds)
+        graph, values = _build(calibration.applied(), states)
+        calibration.link(graph, values, states)
         own = graph.size()
         graph, values = added.add_to(graph, values, states, _few_iterations)
         error_before = graph.error(values) if error_before is None else error_before
-        optimiser = _optimiser(graph, values)
+        optimiser = _optimiser(graph, values, calibration.iterations)
         values = _solve(optimiser)
         states = _states(values, states)
         added.start_next_from(values)
+        if calibration.take(graph, values):
+            break
     isam = bayes_tree(graph, values)
     covariances = pose_covariances(isam, np.array([state.T_world_imu for state in states]), report)
     found = added.results(values, states, isam)
+    found |= calibration.results(values, isam)
     verdict = Verdict.of(kind_fits(graph, own, values, added))
     for doubt in verdict.doubts:
         _log.warning("smoothing: %s", doubt)
-    smoothed = _smoothed(record, states, covariances, error_before or 0.0, optimiser, found)
-    return replace(smoothed, verdict=verdict, **(_own_trajectory(record) if verdict.refused else {}))
+    smoothed = _smoothed(calibration.applied(), states, covariances, error_before or 0.0, optimiser, found)
+    converged = calibration.has_converged(smoothed.iterations)
+    own_poses = _own_trajectory(record) if verdict.refused else {}
+    return replace(smoothed, verdict=verdict, converged=converged, **own_poses)
 
 
 def _own_trajectory(record: Record) -> dict[str, Any]:
@@ -111,15 +128,13 @@ def _own_trajectory(record: Record) -> dict[str, Any]:
     return {"trajectory": record.online, "step_covariances": steps}
 
 
-def _with_loops(
-    groups: Sequence[FactorGroup], record: Record, loops: bool | LoopSettings, report: Progress
-) -> Sequence[FactorGroup]:
+def _loop_closures(record: Record, loops: bool | LoopSettings, report: Progress) -> list[LoopClosures]:
     if loops is False:
-        return groups
+        return []
     from hybridlio.smoothing.loop_closure import find_loops  # late: only those who close loops load registration
 
     search = find_loops(record, None if loops is True else loops, report)
-    return (*groups, LoopClosures(search, record.calibration.T_imu_lidar))
+    return [LoopClosures(search, record.calibration.T_imu_lidar)]
 
 
 def _silent(stage: str, done: int, total: int) -> None:
@@ -158,7 +173,7 @@ def _build(record: Record, states: list[State]) -> tuple[gtsam.NonlinearFactorGr
 
 
 def _optimiser(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, iterations: int = _MAX_ITERATIONS
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, iterations: int
 ) -> gtsam.LevenbergMarquardtOptimizer:
     params = gtsam.LevenbergMarquardtParams()
     params.setLinearSolverType("MULTIFRONTAL_QR")  # Cholesky fails on long straight chains
@@ -224,6 +239,6 @@ def _smoothed(
         error_before=error_before,
         error_after=float(optimiser.error()),
         iterations=iterations,
-        converged=iterations < _MAX_ITERATIONS,
+        converged=True,
         found=found,
     )

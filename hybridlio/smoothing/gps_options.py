@@ -54,6 +54,7 @@ class GpsFit:
         used: ``(M,)`` whether the fix lies in the run's time and in no outage.
         weights: ``(M,)`` weight of each fix, 0 to 1; 0 for fixes that are not used.
         noise_scale: factor on the claimed standard deviations of the fixes, from their scatter; at least 1.
+        antenna_m: ``(3,)`` the antenna in the IMU's frame, as stated or calibrated.
     """
 
     T_enu_world: Array
@@ -64,6 +65,7 @@ class GpsFit:
     used: Mask
     weights: Array
     noise_scale: float
+    antenna_m: Array
 
     @property
     def rejected(self) -> Mask:
@@ -91,6 +93,7 @@ class GpsFit:
             "shift_s": self.shift_s,
             "shift_sigma_s": self.shift_sigma_s,
             "noise_scale": self.noise_scale,
+            "antenna_m": self.antenna_m.tolist(),
             "T_enu_world": self.T_enu_world.tolist(),
         }
 

@@ -1,0 +1,192 @@
+"""Calibration as a part of smoothing: which parameters are variables, what is known of them before, and the result.
+
+A parameter has one to three components. In each direction of their space the measurements of a run carry some
+information; where it is not clearly more than that of the prior, the run's motion does not determine the parameter in
+this direction, and it stays at its prior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hybridlio.core import se3
+from hybridlio.core.arrays import Array
+from hybridlio.core.errors import ConfigError
+from hybridlio.core.sensors import Calibration
+from hybridlio.core.setting_checks import check_positive
+
+CALIBRATED = ("time_offset", "extrinsics", "lever_arm", "gps_clock")
+OF_IMU, OF_GPS = ("time_offset", "extrinsics"), ("lever_arm", "gps_clock")
+# Information of the measurements over that of the prior, in a direction that counts as determined: a tenth of the
+# prior's error is then left in the estimate at most.
+_DETERMINED = 10.0
+_AXES = "xyz"
+_ALONG_AXIS = 0.98  # component of a unit vector that is called by the axis' name: within 11 degrees
+_UNITS = {"time_offset": (1e3, "ms"), "gps_clock": (1e3, "ms"), "rotation": (np.rad2deg(1.0), "°")}
+_METRES = (1e2, "cm")
+
+
+@dataclass(frozen=True)
+class CalibrationPriors:
+    """Which parameters to calibrate, and how well they are known before.
+
+    Attributes:
+        names: of :data:`CALIBRATED`.
+        rotation_sigma_rad: of ``T_imu_lidar`` about each axis; 3° is what a hand measures.
+        translation_sigma_m: of ``T_imu_lidar`` along each axis, from a drawing or a ruler.
+        time_offset_sigma_s: of the IMU's stamps; drivers that stamp on arrival are late by less.
+        lever_arm_sigma_m: of the antenna along each axis: the size of a car's roof.
+
+    Raises:
+        SettingError: a value is not positive.
+        ConfigError: an unknown name.
+    """
+
+    names: Sequence[str]
+    rotation_sigma_rad: float = 0.05
+    translation_sigma_m: float = 0.3
+    time_offset_sigma_s: float = 0.1
+    lever_arm_sigma_m: float = 2.0
+
+    def __post_init__(self) -> None:
+        sigmas = [name for name in vars(self) if name != "names"]
+        check_positive(self, *sigmas)
+        if isinstance(self.names, str):
+            raise ConfigError(f"calibrate takes several names, such as ({self.names!r},), got {self.names!r}")
+        for name in self.names:
+            if name not in CALIBRATED:
+                raise ConfigError(f"calibrate: there is no {name!r}; choose of {', '.join(CALIBRATED)}")
+
+    @property
+    def antenna_sigma_m(self) -> float | None:
+        """Standard deviation of the antenna's position, or None if it is not calibrated."""
+        return self.lever_arm_sigma_m if "lever_arm" in self.names else None
+
+    def check_sensors(self, has_imu: bool, has_gps: bool) -> None:
+        """Raise ConfigError where a parameter's sensor is not used."""
+        for name in self.names:
+            if name in OF_IMU and not has_imu:
+                raise ConfigError(f"calibrate: {name} needs IMU samples, and the run has none")
+            if name in OF_GPS and not has_gps:
+                raise ConfigError(f"calibrate: {name} needs GPS fixes; give gps=True")
+
+
+@dataclass(frozen=True, eq=False)
+class Parameter:
+    """A calibrated parameter.
+
+    Attributes:
+        name: ``rotation``, ``translation`` (of ``T_imu_lidar``), ``time_offset``, ``lever_arm`` or ``gps_clock``.
+        change: ``(d,)`` estimate minus what was stated; rad, m or s. A rotation's is a rotation vector in the lidar
+            frame (right perturbation), a translation's is in the IMU frame.
+        covariance: ``(d, d)``; in undetermined directions that of the prior.
+        prior_sigma: standard deviation of each component before.
+        undetermined: ``(u, d)`` unit vectors of the directions that the motion does not determine.
+    """
+
+    name: str
+    change: Array
+    covariance: Array
+    prior_sigma: float
+    undetermined: Array
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations ``(d,)`` of the components."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the motion determines it in every direction."""
+        return not len(self.undetermined)
+
+    @property
+    def doubt(self) -> str | None:
+        """What is not known, or None."""
+        if self.is_determined:
+            return None
+        if len(self.undetermined) == len(self.change):
+            return f"{self.name}: the motion does not determine it; it stays as stated"
+        along = " and ".join(map(_direction, self.undetermined))
+        return f"{self.name}: the motion does not determine it along {along}; there it stays as stated"
+
+    def __str__(self) -> str:
+        factor, unit = _UNITS.get(self.name, _METRES)
+        columns = zip(factor * self.change, factor * self.sigmas, strict=True)
+        return f"{self.name} {', '.join(f'{value:+.3g} ± {sigma:.2g}' for value, sigma in columns)} {unit}"
+
+
+def _direction(vector: Array) -> str:
+    largest = int(np.abs(vector).argmax())
+    if abs(vector[largest]) > _ALONG_AXIS:
+        return _AXES[largest]
+    return f"({', '.join(f'{value:.2f}' for value in vector * np.sign(vector[largest]))})"
+
+
+def undetermined_directions(covariance: Array, prior_sigma: float) -> Array:
+    """Return unit vectors ``(u, d)`` of the directions in which a posterior covariance is close to the prior's."""
+    variances, directions = np.linalg.eigh(covariance / prior_sigma**2)
+    # posterior = 1 / (1 + r) of the prior, for information r of the measurements
+    return np.asarray(directions.T[variances > 1 / (1 + _DETERMINED)])
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """The calibration that a smoothing found.
+
+    Attributes:
+        calibration: the extrinsics and the antenna, with what was not calibrated as it was.
+        imu_time_offset_s: seconds to add to the IMU's stamps, as the recording has them, to bring them to the poses'
+            clock.
+        gps_time_offset_s: seconds to add to the fixes' stamps.
+        parameters: what was calibrated, with its uncertainty.
+    """
+
+    calibration: Calibration
+    imu_time_offset_s: float
+    gps_time_offset_s: float
+    parameters: tuple[Parameter, ...]
+
+    def parameter(self, name: str) -> Parameter:
+        """Return a parameter by name.
+
+        Raises:
+            ConfigError: it was not calibrated.
+        """
+        for parameter in self.parameters:
+            if parameter.name == name:
+                return parameter
+        raise ConfigError(f"{name} was not calibrated; {', '.join(one.name for one in self.parameters)} were")
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What the motion does not determine."""
+        return tuple(parameter.doubt for parameter in self.parameters if parameter.doubt is not None)
+
+    def summary(self) -> str:
+        """Return the parameters' changes on one line."""
+        return "; ".join(map(str, self.parameters))
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """Return the content for ``metrics.json``."""
+        antenna = self.calibration.antenna_imu_m
+        return {
+            "T_imu_lidar": self.calibration.T_imu_lidar.tolist(),
+            "antenna_imu_m": None if antenna is None else antenna.tolist(),
+            "imu_time_offset_s": self.imu_time_offset_s,
+            "gps_time_offset_s": self.gps_time_offset_s,
+            "parameters": {
+                one.name: {"change": one.change.tolist(), "sigmas": one.sigmas.tolist(), "doubt": one.doubt}
+                for one in self.parameters
+            },
+        }
+
+
+def moved_extrinsics(T_imu_lidar: Array, rotation: Array, translation: Array) -> Array:
+    """Return extrinsics turned by a rotation vector in the lidar frame and moved by a vector in the IMU frame."""
+    R = T_imu_lidar[:3, :3] @ se3.so3_exp(rotation)
+    return se3.make(R, T_imu_lidar[:3, 3] + translation)
