@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from hybridlio.core import se3
@@ -30,10 +32,12 @@ class LoopSupport:
     Attributes:
         scale: factor, at most 1, by which to lower χ² bounds where all noise is stated much larger than it is.
         supported: ``(M,)`` whether a loop agrees with a neighbour.
+        cluster: ``(M,)`` number of the loop's cluster: loops that agree with one another, directly or through others.
     """
 
     scale: float
     supported: Mask
+    cluster: Index
 
 
 class GraphOdometry:
@@ -98,13 +102,20 @@ def loop_support(loops: Edges, odometry: GraphOdometry, bound: float) -> LoopSup
     count, size = len(loops.i), loops.information.shape[1]
     pairs, chi2 = _neighbours(loops, odometry)
     if len(pairs) < _PAIRS_FOR_SCALE:
-        return LoopSupport(1.0, np.zeros(count, dtype=bool))
+        return LoopSupport(1.0, np.zeros(count, dtype=bool), _clusters(pairs[chi2 <= bound], count))
     medians = _medians(np.concatenate([pairs, pairs[:, ::-1]])[:, 0], np.concatenate([chi2, chi2]))
     typical = size - 2 / 3  # median of χ², by Wilson and Hilferty
     scale = min(1.0, _SCALE_MARGIN * float(np.median(medians)) / typical)
+    agreeing = pairs[chi2 <= scale * bound]
     supported = np.zeros(count, dtype=bool)
-    supported[pairs[chi2 <= scale * bound]] = True
-    return LoopSupport(scale, supported)
+    supported[agreeing] = True
+    return LoopSupport(scale, supported, _clusters(agreeing, count))
+
+
+def _clusters(pairs: Index, count: int) -> Index:
+    """Return the number of the cluster ``(count,)`` of each loop, where pairs ``(K, 2)`` belong together."""
+    joined = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count))
+    return np.asarray(connected_components(joined, directed=False)[1], dtype=np.int64)
 
 
 def _neighbours(loops: Edges, odometry: GraphOdometry) -> tuple[Index, Array]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import gtsam
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -12,37 +10,21 @@ from scipy.sparse.csgraph import dijkstra
 from hybridlio.core.arrays import Array, Mask
 from hybridlio.graph.base.truncated_squares import GRADUATION
 from hybridlio.graph.outliers.loop_support import LoopSupport
-from hybridlio.graph.outliers.weighted_solver import WeightedSolver
+from hybridlio.graph.outliers.weighted_solver import Found, WeightedSolver
 
 _FIRST_REACH = 4  # edges: the shortest loops that odometry of a few steps cannot fold
 _COARSE_GRADUATION = 3.0  # within a round, whose candidates start near their places; 1.4 takes three times longer
 # χ² in units of the bound from which a round starts at most: of a loop whose odometry has drifted by a hundred times
 # its stated noise. Higher starts only add steps at which no weight changes.
 _LARGEST_CHI2 = 1e4
-_REPAIRS = 40  # at most, each a solution of the whole graph: all that is rejected in a small graph, a sample in a large
 _SOURCES_AT_ONCE = 256  # rows of distances in memory: 100 MB for 50,000 poses
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """The result of one search.
-
-    Attributes:
-        values: GTSAM's values, solved with the correct loops alone.
-        correct: ``(M,)`` which loops are within the bound.
-        cost: the truncated cost there.
-    """
-
-    values: gtsam.Values
-    correct: Mask
-    cost: float
 
 
 def all_at_once(solver: WeightedSolver, start: gtsam.Values) -> Found:
     """Graduate over all loops together, from their joint solution, as the paper does."""
     candidates = np.ones(len(solver.loops.i), dtype=bool)
     values = solver.solve(start, candidates.astype(np.float64))
-    return _refined(solver, *solver.graduate(values, candidates, solver.bound, GRADUATION))
+    return solver.found(*solver.graduate(values, candidates, solver.bound, GRADUATION))
 
 
 def nearest_first(solver: WeightedSolver, start: gtsam.Values, support: LoopSupport, growth: float) -> Found:
@@ -73,28 +55,7 @@ def nearest_first(solver: WeightedSolver, start: gtsam.Values, support: LoopSupp
                 values, correct = solver.graduate(values, candidates, bound, _COARSE_GRADUATION, _LARGEST_CHI2)
                 tried |= candidates
             reach *= growth
-    return _refined(solver, values, correct)
-
-
-def repaired(solver: WeightedSolver, found: Found) -> Found:
-    """Take back rejected loops one by one, those of least χ² first, where that lowers the cost."""
-    best, tried = found, found.correct.copy()
-    for _ in range(_REPAIRS):
-        left = np.flatnonzero(~(tried | best.correct))
-        if not len(left):
-            break
-        loop = left[np.argmin(solver.chi2(best.values)[left])]
-        tried[loop] = True
-        with_loop = best.correct.copy()
-        with_loop[loop] = True
-        again = _refined(solver, best.values, with_loop)
-        best = again if again.cost < best.cost else best
-    return best
-
-
-def _refined(solver: WeightedSolver, values: gtsam.Values, correct: Mask) -> Found:
-    values, correct = solver.refine(values, correct)
-    return Found(values, correct, solver.cost(values))
+    return solver.found(values, correct)
 
 
 def _spans(solver: WeightedSolver, correct: Mask, limit: float) -> Array:
