@@ -6,8 +6,15 @@ from the IMU. With the gyroscope's bias ``b`` and a small rotation ``φ`` betwee
     ``g_k(δ) - b·Δt_k = Exp(φ)·u_k + e_k``.
 
 The errors ``e_k`` are those of the lidar's poses: a drift that adds up and a scatter that the next step takes back, so
-neighbouring steps are anticorrelated. Both are estimated from the residuals (:class:`StepNoise`). The offset of least
-weighted squares is the maximum of the likelihood, and the inverse of the normal matrix is its covariance.
+neighbouring steps are anticorrelated. Both are estimated from the residuals
+(:class:`~hybridlio.calibration.step_noise.StepNoise`). The offset of least weighted squares is the maximum of the
+likelihood, and the inverse of the normal matrix is its covariance. Errors of registration may also agree over many
+steps, on one wall or in one bend. The covariance is therefore the larger one of this and of the estimate that holds for
+any errors with a limited memory (Newey, West, "A simple, positive semi-definite, heteroskedasticity and autocorrelation
+consistent covariance matrix", Econometrica 55, 1987).
+
+Axes of the lidar about which a step was not measured are left out: on open ground a scan's yaw stays where the
+registration began, and would show the motion that was proposed, not the lidar's.
 """
 
 from __future__ import annotations
@@ -15,8 +22,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solveh_banded
 
+from hybridlio.calibration.step_noise import LEAST_SIGMA_RAD, StepNoise, mean_square
 from hybridlio.calibration.turns import GyroPath, Turns
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Mask
@@ -29,8 +36,8 @@ _ITERATIONS = 12  # each also renews the weights; the offset settles to microsec
 _SETTLED_S = 1e-6
 _DIFFERENCE_S = 1e-3  # of the numeric derivative by the offset, below any time between samples
 _OUTLIER_SIGMAS = 5.0  # of a step's residual: a jump of the odometry
-_LEAST_DRIFT_SHARE = 0.05  # of a step's variance: steps that scatter alone would fix all turns over a whole run
-_LEAST_SIGMA_RAD = 1e-5  # of a step: below a lidar's and a gyroscope's resolution; keeps noise-free data solvable
+_MEMORY_STEPS = 10  # of errors that agree: one second at 10 Hz, in which surroundings of a lidar change
+_COMPENSATION_S = 2e-4  # error of motion compensation: 0.2 to 0.3 ms remain on five of twelve development drives
 _CLIP_QUANTILE = 0.95  # of turn rates, where the search stops counting differences: a jump must not decide
 # An offset is applied from 3 ms on: below it, the errors of interpolating 100 Hz samples and of the lidar's own stamps
 # are as large, and drift does not change measurably (benchmarks/clock_offsets.py).
@@ -122,32 +129,6 @@ def coarse_clock_offset(turns: Turns, imu: ImuSamples, largest_s: float) -> floa
     return _Fit(turns, imu, np.eye(3), ImuNoise()).search(largest_s)
 
 
-@dataclass(frozen=True, eq=False)
-class StepNoise:
-    """Variances ``(3,)`` per axis of an odometry's turns: a step has ``drift + 2·scatter``, neighbours ``-scatter``."""
-
-    drift: Array
-    scatter: Array
-
-    @classmethod
-    def of(cls, residuals: Array, joined: Mask) -> StepNoise:
-        """Estimate both from residuals ``(N, 3)`` by their variance and the covariance of joined neighbours."""
-        variance = (residuals**2).mean(axis=0) + _LEAST_SIGMA_RAD**2
-        pairs = residuals[1:][joined] * residuals[:-1][joined]
-        scatter = np.clip(-pairs.mean(axis=0) if len(pairs) else 0.0, 0.0, (1 - _LEAST_DRIFT_SHARE) * variance / 2)
-        return cls(variance - 2 * scatter, scatter)
-
-    def solve(self, joined: Mask, columns: Array) -> Array:
-        """Return the inverse of the residuals' covariance times ``columns`` ``(N, 3, C)``."""
-        out = np.empty_like(columns)
-        for axis in range(3):
-            bands = np.zeros((2, len(columns)))
-            bands[0] = self.drift[axis] + 2 * self.scatter[axis]
-            bands[1, :-1] = np.where(joined, -self.scatter[axis], 0.0)
-            out[:, axis] = solveh_banded(bands, columns[:, axis], lower=True)
-        return out
-
-
 class _Fit:
     """One comparison of turns with a gyroscope."""
 
@@ -157,6 +138,7 @@ class _Fit:
         self._turns = turns
         self._starts = (turns.starts_ns - origin_ns) / NS_PER_S
         self._ends = (turns.ends_ns - origin_ns) / NS_PER_S
+        self._R, self._measured = R_imu_lidar, turns.measured
         self._u = turns.rotvecs @ R_imu_lidar.T
         self._prior = np.r_[0.0, np.full(3, noise.gyro_bias_sigma_rad_s**-2.0), np.full(3, _ROTATION_SIGMA_RAD**-2)]
 
@@ -186,23 +168,43 @@ class _Fit:
             if whole.sum() < _MIN_STEPS:
                 return None
             kept, joined, noise = self._weights(x, whole)
-            residuals, J = self._residuals(x, kept), self._jacobian(x, kept)
-            weighted = noise.solve(joined, J)
-            normal = np.einsum("nai,naj->ij", J, weighted) + np.diag(self._prior)
-            gradient = np.einsum("nai,na->i", weighted, residuals) + self._prior * np.r_[0.0, x[1:]]
+            J = noise.whitened(joined, self._jacobian(x, kept))
+            residuals = noise.whitened(joined, self._residuals(x, kept)[:, :, None])
+            scores = (J * residuals).sum(axis=1)
+            normal = np.einsum("nai,naj->ij", J, J) + np.diag(self._prior)
+            gradient = scores.sum(axis=0) + self._prior * np.r_[0.0, x[1:]]
             step = np.linalg.solve(normal + 1e-9 * np.diag(np.diag(normal)), gradient)
             step[0] = np.clip(step[0], -2 * _GRID_S, 2 * _GRID_S)
             x = x - step
             x[0] = np.clip(x[0], -largest_s, largest_s)
             if abs(step[0]) < _SETTLED_S:
                 break
-        sigmas = np.sqrt(np.diag(np.linalg.pinv(normal)))
+        sigmas = self._sigmas(normal, scores, kept)
         at_zero = np.r_[0.0, x[1:]]
         return ClockOffset(
             float(x[0]), float(sigmas[0]), x[1:4], x[4:], sigmas[4:], int(kept.sum()),
             self._unexplained(x, kept), self._unexplained(at_zero, kept & self._whole(0.0)),
             float(np.sqrt(self._u[kept].var(axis=0).sum())), self._stated_rotation_ratio(x, kept),
         )  # fmt: skip
+
+    def _sigmas(self, normal: Array, scores: Array, kept: Mask) -> Array:
+        """Return the standard deviations ``(7,)``: of the weighted fit, or of errors that agree over some steps.
+
+        Args:
+            normal: ``(7, 7)`` normal matrix.
+            scores: ``(M, 7)`` derivatives of the steps' parts of the cost.
+            kept: ``(N,)`` the ``M`` steps.
+        """
+        at = np.zeros((len(kept), 7))
+        at[kept] = scores
+        spread = at.T @ at + np.diag(self._prior)
+        for lag in range(1, min(_MEMORY_STEPS, len(at) - 1) + 1):
+            product = at[lag:].T @ at[:-lag]
+            spread += (1 - lag / (_MEMORY_STEPS + 1)) * (product + product.T)
+        inverse = np.linalg.pinv(normal)
+        variances = np.maximum(np.diag(inverse), np.diag(inverse @ spread @ inverse))
+        variances[0] += _COMPENSATION_S**2
+        return np.asarray(np.sqrt(variances))
 
     def _whole(self, offset: float) -> Mask:
         return self._path.covers(self._starts - offset - _DIFFERENCE_S, self._ends - offset + _DIFFERENCE_S)
@@ -211,34 +213,46 @@ class _Fit:
         """Return the rows without outliers ``(N,)``, which of them are joined to the next, and their noise."""
         residuals = np.zeros_like(self._u)
         residuals[whole] = self._residuals(x, whole)
-        scale = 1.4826 * np.median(np.abs(residuals[whole]), axis=0) + _LEAST_SIGMA_RAD
+        sizes = np.where(self._measured[whole], np.abs(residuals[whole]), np.nan)
+        medians = [np.median(column[column >= 0]) if (column >= 0).any() else 0.0 for column in sizes.T]
+        scale = 1.4826 * np.array(medians) + LEAST_SIGMA_RAD
         kept = whole & (np.abs(residuals) < _OUTLIER_SIGMAS * scale).all(axis=1)
         rows = np.flatnonzero(kept)
-        joined = (np.diff(rows) == 1) & self._turns.joined[rows[:-1]]
-        return kept, joined, StepNoise.of(residuals[kept], joined)
+        measured = self._measured[rows]
+        joined = ((np.diff(rows) == 1) & self._turns.joined[rows[:-1]])[:, None] & measured[1:] & measured[:-1]
+        return kept, joined, StepNoise.of(residuals[kept], measured, joined)
 
     def _residuals(self, x: Array, rows: Mask) -> Array:
+        """Return residuals ``(M, 3)`` along the lidar's axes by the stated mounting, 0 where not measured."""
         gyro = self._path.turns(self._starts[rows] - x[0], self._ends[rows] - x[0])
-        return np.asarray(gyro - x[1:4] * self._turns.spans_s[rows, None] - self._u[rows] @ se3.so3_exp(x[4:]).T)
+        errors = gyro - x[1:4] * self._turns.spans_s[rows, None] - self._u[rows] @ se3.so3_exp(x[4:]).T
+        return np.asarray(errors @ self._R * self._measured[rows])
 
     def _jacobian(self, x: Array, rows: Mask) -> Array:
         J = np.zeros((int(rows.sum()), 3, 7))
         step = np.eye(7)[0] * _DIFFERENCE_S
         J[:, :, 0] = (self._residuals(x + step, rows) - self._residuals(x - step, rows)) / (2 * _DIFFERENCE_S)
-        J[:, :, 1:4] = -np.eye(3) * self._turns.spans_s[rows, None, None]
+        J[:, :, 1:4] = -self._R.T * self._turns.spans_s[rows, None, None]
         turned = self._u[rows] @ se3.so3_exp(x[4:]).T
-        J[:, :, 4:] = se3.hat(turned)  # Exp(φ + dφ)·u ≈ Exp(φ)·u - hat(Exp(φ)·u)·dφ
-        return J
+        J[:, :, 4:] = self._R.T @ se3.hat(turned)  # Exp(φ + dφ)·u ≈ Exp(φ)·u - hat(Exp(φ)·u)·dφ
+        return np.asarray(J * self._measured[rows, :, None])
 
     def _stated_rotation_ratio(self, x: Array, rows: Mask) -> float:
-        stated, estimated = (self._residuals(y, rows).var(axis=0) for y in (np.r_[x[:4], np.zeros(3)], x))
-        return float((stated / np.maximum(estimated, _LEAST_SIGMA_RAD**2)).mean())
+        stated, estimated = (self._variances(y, rows) for y in (np.r_[x[:4], np.zeros(3)], x))
+        return float((stated / np.maximum(estimated, LEAST_SIGMA_RAD**2)).mean())
 
     def _unexplained(self, x: Array, rows: Mask) -> float:
         if not rows.any():
             return np.inf
-        ratios = self._residuals(x, rows).var(axis=0) / np.maximum(self._u[rows].var(axis=0), 1e-12)
-        return float(3 / (1 / np.maximum(ratios, 1e-9)).sum())
+        turned, known = self._turns.rotvecs[rows], self._measured[rows].any(axis=0)
+        ratios = self._variances(x, rows)[known] / np.maximum(turned.var(axis=0)[known], 1e-12)
+        return float(3 / (1 / np.maximum(ratios, 1e-9)).sum()) if known.any() else np.inf
+
+    def _variances(self, x: Array, rows: Mask) -> Array:
+        """Return the residuals' variances ``(3,)`` about the lidar's axes."""
+        residuals, measured = self._residuals(x, rows), self._measured[rows]
+        mean = residuals.sum(axis=0) / np.maximum(measured.sum(axis=0), 1)
+        return mean_square((residuals - mean) * measured, measured)
 
 
 def _clipped(rates: Array) -> Array:

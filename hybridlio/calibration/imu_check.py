@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -24,7 +24,7 @@ from hybridlio.calibration.gross_errors import (
 from hybridlio.calibration.motion import ComparedMotion, compare_motion
 from hybridlio.calibration.turns import Turns
 from hybridlio.core import se3
-from hybridlio.core.arrays import Array
+from hybridlio.core.arrays import Array, Mask
 from hybridlio.core.sensors import NS_PER_S, ImuSamples
 from hybridlio.core.trajectory import Trajectory
 
@@ -55,7 +55,14 @@ class ImuCheck:
     wrong: list[str] = field(default_factory=list)
 
 
-def check_imu(paths: list[Trajectory], imu: ImuSamples, T_imu_lidar: Array, largest_s: float) -> ImuCheck:
+def check_imu(
+    paths: list[Trajectory],
+    imu: ImuSamples,
+    T_imu_lidar: Array,
+    largest_s: float,
+    measured: Mask | None = None,
+    more_sigma_s: float = 0.0,
+) -> ImuCheck:
     """Compare samples with the path of the lidar.
 
     Units and the accelerometer's sign are corrected where the data leave no doubt, and an offset of the clocks where it
@@ -66,8 +73,10 @@ def check_imu(paths: list[Trajectory], imu: ImuSamples, T_imu_lidar: Array, larg
         imu: the samples.
         T_imu_lidar: ``(4, 4)`` as stated.
         largest_s: bound of the clocks' offset.
+        measured: ``(N, 3)`` whether the path's steps measure turns about the lidar's axes; by default all do.
+        more_sigma_s: standard deviation that the paths add to the offset, besides the errors of their turns.
     """
-    found, turns = ImuCheck(imu), Turns.of(*paths)
+    found, turns = ImuCheck(imu), Turns.of(*paths, measured=measured)
     _correct_force_unit(found)
     coarse_s = coarse_clock_offset(turns, imu, largest_s)
     if coarse_s is None:
@@ -82,6 +91,8 @@ def check_imu(paths: list[Trajectory], imu: ImuSamples, T_imu_lidar: Array, larg
     if not found.wrong:
         found.offset = find_clock_offset(turns, found.imu, T_imu_lidar[:3, :3], largest_s)
         if found.offset is not None:
+            sigma_s = float(np.hypot(found.offset.sigma_s, more_sigma_s))
+            found.offset = replace(found.offset, sigma_s=sigma_s)
             _judge(found, found.offset, T_imu_lidar, largest_s)
     return found
 

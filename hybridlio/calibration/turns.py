@@ -24,21 +24,30 @@ class Turns:
     Attributes:
         starts_ns, ends_ns: ``(N,)`` int64, in order of time.
         rotvecs: ``(N, 3)`` rotation vectors from start to end in the lidar frame, rad.
+        measured: ``(N, 3)`` whether the lidar measured the turn about each of its axes.
     """
 
     starts_ns: Stamps
     ends_ns: Stamps
     rotvecs: Array
+    measured: Mask
 
     @classmethod
-    def of(cls, *trajectories: Trajectory) -> Turns:
-        """Return the steps between consecutive poses of trajectories that follow each other in time."""
+    def of(cls, *trajectories: Trajectory, measured: Mask | None = None) -> Turns:
+        """Return the steps between consecutive poses of trajectories that follow each other in time.
+
+        Args:
+            trajectories: each of two poses or more.
+            measured: see :class:`Turns`, for all steps one after the other; by default all turns are measured.
+        """
         starts, ends, rotvecs = [], [], []
         for path in trajectories:
             starts.append(path.stamps_ns[:-1])
             ends.append(path.stamps_ns[1:])
             rotvecs.append(se3.so3_log(se3.between(path.poses[:-1], path.poses[1:])[:, :3, :3]))
-        return cls(np.concatenate(starts), np.concatenate(ends), np.concatenate(rotvecs))
+        turns = np.concatenate(rotvecs)
+        all_measured = np.ones(turns.shape, bool) if measured is None else measured
+        return cls(np.concatenate(starts), np.concatenate(ends), turns, all_measured)
 
     def __len__(self) -> int:
         return len(self.starts_ns)
@@ -55,7 +64,7 @@ class Turns:
 
     def at(self, rows: Mask) -> Turns:
         """Return some of the steps."""
-        return Turns(self.starts_ns[rows], self.ends_ns[rows], self.rotvecs[rows])
+        return Turns(self.starts_ns[rows], self.ends_ns[rows], self.rotvecs[rows], self.measured[rows])
 
 
 class GyroPath:

@@ -13,26 +13,25 @@ from dataclasses import replace
 import numpy as np
 
 from hybridlio.calibration.clock_offset import LEAST_OFFSET_S
-from hybridlio.calibration.imu_check import ImuCheck, check_imu
+from hybridlio.calibration.compensation import LARGEST_OFFSET_S, LARGEST_SHARE, Compensation
+from hybridlio.calibration.imu_check import ImuCheck, check_imu, moved
 from hybridlio.core.errors import DataError
 from hybridlio.core.progress import Progress
-from hybridlio.core.sensors import NS_PER_S, ImuSamples, Scan
+from hybridlio.core.sensors import ImuSamples, Scan
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.sources.scan_path import ScanPath, best_paths, scan_paths
 
-LARGEST_OFFSET_S = 0.2  # drivers that stamp on arrival are late by less; larger offsets are of clocks never set
 # Four stretches of ten seconds at 10 Hz: the offset is then known to 0.5 ms in ordinary driving, as the gyroscope's
-# noise allows. Two are enough to see that the clocks agree (benchmarks/clock_offsets.py has accuracy and time).
-_STRETCHES, _FIRST_STRETCHES, _STRETCH_SCANS = 4, 2, 100
+# noise allows. One is enough to see that the clocks agree (benchmarks/clock_offsets.py has accuracy and time).
+_STRETCHES, _STRETCH_SCANS = 4, 100
 _QUIET_SCANS = 15  # of a stretch, among which it begins at the one that turns least
 _LEAST_SCANS = 60  # in a recording, for 50 steps that the samples cover
 _POINTS = 30_000
-_MAX_PASSES = 6  # of scans that need motion compensation, which depends on the offset: the error falls to a tenth a
-# pass in a car, to a quarter in a hand that turns fast
-_SETTLED_S = 5e-4
-_COARSE_S = 0.02  # standard deviation of an offset that compensation begins with: as fine as the search and its step
-_LARGEST_RATE_RAD_S = 6.0  # of 95 % of samples; rates beyond are of another unit and no help to compensate scans
+_MAX_PASSES = 8  # with other stretches, or another compensation: three of the latter are usual in a car, five in a hand
+# Where scans compensated with a wrong offset do not fit each other, the nearest of these is near enough to begin with.
+_TRIED_SHIFTS_S, _TRIED_SCANS = (0.0, -0.05, 0.05, -0.1, 0.1, -0.15, 0.15), 40
+_PRECISE_S = 3e-4  # standard deviation with which 1 ms is exceeded once in 1,000 recordings
 
 
 def check_recording(sequence: Sequence, progress: Progress | None = None) -> Sequence:
@@ -69,24 +68,28 @@ def is_comparable(sequence: Sequence) -> bool:
 
 
 def compare_imu(sequence: Sequence, progress: Progress | None = None) -> ImuCheck | None:
-    """Return what the comparison of IMU and scans shows; None if too few scans can be used."""
-    recording = _Loaded(sequence, progress)
-    rates = np.linalg.norm(sequence.imu.gyro_rad_s, axis=1)
-    compensating = sequence.imu if np.quantile(rates, 0.95) < _LARGEST_RATE_RAD_S else ImuSamples.empty()
-    paths: list[ScanPath] = []
-    check, before_s = None, 0.0
+    """Return what the comparison of IMU and scans shows; None if too few scans can be used.
+
+    The stretch with most turns comes first, until the offset that compensates its scans is the one that is found. The
+    others follow one by one while they could change the answer.
+    """
+    recording, compensation = _Loaded(sequence, progress), Compensation(sequence.imu)
+    stretches, check = 1, None
     for _ in range(_MAX_PASSES):
-        paths = recording.paths(slice(None, _FIRST_STRETCHES), compensating)
-        check = recording.check(paths)
-        if check is None or check.wrong or not recording.are_distorted:
+        check = recording.check(recording.paths(stretches, compensation.imu))
+        if check is None and compensation.is_new and recording.are_distorted:
+            compensation.shift(recording.likely_shift_s(compensation.imu))
+            continue
+        if check is not None and _is_final(check, compensation, recording.are_distorted):
             break
-        now_s = check.offset.offset_s if _is_known_coarsely(check) and check.offset is not None else 0.0
-        if abs(now_s - before_s) < _SETTLED_S and len(compensating):
+        if recording.are_distorted and check is not None and compensation.improve(check):
+            continue
+        if (check is not None and check.wrong and stretches > 1) or stretches == recording.stretches:
             break
-        before_s, compensating = now_s, _moved(check)
-    if check is not None and (check.wrong or _is_on_time(check)):
+        stretches += 1
+    if check is None or check.offset is None or not recording.are_distorted or compensation.agrees(check.offset):
         return check
-    return recording.check(paths + recording.paths(slice(_FIRST_STRETCHES, None), compensating))
+    return recording.check(recording.paths(stretches, compensation.imu), compensation.error_s(check.offset))
 
 
 class _Loaded:
@@ -94,29 +97,53 @@ class _Loaded:
 
     def __init__(self, sequence: Sequence, progress: Progress | None) -> None:
         self._sequence, self._progress = sequence, progress
-        self._stretches = [_loaded(sequence, rows) for rows in _stretches(sequence)]
-        self._done, self._total = 0, sum(map(len, self._stretches))
+        self._rows = _stretches(sequence)
+        self._stretches: dict[int, list[Scan]] = {}
+        self._paths: dict[int, list[ScanPath]] = {}
+        self._compensating: ImuSamples | None = None
+        self._done, self._total = 0, sum(map(len, self._rows))
+
+    @property
+    def stretches(self) -> int:
+        """Number of stretches."""
+        return len(self._rows)
 
     @property
     def are_distorted(self) -> bool:
-        """Whether motion compensation, and so the offset of the clocks, changes the scans."""
-        return any(scan.time_offsets_ns is not None for stretch in self._stretches for scan in stretch)
+        """Whether motion compensation, and so the offset of the clocks, changes the scans loaded so far."""
+        return any(scan.time_offsets_ns is not None for stretch in self._stretches.values() for scan in stretch)
 
-    def paths(self, stretches: slice, compensating: ImuSamples) -> list[ScanPath]:
-        """Return the lidar's paths through some stretches, compensated by the gyroscope if it has samples."""
-        calibration = self._sequence.calibration
-        return [
-            path
-            for stretch in self._stretches[stretches]
-            for path in scan_paths(self._counted(stretch), calibration, compensating)
-        ]
+    def paths(self, stretches: int, compensating: ImuSamples) -> list[ScanPath]:
+        """Return the lidar's paths through the first stretches, compensated by the gyroscope if it has samples."""
+        if compensating is not self._compensating:
+            self._compensating, self._paths = compensating, {}
+        for stretch in range(stretches):
+            if stretch not in self._stretches:
+                self._stretches[stretch] = _loaded(self._sequence, self._rows[stretch])
+            if stretch not in self._paths:
+                scans = self._counted(self._stretches[stretch])
+                self._paths[stretch] = scan_paths(scans, self._sequence.calibration, compensating)
+        return [path for stretch in range(stretches) for path in self._paths[stretch]]
 
-    def check(self, paths: list[ScanPath]) -> ImuCheck | None:
-        """Return the comparison of the samples with paths."""
+    def likely_shift_s(self, compensating: ImuSamples) -> float:
+        """Return the shift of the samples with which scans fit each other longest, and best."""
+
+        def quality(shift_s: float) -> tuple[int, float]:
+            scans, samples = self._stretches[0][:_TRIED_SCANS], moved(compensating, shift_s)
+            paths = scan_paths(scans, self._sequence.calibration, samples)
+            return max(((len(path.trajectory), -path.sigma_m) for path in paths), default=(0, 0.0))
+
+        return max(_TRIED_SHIFTS_S, key=quality)
+
+    def check(self, paths: list[ScanPath], more_sigma_s: float = 0.0) -> ImuCheck | None:
+        """Return the comparison of the samples with paths; the offset's deviation is larger by ``more_sigma_s``."""
         right = best_paths(paths)
-        if sum(map(len, right)) < _LEAST_SCANS:
+        trajectories = [path.trajectory for path in right]
+        if sum(map(len, trajectories)) < _LEAST_SCANS:
             return None
-        return check_imu(right, self._sequence.imu, self._sequence.calibration.T_imu_lidar, LARGEST_OFFSET_S)
+        measured = np.concatenate([path.measured for path in right])
+        imu, T_imu_lidar = self._sequence.imu, self._sequence.calibration.T_imu_lidar
+        return check_imu(trajectories, imu, T_imu_lidar, LARGEST_OFFSET_S, measured, more_sigma_s)
 
     def _counted(self, scans: list[Scan]) -> Iterator[Scan]:
         for scan in scans:
@@ -126,25 +153,34 @@ class _Loaded:
             yield scan
 
 
-def _is_on_time(check: ImuCheck) -> bool:
-    """Whether the offset is known to be too small to matter, so that more scans would change nothing."""
+def _is_final(check: ImuCheck, compensation: Compensation, are_distorted: bool) -> bool:
+    """Whether more scans, or others to compensate them with, would not change the answer in a way that matters."""
+    if not are_distorted:
+        return _is_on_time(check) or _is_precise(check)
+    if compensation.is_new:
+        return _is_on_time(check, LARGEST_SHARE)
+    agrees = check.offset is not None and compensation.agrees(check.offset)
+    return agrees and (_is_on_time(check) or _is_precise(check))
+
+
+def _is_on_time(check: ImuCheck, share: float = 0.0) -> bool:
+    """Whether the offset is known to be too small to matter, so that more scans would change nothing.
+
+    Args:
+        check: of the scans so far.
+        share: of the offset that their compensation, with the stamps as they are, may have hidden.
+    """
     offset = check.offset
-    return offset is not None and offset.is_determined and abs(offset.offset_s) + 2 * offset.sigma_s < LEAST_OFFSET_S
+    if offset is None or check.wrong or not offset.is_determined:
+        return False
+    return abs(offset.offset_s) / (1 - share) + 2 * offset.sigma_s < LEAST_OFFSET_S
 
 
-def _is_known_coarsely(check: ImuCheck) -> bool:
-    """Whether motion compensation is better with the offset that was found than without."""
+def _is_precise(check: ImuCheck) -> bool:
+    """Whether more scans would not make the offset better in a way that matters, and nothing else is in doubt."""
     offset = check.offset
-    return offset is not None and not offset.contradicts and offset.sigma_s < _COARSE_S
-
-
-def _moved(check: ImuCheck) -> ImuSamples:
-    """Return the samples at the offset that was found, significant or not, without the gyroscope's bias."""
-    imu, offset = check.imu, check.offset
-    if offset is None:
-        return imu
-    to_come_ns = 0 if offset.is_significant or not _is_known_coarsely(check) else round(offset.offset_s * NS_PER_S)
-    return ImuSamples(imu.stamps_ns + to_come_ns, imu.gyro_rad_s - offset.gyro_bias_rad_s, imu.accel_m_s2)
+    is_clear = not check.wrong and not check.doubtful
+    return is_clear and offset is not None and offset.is_significant and offset.sigma_s < _PRECISE_S
 
 
 def _stretches(sequence: Sequence) -> list[range]:

@@ -14,10 +14,11 @@ import numpy as np
 from hybridlio.calibration.turns import GyroPath
 from hybridlio.cloud.deskew import constant_twist, deskew, sweep_motion
 from hybridlio.core import se3
-from hybridlio.core.arrays import Array
+from hybridlio.core.arrays import Array, Mask
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuSamples, Scan
 from hybridlio.core.trajectory import Trajectory
-from hybridlio.registration.icp import register
+from hybridlio.registration.icp import Registration, register
+from hybridlio.registration.information import weak_basis
 from hybridlio.registration.local_map import LocalMap
 from hybridlio.registration.motion_search import best_start, fits_better, motions
 from hybridlio.sources.scene_scale import SceneScale
@@ -34,6 +35,9 @@ _KERNEL = 0.25
 # by 1.6 to 2.5 times on the drive with hard driving. Where all is well the distances vary by 15 %.
 _LOST_RATIO, _SETTLED_SCANS, _JUDGING_SCANS = 1.5, 10, 30
 _ABOUT_NS = NS_PER_S // 40  # a quarter of a scan before and after its stamp
+# Of an axis of rotation in the weak directions, in squared length: along them a pose stays where it started, so more
+# than a third of the turn about the axis would be that of the start, such as the gyroscope's.
+_LARGEST_WEAK_SHARE = 0.1
 _FIRST_REPETITIONS = 2  # of the first step, when its speed is known and both scans are compensated with it
 
 
@@ -54,12 +58,19 @@ class ScanPath:
         self._stamps: list[int] = []
         self._poses: list[Array] = []
         self._sigmas_m: list[float] = []
+        self._measured: list[Mask] = []
         self._first: tuple[Scan, ImuSamples] | None = None
 
     @property
     def trajectory(self) -> Trajectory:
         """The lidar's poses so far, in the frame of the first scan."""
         return Trajectory(np.array(self._stamps, np.int64), np.array(self._poses).reshape(-1, 4, 4))
+
+    @property
+    def measured(self) -> Mask:
+        """``(N-1, 3)`` whether the scans determine the turns between the poses, about each of the lidar's axes."""
+        poses = np.array(self._measured).reshape(-1, 3)
+        return np.asarray(poses[1:] & poses[:-1])
 
     @property
     def sigma_m(self) -> float:
@@ -87,6 +98,7 @@ class ScanPath:
                 return False
             step = self._poses.pop()
             self._stamps.pop()
+            self._measured.pop()
         assert step is not None
         fits = self._register(scan, sweep_imu, step)
         self._settings = _coarser(self._settings)
@@ -111,7 +123,7 @@ class ScanPath:
         points = self._compensated(scan, sweep_imu, step, scan.stamp_ns, end_ns).points
         self._map = LocalMap(self._settings.local_map)
         self._map.insert(points, np.eye(4))
-        self._stamps, self._poses = [scan.stamp_ns], [np.eye(4)]
+        self._stamps, self._poses, self._measured = [scan.stamp_ns], [np.eye(4)], [np.ones(3, bool)]
         return len(points) >= self._settings.min_points and self._map.surface is not None
 
     def _search(self, scan: Scan, sweep_imu: ImuSamples) -> Array | None:
@@ -146,6 +158,7 @@ class ScanPath:
         self._sigmas_m.append(found.sigma_m)
         self._stamps.append(scan.stamp_ns)
         self._poses.append(found.pose)
+        self._measured.append(_measured_axes(found, surface.normal_noise.largest))
         if self._map.needs_keyframe(found.pose):
             self._map.insert(thinned.points, found.pose)
         else:
@@ -159,6 +172,12 @@ class ScanPath:
             twist = constant_twist(step, start_ns, end_ns)
             scan = deskew(scan, sweep_motion(frame, twist, np.zeros(3), self._calibration))
         return thin(scan, self._settings)
+
+
+def _measured_axes(found: Registration, normal_noise: float) -> Mask:
+    """Return ``(3,)`` which rotations a registration determines."""
+    weak, _ = weak_basis(found.hessian, found.lever_arms_m, normal_noise)
+    return np.asarray((weak[:3] ** 2).sum(axis=1) < _LARGEST_WEAK_SHARE)
 
 
 def _during(scan: Scan, imu: ImuSamples) -> ImuSamples:
@@ -202,7 +221,7 @@ def scan_paths(scans: Iterable[Scan], calibration: Calibration, imu: ImuSamples)
     return [path for path in paths if len(path.trajectory) > 1]
 
 
-def best_paths(paths: Iterable[ScanPath]) -> list[Trajectory]:
+def best_paths(paths: Iterable[ScanPath]) -> list[ScanPath]:
     """Return the paths of one recording, without those whose scans lie far from their maps, after a false first fit.
 
     Such a path goes on as consistently as a right one, at another speed or turning all the time.
@@ -210,4 +229,4 @@ def best_paths(paths: Iterable[ScanPath]) -> list[Trajectory]:
     known = [path for path in paths if path.sigma_m > 0]
     least_m = min((path.sigma_m for path in known if len(path.trajectory) >= _JUDGING_SCANS), default=np.inf)
     right = [path for path in known if path.sigma_m < _LOST_RATIO * least_m]
-    return sorted((path.trajectory for path in right), key=lambda path: int(path.stamps_ns[0]))
+    return sorted(right, key=lambda path: int(path.trajectory.stamps_ns[0]))

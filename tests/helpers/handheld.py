@@ -7,6 +7,7 @@ import numpy as np
 from rooms import ROOM, scene, seen_from
 
 from hybridlio.core import se3
+from hybridlio.core.pose_interpolation import PosePath
 from hybridlio.core.sensors import Calibration, ImuSamples, Scan
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.sequence import Sequence
@@ -22,10 +23,12 @@ class Handheld:
     Attributes:
         path: ``T_world_lidar`` at 10 Hz.
         imu: samples at 100 Hz, on the same clock.
+        fine: ``T_world_lidar`` at 100 Hz.
     """
 
     path: Trajectory
     imu: ImuSamples
+    fine: Trajectory
 
 
 def carried(rng: np.random.Generator, seconds: float = 12.0, turning: float = 1.0) -> Handheld:
@@ -52,8 +55,8 @@ def carried(rng: np.random.Generator, seconds: float = 12.0, turning: float = 1.
     noise = rng.normal(0, [[1e-3] * 3 + [0.02] * 3], (len(stamps[fast]), 6))
     imu = ImuSamples(stamps[fast], rates[fast] + 0.004 + noise[:, :3], force[fast] + noise[:, 3:])
     slow = slice(1000, round((seconds + 1) / _STEP_S), 100)
-    poses = se3.make(rotations[slow], positions[slow]) @ MOUNTING
-    return Handheld(Trajectory(stamps[slow], poses), imu)
+    path, fine = (Trajectory(stamps[k], se3.make(rotations[k], positions[k]) @ MOUNTING) for k in (slow, fast))
+    return Handheld(path, imu, fine)
 
 
 def as_sequence(
@@ -70,6 +73,23 @@ def as_sequence(
     return Sequence(
         "walk", path.stamps_ns, load, imu=recording.imu if imu is None else imu, calibration=Calibration(T_imu_lidar)
     )
+
+
+def swept(rng: np.random.Generator, recording: Handheld, imu: ImuSamples) -> Sequence:
+    """Return the recording with scans whose points are measured one after the other in 0.09 s from the stamp on."""
+    points, _ = scene(rng, ROOM, count=2000)
+    points = points[rng.permutation(len(points))]
+    offsets_ns = np.linspace(0, 90_000_000, len(points)).astype(np.int64)
+    path, fine = recording.path, PosePath(recording.fine.stamps_ns, recording.fine.poses)
+
+    def load(k: int) -> Scan:
+        stamp_ns = int(path.stamps_ns[k])
+        there = se3.inverse(fine.at(stamp_ns + offsets_ns))
+        seen = np.einsum("nij,nj->ni", there[:, :3, :3], points) + there[:, :3, 3]
+        noisy = seen + np.random.default_rng(k).normal(0, 0.01, points.shape)
+        return Scan(stamp_ns, noisy.astype(np.float32), None, offsets_ns.astype(np.int32))
+
+    return Sequence("walk", path.stamps_ns, load, imu=imu, calibration=Calibration(MOUNTING))
 
 
 def changed(imu: ImuSamples, gyro: Callable | None = None, accel: Callable | None = None) -> ImuSamples:

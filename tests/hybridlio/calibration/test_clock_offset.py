@@ -77,6 +77,27 @@ def test_offset_rotation_and_bias_have_the_covariance_that_is_stated():
     assert (means < 1.9).all()
 
 
+def test_errors_that_agree_over_many_steps_are_in_the_standard_deviation():
+    errors = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        turns, imu = recording(rng, 0.02)
+        slow = np.repeat(rng.normal(0, 2e-3, (len(turns) // 8 + 1, 3)), 8, axis=0)[: len(turns)]
+        result = found(replace(turns, rotvecs=turns.rotvecs + slow), imu)
+        errors.append((result.offset_s - 0.02) / result.sigma_s)
+    assert 0.4 < np.mean(np.square(errors)) < 1.9
+
+
+def test_turns_about_an_axis_that_is_not_measured_do_not_count(rng: np.random.Generator):
+    turns, imu = recording(rng, 0.05, planar=1.0)
+    yaw = np.zeros(turns.rotvecs.shape, bool)
+    yaw[:, 2] = True
+    false = replace(turns, rotvecs=np.where(yaw, np.roll(turns.rotvecs, 2, axis=0), turns.rotvecs), measured=~yaw)
+    result = found(false, imu)
+    assert result.offset_s == pytest.approx(0.05, abs=2e-3)
+    assert result.sigma_s > found(*recording(rng, 0.05, planar=1.0)).sigma_s
+
+
 def test_the_gyroscopes_bias_is_found_with_it(rng: np.random.Generator):
     result = found(*recording(rng, 0.05, bias=0.01))
     np.testing.assert_allclose(result.gyro_bias_rad_s, 0.01, atol=1e-3)

@@ -1,5 +1,7 @@
 """What the comparison of an IMU with a lidar's path corrects, doubts and refuses, mistake by mistake."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from handheld import MOUNTING, Handheld, carried, changed
@@ -98,7 +100,7 @@ def test_a_mirrored_gyroscope_alone_is_named(walk: Handheld):
 
 def test_the_inverse_of_the_mounting_is_named(walk: Handheld):
     turned = MOUNTING @ se3.exp([0, 0, 0.5, 0, 0, 0])
-    path = Handheld(Trajectory(walk.path.stamps_ns, walk.path.poses @ se3.exp([0, 0, 0.5, 0, 0, 0])), walk.imu)
+    path = replace(walk, path=Trajectory(walk.path.stamps_ns, walk.path.poses @ se3.exp([0, 0, 0.5, 0, 0, 0])))
     found = check(path, T_imu_lidar=se3.inverse(turned))
     assert "T_imu_lidar is the inverse" in found.wrong[0]
     assert f"translation: [{turned[0, 3]:.3f}" in found.wrong[0]

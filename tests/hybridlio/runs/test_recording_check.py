@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from handheld import Handheld, as_sequence, carried, changed
+from handheld import Handheld, as_sequence, carried, changed, swept
 
 from hybridlio.calibration.imu_check import moved
 from hybridlio.core.errors import DataError
@@ -23,6 +23,12 @@ def test_an_offset_is_applied_and_noted(rng: np.random.Generator, walk: Handheld
     assert found.imu_time_offset_s == pytest.approx(-0.05, abs=2e-3)
     np.testing.assert_allclose(found.imu.stamps_ns, walk.imu.stamps_ns, atol=2e6)
     assert [note.kind for note in found.notes] == ["corrected"]
+
+
+def test_scans_distorted_by_a_fast_hand_give_the_offset_that_compensates_them(rng: np.random.Generator):
+    fast = carried(np.random.default_rng(6), seconds=8.0, turning=1.0)
+    found = check_recording(swept(rng, fast, moved(fast.imu, 0.12)))
+    assert found.imu_time_offset_s == pytest.approx(-0.12, abs=1e-3)
 
 
 def test_a_recording_whose_clocks_agree_keeps_its_samples(rng: np.random.Generator, walk: Handheld):

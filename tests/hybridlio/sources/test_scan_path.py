@@ -29,6 +29,22 @@ def test_a_new_path_begins_after_a_scan_that_does_not_fit(rng: np.random.Generat
     assert len(paths[0].trajectory) == 12
 
 
+def test_a_turn_that_the_scans_do_not_show_is_not_counted_as_measured(rng: np.random.Generator):
+    flat = [Scan(k * 100_000_000, _ground(rng), None) for k in range(15)]
+    turning = ImuSamples(
+        np.arange(0, 1_600_000_000, 10_000_000), np.tile([0.0, 0.0, 0.5], (160, 1)), np.tile([0, 0, 9.81], (160, 1))
+    )
+    (path,) = scan_paths(flat, Calibration(), turning)
+    assert path.measured[:, :2].all()
+    assert not path.measured[:, 2].any()
+
+
+def _ground(rng: np.random.Generator) -> np.ndarray:
+    places = rng.uniform(-30, 30, (6000, 2))
+    heights = rng.normal(-1.7, 0.01, len(places))
+    return np.column_stack([places, heights]).astype(np.float32)
+
+
 def test_no_scans_give_no_path():
     assert scan_paths([], Calibration(), ImuSamples.empty()) == []
 
@@ -42,4 +58,4 @@ def test_a_path_that_began_with_a_false_fit_is_left_out(rng: np.random.Generator
     blurred = [Scan(scan.stamp_ns, scan.points + more) for scan, more in zip(scans, noise, strict=True)]
     wrong = scan_paths(blurred, Calibration(), ImuSamples.empty())
     (kept,) = best_paths([*wrong, right])
-    np.testing.assert_array_equal(kept.poses, right.trajectory.poses)
+    np.testing.assert_array_equal(kept.trajectory.poses, right.trajectory.poses)

@@ -1,0 +1,66 @@
+"""The samples that compensate scans for motion while the offset between the clocks is still being found."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hybridlio.calibration.clock_offset import ClockOffset
+from hybridlio.calibration.imu_check import ImuCheck, moved
+from hybridlio.core.sensors import ImuSamples
+
+LARGEST_OFFSET_S = 0.2  # drivers that stamp on arrival are late by less; larger offsets are of clocks never set
+_SETTLED_S = 5e-4  # half of the accuracy that is wanted; the pass after it would change the offset by less
+LARGEST_SHARE = 0.7  # of the compensation's offset in the one that is found; a hand that turns fast has 0.25 to 0.5
+_COARSE_S = 0.02  # standard deviation of an offset that compensation begins with: as fine as the search and its step
+_LARGEST_RATE_RAD_S = 6.0  # of 95 % of samples; rates beyond are of another unit and no help to compensate scans
+
+
+class Compensation:
+    """The samples that compensate scans for motion, on the scans' clock as far as it is known.
+
+    The offset that is found depends on the one that scans are compensated with, and agrees with it where both are
+    right. Each pass therefore goes to where the line through the last two would agree (secant method).
+    """
+
+    def __init__(self, imu: ImuSamples) -> None:
+        rates = np.linalg.norm(imu.gyro_rad_s, axis=1)
+        self.imu = imu if np.quantile(rates, 0.95) < _LARGEST_RATE_RAD_S else ImuSamples.empty()
+        self.is_new = True
+        self._offset_s = 0.0
+        self._before: tuple[float, float] | None = None  # offset of the compensation, and found with it
+
+    def shift(self, offset_s: float) -> None:
+        """Start from another offset."""
+        self.imu, self._offset_s, self.is_new = moved(self.imu, offset_s), offset_s, False
+
+    def improve(self, check: ImuCheck) -> bool:
+        """Take the offset and the bias that were found; return whether scans should be compensated again with them."""
+        offset = check.offset
+        if offset is None or check.wrong or not _is_known_coarsely(offset):
+            return False
+        used_s, found_s = self._offset_s, offset.offset_s
+        had_samples, self.is_new = len(self.imu) > 0, False
+        share = 0.0
+        if self._before is not None and abs(used_s - self._before[0]) > _SETTLED_S:
+            share = float(np.clip((found_s - self._before[1]) / (used_s - self._before[0]), 0.0, LARGEST_SHARE))
+        if had_samples and abs(found_s - used_s) < _SETTLED_S:
+            return False
+        self._before = used_s, found_s
+        self._offset_s = float(np.clip(used_s + (found_s - used_s) / (1 - share), -LARGEST_OFFSET_S, LARGEST_OFFSET_S))
+        to_come_s = self._offset_s - (found_s if offset.is_significant else 0.0)
+        without_bias = check.imu.gyro_rad_s - offset.gyro_bias_rad_s
+        self.imu = moved(ImuSamples(check.imu.stamps_ns, without_bias, check.imu.accel_m_s2), to_come_s)
+        return True
+
+    def agrees(self, offset: ClockOffset) -> bool:
+        """Whether the offset that was found is the one that scans were compensated with."""
+        return len(self.imu) > 0 and self.error_s(offset) < _SETTLED_S + offset.sigma_s
+
+    def error_s(self, offset: ClockOffset) -> float:
+        """Return how far the offset that was found is from the one that scans were compensated with."""
+        return abs(offset.offset_s - self._offset_s) if len(self.imu) else 0.0
+
+
+def _is_known_coarsely(offset: ClockOffset) -> bool:
+    """Whether motion compensation is better with the offset that was found than without."""
+    return not offset.contradicts and offset.sigma_s < _COARSE_S
