@@ -17,6 +17,7 @@ Estimation:
     OdometryStream     the same from live data, such as in a robot's node: measurements in, estimates out
     Estimate           the result of a step: pose, covariance and what they were computed from
     smooth             smooth a finished run (odometry.record()) over its whole length, with loops and GPS
+    localize           where a recording is in a prior map: a run folder or a map file
     run_batch          run many Recordings in parallel; BatchOptions has the settings, Batch the results
 
 Results:
@@ -47,6 +48,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time each name l
     from hybridlio.datasets.sequence import Sequence
     from hybridlio.evaluation.evaluate import evaluate
     from hybridlio.graph.run.smooth import smooth
+    from hybridlio.localization.localize import localize
     from hybridlio.mapping.build import build_map
     from hybridlio.mapping.settings import MapSettings
     from hybridlio.odometry.config import Config, load_config
@@ -87,6 +89,7 @@ __all__ = [
     "evaluate",
     "find_recordings",
     "load_config",
+    "localize",
     "open_sequence",
     "run_batch",
     "simulate",
@@ -102,6 +105,7 @@ _HOMES = {
     "datasets.sequence": ("Sequence",),
     "evaluation.evaluate": ("evaluate",),
     "graph.run.smooth": ("smooth",),
+    "localization.localize": ("localize",),
     "mapping.build": ("build_map",),
     "mapping.settings": ("MapSettings",),
     "odometry.config": ("Config", "load_config"),

@@ -14,7 +14,8 @@ from hybridlio.commands.config import config
 from hybridlio.commands.evaluate import evaluate
 from hybridlio.commands.georeference import georeference
 from hybridlio.commands.info import info
-from hybridlio.commands.map import map_
+from hybridlio.commands.maps.localize import localize
+from hybridlio.commands.maps.map import map_
 from hybridlio.commands.odometry import odometry
 from hybridlio.commands.optimize import optimize
 from hybridlio.commands.report import report
@@ -63,6 +64,7 @@ for _command in (
     config,
     view,
     optimize,
+    localize,
 ):
     app.command()(_command)
 app.command("map")(map_)

@@ -9,7 +9,7 @@ import numpy as np
 
 from hybridlio.core.errors import ConfigError, DataError, EstimationError
 from hybridlio.core.estimates import Backend, InitialPoseSource, ResidualSource, State
-from hybridlio.core.sensors import Frame, ImuNoise
+from hybridlio.core.sensors import Frame, ImuNoise, Scan
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.estimate import Estimate
 from hybridlio.odometry.pipeline import Pipeline, timed
@@ -38,6 +38,10 @@ class Odometry:
         keep_record: whether :meth:`record` is wanted. Without it memory does not grow with the run, once IMU samples
             have come.
 
+    Attributes:
+        keeps_record: whether :meth:`record` may be called.
+        last_scan: the last frame's scan, motion compensated to its stamp; None before the second frame.
+
     Raises:
         ConfigError: a name is unknown.
     """
@@ -60,6 +64,7 @@ class Odometry:
         self._recorder = Recorder()
         self._keyframes = LoopKeyframeSelector(config.keyframes)
         self.keeps_record = keep_record
+        self.last_scan: Scan | None = None
 
     @property
     def last_state(self) -> State | None:
@@ -109,6 +114,7 @@ class Odometry:
             step = pipeline.backend.last_step()
         pipeline.correct(frame, initial, relative, step)
         pipeline.learn(frame, gate)
+        self.last_scan = compensated.scan
         pose, covariance = pipeline.lidar_pose(pipeline.state)
         if self.keeps_record:
             with timed(seconds, "keyframes"):

@@ -29,9 +29,10 @@ from hybridlio.runs.whole_folder import COMPLETE_MARKER, JOURNAL, STATE
 POSES, KITTI, COVARIANCES, GRAPH = "poses_tum.txt", "poses_kitti.txt", "covariances.npz", "graph.g2o"
 RECORD, CONFIG, METRICS, REFERENCE = "odometry.npz", "config.yaml", COMPLETE_MARKER, "reference_tum.txt"
 REPORT, PICTURE, SMOOTHED, KEYFRAMES = "report.html", "trajectory.png", "smoothed", "keyframes.npz"
+LOCALIZATION = "localization.csv"
 FILES = (POSES, KITTI, COVARIANCES, GRAPH, RECORD, KEYFRAMES, CONFIG, METRICS, REFERENCE, REPORT, PICTURE)
 JOB, LOG = "batch_job.json", "run.log"  # of a run by `hybridlio batch`
-_OWN = frozenset((*FILES, JOB, LOG, JOURNAL, STATE, f".{STATE}.new"))
+_OWN = frozenset((*FILES, LOCALIZATION, JOB, LOG, JOURNAL, STATE, f".{STATE}.new"))
 _STEMS = "|".join(Path(name).stem for name in sorted(_OWN))
 _TEMPORARY = re.compile(rf"\.({_STEMS})\.[0-9a-f]{{12}}\.\w+")  # names of hybridlio.core.files.atomic_path
 

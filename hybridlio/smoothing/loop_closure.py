@@ -28,7 +28,7 @@ from hybridlio.smoothing.loop_consistency import (
     pairwise_chi2,
     supported,
 )
-from hybridlio.smoothing.loop_verification import Verdict, VerificationSettings, Verifier
+from hybridlio.smoothing.loop_verification import PreparedPlaces, Verdict, VerificationSettings, Verifier
 from hybridlio.smoothing.loops import Loop, LoopSearch, RejectedLoop
 from hybridlio.smoothing.places import KeyframePlaces
 from hybridlio.smoothing.step_uncertainty import OdometryChain
@@ -65,7 +65,8 @@ def find_loops(record: Record, settings: LoopSettings | None = None, progress: P
     chain = OdometryChain(record.online, record.relative)
     rows = keyframes.rows
     places = KeyframePlaces(keyframes, chain, up_of(record), settings.verification.reach_m)
-    verifier = Verifier(places, places, settings.verification)
+    prepared = PreparedPlaces(places, settings.verification)
+    verifier = Verifier(prepared, prepared, settings.verification)
     finder = CandidateFinder(chain, rows, places, settings.candidates)
     seconds = {"candidates": 0.0, "verification": 0.0, "consistency": 0.0}
     found: list[tuple[Candidate, Verdict]] = []

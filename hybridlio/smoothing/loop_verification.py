@@ -110,8 +110,13 @@ _SURFACES_KEPT = 64  # a second pass over a place needs the same surfaces repeat
 _UNKNOWN = np.full((6, 6), np.nan)  # the covariance of a rejected candidate
 
 
-class _PreparedPlaces:
-    """Surfaces and points of places, made when first needed."""
+class PreparedPlaces:
+    """Places with their surfaces and the points to register, made when first needed.
+
+    Args:
+        places: of a run or of a map.
+        settings: how both are thinned.
+    """
 
     def __init__(self, places: Places, settings: VerificationSettings) -> None:
         self.places, self._settings = places, settings
@@ -146,10 +151,8 @@ class Verifier:
         settings: limits.
     """
 
-    def __init__(self, earlier: Places, later: Places, settings: VerificationSettings) -> None:
-        self._settings = settings
-        self._earlier = _PreparedPlaces(earlier, settings)
-        self._later = self._earlier if later is earlier else _PreparedPlaces(later, settings)
+    def __init__(self, earlier: PreparedPlaces, later: PreparedPlaces, settings: VerificationSettings) -> None:
+        self._earlier, self._later, self._settings = earlier, later, settings
 
     def verify(self, earlier: int, later: int, guesses: Sequence[Array]) -> Verdict:
         """Find the relative pose of two keyframes from several starts, and judge it.

@@ -37,7 +37,7 @@ class OdometryChain:
         self.poses = online.poses
         lengths_m = np.linalg.norm(np.diff(self.poses[:, :3, 3], axis=0), axis=1)
         self.travelled_m: Array = np.append(0.0, np.cumsum(lengths_m))
-        drift = np.array([_drift(step) for step in steps]).reshape(-1, 6, 6)
+        drift = np.array([drift_of(step) for step in steps]).reshape(-1, 6, 6)
         scatter = np.array([_scatter(step) for step in steps]).reshape(-1, 6, 6)
         self._sums = np.concatenate(
             [np.zeros((1, 6, 6)), np.cumsum(se3.rotate_covariance(drift, self.poses[1:]), axis=0)]
@@ -61,8 +61,8 @@ class OdometryChain:
         return se3.rotate_covariance(world, se3.inverse(self.poses[j]))
 
 
-def _drift(step: RelativePose) -> Array:
-    """The part of a step's covariance that adds up over steps."""
+def drift_of(step: RelativePose) -> Array:
+    """Return the part ``(6, 6)`` of a step's covariance that adds up over steps."""
     return step.covariance if step.drift is None or not step.ok else step.drift
 
 

@@ -8,14 +8,15 @@ import pytest
 
 from hybridlio.core import se3
 from hybridlio.record.loop_keyframes import RESOLUTION_M, LoopKeyframes
-from hybridlio.smoothing.loop_verification import VerificationSettings, Verifier
+from hybridlio.smoothing.loop_verification import PreparedPlaces, VerificationSettings, Verifier
 from hybridlio.smoothing.places import KeyframePlaces
 from hybridlio.smoothing.step_uncertainty import OdometryChain
 
 
 def verifier_of(keyframes: LoopKeyframes, chain: OdometryChain) -> Verifier:
     places = KeyframePlaces(keyframes, chain, np.array([0.0, 0.0, 1.0]), VerificationSettings().reach_m)
-    return Verifier(places, places, VerificationSettings())
+    prepared = PreparedPlaces(places, VerificationSettings())
+    return Verifier(prepared, prepared, VerificationSettings())
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,1 @@
+"""Commands that make, join and use maps."""

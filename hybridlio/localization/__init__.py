@@ -1,0 +1,1 @@
+"""Localisation in a map that was made before."""

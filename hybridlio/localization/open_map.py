@@ -1,0 +1,92 @@
+"""Open a prior map: a run folder, or a file of points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from hybridlio.core import se3
+from hybridlio.core.arrays import Array
+from hybridlio.core.errors import DataError
+from hybridlio.core.files import UNREADABLE_NPZ, user_path
+from hybridlio.core.trajectory import Trajectory
+from hybridlio.datasets.points.point_files import SUFFIXES, read_columns
+from hybridlio.localization.map_places import MapPlaces
+from hybridlio.localization.map_surface import MapSurface
+from hybridlio.localization.prior_map import PriorMap
+from hybridlio.record.loop_keyframes import LoopKeyframes
+from hybridlio.record.record import Record
+from hybridlio.runs.folder import KEYFRAMES, RECORD, is_run_folder, read_run
+from hybridlio.smoothing.loop_closure import keyframes_of, up_of
+from hybridlio.smoothing.loop_verification import VerificationSettings
+from hybridlio.smoothing.places import KeyframePlaces
+from hybridlio.smoothing.step_uncertainty import OdometryChain
+
+
+def open_prior_map(path: str | Path) -> PriorMap:
+    """Open a map: a run folder (smoothed or not), or a ``.ply``, ``.pcd``, ``.las``, ``.laz`` or ``.npz`` file.
+
+    A run folder's map consists of its keyframes, which also are the places by which a run is found in it. A file has
+    points only, with z up; a run in it needs a start.
+
+    Raises:
+        DataError: there is no run or no readable file of points.
+    """
+    path = user_path(path)
+    if path.is_dir():
+        return map_of_run(path)
+    return PriorMap(MapSurface(_points(path)))
+
+
+def map_of_run(folder: Path) -> PriorMap:
+    """Return the map of a run folder.
+
+    Raises:
+        DataError: it is no run folder, or lacks the keyframes.
+    """
+    if not is_run_folder(folder):
+        raise DataError(f"{folder}: not a run folder; give one written by `hybridlio odometry`, or a file of points")
+    trajectory = read_run(folder).trajectory
+    home = folder if (folder / RECORD).is_file() else folder.parent  # a smoothed run lies inside its run
+    record = replace(Record.load(home / RECORD), keyframes=LoopKeyframes.load(home / KEYFRAMES))
+    return map_of_record(record, trajectory)
+
+
+def map_of_record(record: Record, trajectory: Trajectory | None = None) -> PriorMap:
+    """Return the map of a run from its record.
+
+    Args:
+        record: of the run, with keyframes.
+        trajectory: its poses, such as smoothed ones; by default those of the record.
+
+    Raises:
+        DataError: the record has no keyframes, or the trajectory other scans.
+    """
+    keyframes = keyframes_of(record)
+    trajectory = trajectory or record.online
+    if not np.array_equal(trajectory.stamps_ns, record.online.stamps_ns):
+        raise DataError("the trajectory does not belong to this run: its stamps are others")
+    poses = trajectory.poses[keyframes.rows]
+    chain = OdometryChain(trajectory, record.relative)
+    places = KeyframePlaces(keyframes, chain, up_of(record), VerificationSettings().reach_m)
+    points = [se3.transform(pose, keyframes.points(k)) for k, pose in enumerate(poses)]
+    return PriorMap(MapSurface(np.concatenate(points)), MapPlaces(places, poses), up_of(record))
+
+
+def _points(path: Path) -> Array:
+    if not path.is_file():
+        raise DataError(f"{path}: no such map; give a run folder or a file of points")
+    if path.suffix.lower() == ".npz":
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                points = np.asarray(file["points"], np.float64)
+        except UNREADABLE_NPZ as error:
+            raise DataError(f"{path}: not a map ({error}); `hybridlio map` writes one") from error
+    elif path.suffix.lower() in SUFFIXES:
+        columns = read_columns(path)
+        points = np.column_stack([columns[axis] for axis in "xyz"]).astype(np.float64)
+    else:
+        raise DataError(f"{path}: unknown format; a map is a run folder or a .ply, .pcd, .las, .laz or .npz file")
+    return points[np.isfinite(points).all(axis=1)]
