@@ -22,15 +22,15 @@ def note_vehicle(clouds: list[Floats], notes: Notes) -> None:
     """Note points near the lidar that occupy the same voxels in all scans of a moving vehicle, and a box around them.
 
     Args:
-        clouds: ``(N, 3)`` points of scans that are spread over the recording.
+        clouds: ``(N, 3)`` returns of scans that are spread over the recording.
         notes: receives the note.
     """
     near, far = [], []
     for cloud in clouds:
-        points = cloud[np.isfinite(cloud).all(axis=1) & cloud.any(axis=1)]
-        across = np.abs(points).max(axis=1, initial=0)
-        near.append(_voxels(points[across < _NEAR_M]))
-        far.append(_voxels(points[(across >= _NEAR_M) & (across < _FAR_M)]))
+        x, y, z = np.abs(cloud).T
+        across = np.maximum(np.maximum(x, y), z)
+        near.append(_voxels(cloud[across < _NEAR_M]))
+        far.append(_voxels(cloud[(across >= _NEAR_M) & (across < _FAR_M)]))
     if len(clouds) < _MIN_SCANS:
         return
     still, elsewhere = _in_all(near), _in_all(far)

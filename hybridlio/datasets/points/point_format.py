@@ -24,6 +24,7 @@ MORE_SAMPLES = 21  # if those do not agree: some bad scans among them no longer 
 _INTENSITIES = ("intensity", "reflectivity", "reflectance", "remission")
 _FULL_SCALES = (1.0, 255.0, 65535.0)  # of intensities: the smallest that holds them
 _MM = 1e-3
+_FEW = 100  # points; of coordinates in metres nearly none is a whole number
 _MIN_WHOLE_RANGE = 500.0  # median of whole numbers above which they are millimetres: no lidar's median range is 500 m
 _SAME_RANGE_M = 0.002  # of one no-return code, also where coordinates are rounded to millimetres
 _MIN_CODE_SHARE, _MIN_CODE_POINTS = 0.005, 20  # of a scan at its largest range; surfaces leave a few points there
@@ -104,8 +105,7 @@ class PointFormat:
         plain = self.no_return_m is None and self.limits_m is None and self.vehicle is None
         if plain and len(points) and points[:, 0].all() and np.isfinite([points.min(), points.max()]).all():
             return np.ones(len(points), dtype=bool)  # the usual case, found without arrays of sums
-        # NaN or infinite where a coordinate is; a product with ones is far quicker than all() along rows of three
-        sums = np.abs(points) @ np.ones(3, np.float32)
+        sums = _sums(points)
         keep = np.asarray((sums > 0) & (sums < np.inf), dtype=bool)
         if self.no_return_m is not None:
             keep &= np.abs(_ranges(points) - self.no_return_m) > _SAME_RANGE_M
@@ -185,13 +185,15 @@ def find_format(
     scale_m = _scale_m([coordinates(columns) for _, columns in samples], notes)
     plain = PointFormat(scale_m)
     clouds = [plain._points(columns) for _, columns in samples]
-    zeros = float(np.mean([(~cloud.any(axis=1)).mean() for cloud in clouds if len(cloud)] or [0.0]))
+    zeros = float(np.mean([(_sums(cloud) == 0).mean() for cloud in clouds if len(cloud)] or [0.0]))
     if zeros:
         notes.found(f"points at the origin, {zeros:.1%} of a scan, are left out: beams without a return")
-    _check_frame(clouds)
-    found = PointFormat(scale_m, _no_return_m(clouds, notes), None, stated.limits_m, stated.vehicle)
+    seen = [cloud[plain._returns(cloud)] for cloud in clouds]
+    ranges = [_ranges(points) for points in seen]
+    _check_frame(ranges)
+    found = PointFormat(scale_m, _no_return_m(seen, ranges, notes), None, stated.limits_m, stated.vehicle)
     if stated.vehicle is None:
-        note_vehicle(clouds, notes)
+        note_vehicle(seen, notes)
     valid = []
     for (stamp, columns), cloud in zip(samples, clouds, strict=True):
         keep = found._returns(cloud)
@@ -199,17 +201,13 @@ def find_format(
     return replace(found, times=find_point_times(valid, step_ns, notes, stated.times))
 
 
-def _check_frame(clouds: list[Floats]) -> None:
+def _check_frame(ranges: list[Array]) -> None:
     """Refuse clouds in a map's frame, such as UTM.
 
     Raises:
         DataError: most points of most clouds are beyond the range of any lidar.
     """
-    far = []
-    for cloud in clouds:
-        ranges = _ranges(cloud[np.isfinite(cloud).all(axis=1) & cloud.any(axis=1)])
-        if len(ranges):
-            far.append(float(np.median(ranges)))
+    far = [float(np.median(of_scan)) for of_scan in ranges if len(of_scan)]
     if far and np.median(far) > MAX_RANGE_M:
         raise DataError(
             f"points are {np.median(far) / 1000:.0f} km from the origin, as in a map's frame (UTM); they must be in "
@@ -219,6 +217,8 @@ def _check_frame(clouds: list[Floats]) -> None:
 
 def _scale_m(clouds: list[NDArray[Any]], notes: Notes) -> float:
     """Return metres in one unit of the coordinates: 0.001 for whole numbers that are too large for metres."""
+    if any((cloud != np.round(cloud))[np.isfinite(cloud)].any() for cloud in (cloud[:_FEW] for cloud in clouds)):
+        return 1.0  # the usual case
     finite = [cloud[np.isfinite(cloud).all(axis=1)].astype(np.float64) for cloud in clouds]
     finite = [cloud for cloud in finite if len(cloud)]
     if not finite:
@@ -232,15 +232,13 @@ def _scale_m(clouds: list[NDArray[Any]], notes: Notes) -> float:
     return _MM
 
 
-def _no_return_m(clouds: list[Floats], notes: Notes) -> float | None:
+def _no_return_m(clouds: list[Floats], ranges_m: list[Array], notes: Notes) -> float | None:
     """Return the exact range that a sensor writes for beams without a return; None if there is no such range.
 
     It is the largest range of most scans, at many points in many directions.
     """
     codes, shares = [], []
-    for points in clouds:
-        cloud = points[np.isfinite(points).all(axis=1) & points.any(axis=1)]
-        ranges = _ranges(cloud)
+    for cloud, ranges in zip(clouds, ranges_m, strict=True):
         at = ranges > ranges.max() - _SAME_RANGE_M if len(ranges) else np.zeros(0, dtype=bool)
         if at.sum() < max(_MIN_CODE_POINTS, _MIN_CODE_SHARE * len(cloud)):
             continue
@@ -256,8 +254,17 @@ def _no_return_m(clouds: list[Floats], notes: Notes) -> float | None:
     return float(np.median(codes))
 
 
+def _sums(points: Floats) -> Floats:
+    """Return the sums of the coordinates' sizes; NaN or infinite where a coordinate is.
+
+    A product with ones is far quicker than all() or any() along rows of three.
+    """
+    return np.asarray(np.abs(points) @ np.ones(3, np.float32))
+
+
 def _ranges(points: NDArray[Any]) -> Array:
-    return np.asarray(np.linalg.norm(points.astype(np.float64), axis=1))
+    wide = points.astype(np.float64)
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", wide, wide)))
 
 
 def _intensity(columns: Columns) -> Floats | None:
