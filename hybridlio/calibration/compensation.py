@@ -9,7 +9,7 @@ from hybridlio.calibration.imu_check import ImuCheck, moved
 from hybridlio.core.sensors import ImuSamples
 
 LARGEST_OFFSET_S = 0.2  # drivers that stamp on arrival are late by less; larger offsets are of clocks never set
-_SETTLED_S = 5e-4  # half of the accuracy that is wanted; the pass after it would change the offset by less
+_SETTLED_S = 2e-4  # a fifth of the accuracy that is wanted
 LARGEST_SHARE = 0.7  # of the compensation's offset in the one that is found; a hand that turns fast has 0.25 to 0.5
 _COARSE_S = 0.02  # standard deviation of an offset that compensation begins with: as fine as the search and its step
 _LARGEST_RATE_RAD_S = 6.0  # of 95 % of samples; rates beyond are of another unit and no help to compensate scans
@@ -29,6 +29,12 @@ class Compensation:
         self._offset_s = 0.0
         self._before: tuple[float, float] | None = None  # offset of the compensation, and found with it
 
+    def is_far_off(self, check: ImuCheck | None) -> bool:
+        """Whether scans compensated with the first samples show no offset, so that others should be tried."""
+        if not self.is_new or not len(self.imu):
+            return False
+        return check is None or (check.offset is not None and not _is_known_coarsely(check.offset))
+
     def shift(self, offset_s: float) -> None:
         """Start from another offset."""
         self.imu, self._offset_s, self.is_new = moved(self.imu, offset_s), offset_s, False
@@ -36,17 +42,12 @@ class Compensation:
     def improve(self, check: ImuCheck) -> bool:
         """Take the offset and the bias that were found; return whether scans should be compensated again with them."""
         offset = check.offset
-        if offset is None or check.wrong or not _is_known_coarsely(offset):
+        if offset is None or check.wrong or not _is_known_coarsely(offset) or self.agrees(offset):
             return False
         used_s, found_s = self._offset_s, offset.offset_s
-        had_samples, self.is_new = len(self.imu) > 0, False
-        share = 0.0
-        if self._before is not None and abs(used_s - self._before[0]) > _SETTLED_S:
-            share = float(np.clip((found_s - self._before[1]) / (used_s - self._before[0]), 0.0, LARGEST_SHARE))
-        if had_samples and abs(found_s - used_s) < _SETTLED_S:
-            return False
-        self._before = used_s, found_s
-        self._offset_s = float(np.clip(used_s + (found_s - used_s) / (1 - share), -LARGEST_OFFSET_S, LARGEST_OFFSET_S))
+        next_s = used_s + (found_s - used_s) / (1 - self._share(found_s, 0.0))
+        self._before, self.is_new = (used_s, found_s), False
+        self._offset_s = float(np.clip(next_s, -LARGEST_OFFSET_S, LARGEST_OFFSET_S))
         to_come_s = self._offset_s - (found_s if offset.is_significant else 0.0)
         without_bias = check.imu.gyro_rad_s - offset.gyro_bias_rad_s
         self.imu = moved(ImuSamples(check.imu.stamps_ns, without_bias, check.imu.accel_m_s2), to_come_s)
@@ -54,11 +55,19 @@ class Compensation:
 
     def agrees(self, offset: ClockOffset) -> bool:
         """Whether the offset that was found is the one that scans were compensated with."""
-        return len(self.imu) > 0 and self.error_s(offset) < _SETTLED_S + offset.sigma_s
+        return len(self.imu) > 0 and self.error_s(offset) < _SETTLED_S
 
     def error_s(self, offset: ClockOffset) -> float:
-        """Return how far the offset that was found is from the one that scans were compensated with."""
-        return abs(offset.offset_s - self._offset_s) if len(self.imu) else 0.0
+        """Return by how much the offset would still change if scans were compensated with it again and again."""
+        share = self._share(offset.offset_s, LARGEST_SHARE)
+        return abs(offset.offset_s - self._offset_s) * share / (1 - share) if len(self.imu) else 0.0
+
+    def _share(self, found_s: float, unknown: float) -> float:
+        """Return by how much of the compensation's offset the one that is found moves; ``unknown`` at first."""
+        if self._before is None or abs(self._offset_s - self._before[0]) < _SETTLED_S:
+            return unknown
+        share = (found_s - self._before[1]) / (self._offset_s - self._before[0])
+        return float(np.clip(share, 0.0, LARGEST_SHARE))
 
 
 def _is_known_coarsely(offset: ClockOffset) -> bool:

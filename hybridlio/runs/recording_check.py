@@ -77,7 +77,7 @@ def compare_imu(sequence: Sequence, progress: Progress | None = None) -> ImuChec
     stretches, check = 1, None
     for _ in range(_MAX_PASSES):
         check = recording.check(recording.paths(stretches, compensation.imu))
-        if check is None and compensation.is_new and recording.are_distorted:
+        if recording.are_distorted and compensation.is_far_off(check):
             compensation.shift(recording.likely_shift_s(compensation.imu))
             continue
         if check is not None and _is_final(check, compensation, recording.are_distorted):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from hybridlio.core.errors import DataError, HybridLioError
 from hybridlio.core.sensors import NS_PER_S
+from hybridlio.datasets.rosbag.recovery import RecoveredFile
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -74,10 +75,11 @@ class Bag:
         path: the bag's file or folder.
         is_ros2: whether messages are serialised as CDR.
         topics: its topics with at least one message, by name.
+        recovered: what was lost, for each file whose index was made again.
     """
 
     def __init__(self, path: Path) -> None:
-        """Open a bag: read its index, and no message.
+        """Open a bag: read its index, and no message. An index that is missing is made again.
 
         Raises:
             DataError: the files are missing, truncated or damaged.
@@ -87,7 +89,7 @@ class Bag:
         self._connections: dict[str, list[Any]] = {}
         self._types: dict[str, str] = {}
         with readable(path):
-            self._reader = _open(parts)
+            self._reader, self.recovered = _open_or_recover(parts)
             weakref.finalize(self, _close, self._reader)
             for connection in self._reader.connections:
                 self._connections.setdefault(connection.topic, []).append(connection)
@@ -154,7 +156,37 @@ def _close(reader: AnyReader) -> None:
         reader.close()
 
 
-def _open(parts: list[Path]) -> AnyReader:
+def _open_or_recover(parts: list[Path]) -> tuple[AnyReader, list[str]]:
+    """Return the open reader, and notes on files whose index was made again."""
+    try:
+        return _open(parts), []
+    except Exception:  # of a dozen types, see readable()
+        files = _parts_without_metadata(parts)
+        try:
+            whole = [_whole_or_recovered(file) for file in files]
+        except Exception:
+            whole = []
+        notes = [file.note for file in whole if isinstance(file, RecoveredFile)]
+        if not notes:
+            raise
+        return _open(whole), notes
+
+
+def _parts_without_metadata(parts: list[Path]) -> list[Path]:
+    """Return the files of a folder whose ``metadata.yaml`` may count messages that are lost."""
+    (first, *others) = parts
+    return parts if others or first.is_file() else sorted(first.glob("*.mcap"), key=part_number)
+
+
+def _whole_or_recovered(file: Path) -> Path | RecoveredFile:
+    try:
+        _close(_open([file]))
+    except Exception:
+        return RecoveredFile(file)
+    return file
+
+
+def _open(parts: Sequence[Path | RecoveredFile]) -> AnyReader:
     from rosbags.highlevel import AnyReader, AnyReaderError
 
     reader = AnyReader(parts)

@@ -99,6 +99,8 @@ def open_bag(path: Path, topics: BagTopics | None = None, vertical_angle_deg: fl
 def _open(path: Path, wanted: BagTopics, vertical_angle_deg: float | None) -> Sequence:
     notes, bag = Notes(path.stem if path.is_file() else path.name), Bag(path)
     _note_part(path, notes)
+    for text in bag.recovered:
+        notes.add(text)
     stated = read_calibration_yaml(calibration_file(path))
     known = known_bag(bag, wanted, notes)
     wanted = wanted if known is None else known.filled(wanted)
