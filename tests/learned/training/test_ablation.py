@@ -11,7 +11,7 @@ from hybridlio.learned.data.pairs import Pairs
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
 from hybridlio.learned.paper_tables import TABLES
 from hybridlio.learned.presets import PRESETS
-from hybridlio.learned.training.ablation import RowData, reduced, run_rows
+from hybridlio.learned.training.ablation import RowData, reduced, run_rows, spread_over
 from hybridlio.learned.training.ablation_results import RowResult
 from hybridlio.learned.training.driving import drift_of, drive
 from hybridlio.learned.training.run_options import RunOptions
@@ -97,6 +97,11 @@ def test_an_interrupted_row_resumes_from_its_checkpoint(rooms, tiny_recipe, tmp_
     run_rows([tiny_recipe], data, tmp_path, 6, CPU)
     lines = [json.loads(line) for line in (tmp_path / "tiny" / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines if "loss" in line] == [1, 2, 3, 4, 5, 6]
+
+
+def test_of_many_training_recordings_some_are_driven_spread_over_them():
+    assert spread_over(list(range(106)), 8) == [0, 13, 26, 39, 53, 66, 79, 92]
+    assert spread_over([1, 2, 3], 8) == [1, 2, 3]
 
 
 def test_averages_leave_out_what_is_too_short():
