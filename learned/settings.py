@@ -114,6 +114,14 @@ class NetworkSettings:
         if not self.encoder and not self.projective_steps:
             raise ConfigError("network: set encoder, or projective_steps above 0: nothing else estimates the residual")
 
+    @property
+    def fits_any_cells(self) -> bool:
+        """Whether weights trained on one geometry work on another.
+
+        Steps weigh single cells by their neighbours; an encoder pools all cells into features of one geometry.
+        """
+        return not self.encoder
+
 
 @dataclass(frozen=True)
 class LossSettings:

@@ -6,7 +6,7 @@ import json
 import os
 import subprocess
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -14,6 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.files import write_atomically
 from hybridlio.core.version import __version__
@@ -60,6 +61,11 @@ class Weights:
         if self.recipe.network.imu == "initial-pose" and network.imu == "given":
             return {name: tensor for name, tensor in self.tensors.items() if not name.startswith("imu_network.")}
         return self.tensors
+
+    def on_cells(self, geometry: MapGeometry) -> Weights:
+        """Return the weights for maps of other cells; for networks with ``fits_any_cells``."""
+        network = replace(self.recipe.network, geometry=geometry)
+        return replace(self, recipe=replace(self.recipe, network=network))
 
     def network(self, device: torch.device | str = "cpu") -> OdometryNetwork:
         """Return the trained network in evaluation mode."""

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hybridlio.cloud.fitting_geometry import fitting_geometry
 from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
@@ -19,14 +20,15 @@ from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.motion_limits import UNKNOWN_TRANSLATION_SIGMA_M
 from hybridlio.core.sensors import NS_PER_S, Frame, Scan
-from hybridlio.learned.data.preparing import Mapped
 from hybridlio.learned.losses.loss_evaluator import CHI2_99, EvaluatedPose, LossEvaluator, LossScan
 from hybridlio.learned.networks.devices import at_run_time, on_device, pick_device
 from hybridlio.learned.networks.maps import valid_cells
 from hybridlio.learned.networks.network_types import ScanMaps
+from hybridlio.learned.networks.odometry_network import OdometryNetwork
 from hybridlio.learned.networks.weights import load_weights, weights_path
 from hybridlio.learned.settings import Recipe
 from hybridlio.learned.source_settings import NetworkResidualSettings
+from hybridlio.learned.sources.fitted_network import FittedNetwork, Prepare
 from hybridlio.learned.sources.inertial_inputs import inertial
 from hybridlio.record import plain_values
 
@@ -39,8 +41,6 @@ plain_values.register(  # so that the state of a run can be stored
 )
 
 Rows = NDArray[np.float32] | NDArray[np.float64]
-Prepare = Callable[[Scan], Mapped]
-
 _LONG_CORRECTION_M = 0.15  # the network is trained on initial poses 0.14 m off; longer corrections are less accurate
 _RISE = 1.02  # a smaller change of the loss may come from other points matching alone
 
@@ -93,7 +93,8 @@ class NetworkResidual:
     """
 
     name = "network"
-    NOT_STATE = ("_settings", "_device", "_network", "_prepare", "_threads", "_pair")  # the last: within one step
+    # the last is of one step only; the network and the preparation follow from the cells
+    NOT_STATE = ("_settings", "_device", "_fitting", "_threads", "_pair")
 
     def __init__(
         self, prepare_for: Callable[[Recipe], Prepare], settings: NetworkResidualSettings | None = None
@@ -101,8 +102,8 @@ class NetworkResidual:
         self._settings = settings or NetworkResidualSettings()
         self._device = pick_device(self._settings.device)
         weights = load_weights(weights_path(self._settings.weights))
-        self._network = weights.network(self._device)
-        self._prepare = prepare_for(weights.recipe)
+        self._fitting = FittedNetwork(weights, prepare_for, self._device)
+        self._cells = self._fitting.trained.geometry
         self._threads = torch.get_num_threads()
         self._last: _Seen | None = None
         self._pair: _Pair | None = None  # of the last scan and the one before it
@@ -111,22 +112,44 @@ class NetworkResidual:
     @property
     def geometry(self) -> MapGeometry:
         """Cells of the maps that the network takes."""
-        return self._network.settings.geometry
+        return self._cells
+
+    @property
+    def _network(self) -> OdometryNetwork:
+        return self._fitting.on(self._cells).network
 
     def start(self, frame: Frame) -> None:
-        """Start at a first scan.
+        """Start at a first scan; where its lidar does not fill the cells of the weights, find cells that fit it.
 
         Raises:
             DataError: too few cells of its map have a normal.
         """
         self._step = self._pair = None
         self._last = self._look(frame.scan)
+        if not self._last.enough and self._fitting.trained.fits_any_cells:
+            self._last = self._look_with_fitting_cells(frame)
         if not self._last.enough:
             raise DataError(
                 f"frame {frame.index}: only {self._last.cells} cells of the network's maps "
                 f"({self.geometry.rows} x {self.geometry.columns}) have a normal, {self._settings.min_cells} are "
-                "needed; start at another scan, or choose weights trained for this lidar"
+                "needed; start at another scan, choose weights trained for this lidar, or residual scan-matching, "
+                "which takes any"
             )
+
+    def _look_with_fitting_cells(self, frame: Frame) -> _Seen:
+        before, found = self._cells, fitting_geometry(frame.scan.points)
+        self._cells = found or before
+        seen = self._look(frame.scan)
+        if not seen.enough:
+            self._cells = before
+            return self._look(frame.scan)
+        _log.warning(
+            "frame %d: this lidar does not fill the cells that the weights were trained on (%d x %d); the maps get "
+            "%d x %d from %.1f to %.1f degrees, and the covariance is less sure",
+            *(frame.index, before.rows, before.columns, self._cells.rows, self._cells.columns),
+            *(self._cells.fov_down_deg, self._cells.fov_up_deg),
+        )
+        return seen
 
     def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:
         """Return the network's ``T = δT·T̂``, or the initial pose marked as not ok on failure."""
@@ -205,7 +228,7 @@ class NetworkResidual:
         return _Pair(last, current, (current.stamp_ns - last.stamp_ns) / NS_PER_S, features)
 
     def _look(self, scan: Scan) -> _Seen:
-        prepared = self._prepare(scan)
+        prepared = self._fitting.on(self._cells).prepare(scan)
         vertices, cells = prepared.vertex_map, (self.geometry.rows, self.geometry.columns)
         if vertices.shape[1:] != cells:
             raise ConfigError(f"the network takes maps of {cells} cells, scans are prepared with {vertices.shape[1:]}")
