@@ -25,10 +25,10 @@ from hybridlio.learned.networks.devices import at_run_time, on_device, pick_devi
 from hybridlio.learned.networks.maps import valid_cells
 from hybridlio.learned.networks.network_types import ScanMaps
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
-from hybridlio.learned.networks.weights import load_weights, weights_path
+from hybridlio.learned.networks.weights import Weights, load_weights, weights_path
 from hybridlio.learned.settings import Recipe
 from hybridlio.learned.source_settings import NetworkResidualSettings
-from hybridlio.learned.sources.fitted_network import FittedNetwork, Prepare
+from hybridlio.learned.sources.fitted_network import Fitted, FittedNetwork, Prepare
 from hybridlio.learned.sources.inertial_inputs import inertial
 from hybridlio.record import plain_values
 
@@ -75,6 +75,10 @@ class _Pair:
         return self.last.enough and self.current.enough
 
 
+def _fitted(weights: Weights, prepare_for: Callable[[Recipe], Prepare], device: torch.device) -> Fitted:
+    return Fitted(weights.network(device), prepare_for(weights.recipe))
+
+
 class NetworkResidual:
     """Refines each initial pose by the network, from the last scan and the current one.
 
@@ -102,7 +106,9 @@ class NetworkResidual:
         self._settings = settings or NetworkResidualSettings()
         self._device = pick_device(self._settings.device)
         weights = load_weights(weights_path(self._settings.weights))
-        self._fitting = FittedNetwork(weights, prepare_for, self._device)
+        self._fitting = FittedNetwork(
+            weights.recipe.network, lambda cells: _fitted(weights.on_cells(cells), prepare_for, self._device)
+        )
         self._cells = self._fitting.trained.geometry
         self._threads = torch.get_num_threads()
         self._last: _Seen | None = None
@@ -145,7 +151,7 @@ class NetworkResidual:
             return self._look(frame.scan)
         _log.warning(
             "frame %d: this lidar does not fill the cells that the weights were trained on (%d x %d); the maps get "
-            "%d x %d from %.1f to %.1f degrees, and the covariance is less sure",
+            "%d x %d from %.1f to %.1f degrees",
             *(frame.index, before.rows, before.columns, self._cells.rows, self._cells.columns),
             *(self._cells.fov_down_deg, self._cells.fov_up_deg),
         )
