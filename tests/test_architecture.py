@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-HEAVY = {"torch", "gtsam", "open3d", "matplotlib", "small_gicp", "scipy", "pydantic", "typer", "joblib"}
+HEAVY = {"torch", "gtsam", "open3d", "matplotlib", "small_gicp", "scipy", "pydantic", "typer", "joblib", "rerun"}
 # a room imports only rooms of lower floors
 FLOORS = {
     "core": 1,
@@ -32,6 +32,7 @@ FLOORS = {
     "odometry": 6,
     "runs": 7,
     "localization": 8,
+    "viewing": 8,
     "commands": 9,
 }
 APART = {"graph", "learned", "simulation"}  # they do not import each other

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,6 +23,7 @@ if TYPE_CHECKING:
     from hybridlio.odometry.config import Config
     from hybridlio.odometry.odometry import Odometry
     from hybridlio.runs.run import Run
+    from hybridlio.viewing.rerun_live import LiveView
 
 _SCANS_LISTED = 20  # fits on two lines of a terminal
 
@@ -42,6 +46,13 @@ def odometry(
     vertical_angle: common.VerticalAngle = None,
     rate: common.Rate = None,
     check: common.Check = True,
+    view: Annotated[
+        bool, typer.Option("--view", "--visualize", help="Show the run in the Rerun viewer while it goes.")
+    ] = False,
+    save: Annotated[
+        Path | None,
+        typer.Option("--save", metavar="FILE.rrd", help="Write what the viewer would show to a file for it."),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", metavar="RUN", help="The run folder; default runs/<sequence>-<date-time>."),
@@ -63,6 +74,7 @@ def odometry(
     from hybridlio.runs.run import adapt_config
     from hybridlio.runs.whole_folder import partial_folder
 
+    shown = _shown(view, save, data)
     if resume and (out is None or overwrite):
         raise ConfigError("--resume needs -o, the folder of the run that is to go on, and no --overwrite")
     chosen = common.load_settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
@@ -74,11 +86,35 @@ def odometry(
         chosen, estimator = adapted, Odometry(config=adapted)
     recording = common.check_data(recording, check)
     with new_run_folder(recording.name, out, overwrite, data, resume=resume) as folder:
-        run = _run(partial_folder(folder), recording, chosen, estimator, resume)
+        run = _run(partial_folder(folder), recording, chosen, estimator, resume, shown)
         _finish(folder, run, chosen, is_latest=out is None)
 
 
-def _run(part: Path, recording: Sequence, config: Config, estimator: Odometry, resume: bool) -> Run:
+@dataclass(frozen=True)
+class _Shown:
+    """Where a run is shown while it goes: in a file, or in a viewer."""
+
+    save: Path | None
+
+
+def _shown(view: bool, save: Path | None, data: Path) -> _Shown | None:
+    """Return where to show the run, or None; check that it can be shown there."""
+    if not view and save is None:
+        return None
+    if view and save is not None:
+        raise ConfigError("--view opens the viewer, --save writes a file for it; give one of them")
+    from hybridlio.datasets.protection import check_output
+    from hybridlio.viewing.rerun_stream import check_target
+
+    check_target(save)
+    if save is not None:
+        check_output(save.parent, data, may_hold=True)
+    return _Shown(save)
+
+
+def _run(
+    part: Path, recording: Sequence, config: Config, estimator: Odometry, resume: bool, shown: _Shown | None
+) -> Run:
     """Run the odometry, or go on with a run, and keep its estimates in the hidden folder ``part``."""
     from hybridlio.runs.run import Run, finish_run
     from hybridlio.runs.unfinished.keeper import Keeper
@@ -87,8 +123,23 @@ def _run(part: Path, recording: Sequence, config: Config, estimator: Odometry, r
     run, length = resume_run(part, recording, config, estimator) if resume else (Run(recording, estimator), 0)
     if resume:
         print_message(f"resumed after {run.done} of {len(recording)} scans", "none")
-    with progress("odometry") as report, Keeper(part, run, config, length) as keeper:
-        return finish_run(run, report, keeper)
+    with _watcher(run, shown) as watcher, progress("odometry") as report, Keeper(part, run, config, length) as keeper:
+        return finish_run(run, report, keeper, watcher)
+
+
+@contextmanager
+def _watcher(run: Run, shown: _Shown | None) -> Iterator[LiveView | None]:
+    """Show a run within the block."""
+    if shown is None:
+        yield None
+        return
+    from hybridlio.viewing.rerun_live import LiveView
+    from hybridlio.viewing.rerun_stream import rerun_stream
+
+    with rerun_stream(run.sequence.name, shown.save) as stream:
+        view = LiveView(stream, run)
+        yield view
+        view.finish()
 
 
 def _finish(folder: Path, run: Run, config: Config, is_latest: bool) -> None:

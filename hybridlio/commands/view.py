@@ -2,31 +2,63 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hybridlio.commands.common import Verbose, guarded
-from hybridlio.commands.terminal import print_result
+from hybridlio.commands import common
+from hybridlio.commands.common import guarded
+from hybridlio.commands.terminal import print_message, print_result, progress
 from hybridlio.core.errors import DataError
+from hybridlio.core.tables import counted
 
 
 @guarded
 def view(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.", show_default=False)],
-    _verbosity: Verbose = 0,
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder, smoothed or not.", show_default=False)],
+    save: Annotated[
+        Path | None, typer.Option("--save", metavar="FILE.rrd", help="Write a file for the viewer, without opening it.")
+    ] = None,
+    data: Annotated[
+        Path | None, typer.Option("--data", metavar="DATA", help="The recording, if it is not where the run found it.")
+    ] = None,
+    scans: Annotated[
+        bool, typer.Option("--scans/--no-scans", help="Show the points of every scan, read from the recording.")
+    ] = True,
+    report: Annotated[
+        bool, typer.Option("--report", help="Open the run's report in the browser instead, or print its path.")
+    ] = False,
+    _verbosity: common.Verbose = 0,
 ) -> None:
-    """Open a run's report in the browser, or print its path where there is no display."""
+    """Show a run in the Rerun viewer: map, path, scans, uncertainty, biases, loops and GPS over time."""
+    if report:
+        _open_report(run)
+        return
+    from hybridlio.datasets.protection import check_output
+    from hybridlio.viewing.rerun_stream import check_target
+    from hybridlio.viewing.view import view as show
+
+    check_target(save)
+    if save is not None and data is not None:
+        check_output(save.parent, data, may_hold=True)
+    with progress("view") as reported:
+        scene = show(run, save, data=data, scans=scans, progress=reported)
+    for note in scene.left_out:
+        print_message(note, "yellow")
+    print_result(f"{scene.name}: {counted(len(scene.scans), 'scan')}")
+    if save is not None:
+        print_result(f"view    {save}")
+
+
+def _open_report(run: Path) -> None:
     import webbrowser
 
     from hybridlio.runs.folder import REPORT
+    from hybridlio.viewing.rerun_stream import has_display
 
-    report = (run / REPORT).absolute()
-    if not report.is_file():
-        raise DataError(f"{report}: no such file; give a run folder written by `hybridlio odometry` or `smooth`")
-    has_display = sys.platform in ("darwin", "win32") or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
-    if not (has_display and webbrowser.open(report.as_uri())):
-        print_result(f"{report}")
+    path = (run / REPORT).absolute()
+    if not path.is_file():
+        raise DataError(f"{path}: no such file; give a run folder written by `hybridlio odometry` or `smooth`")
+    if not (has_display() and webbrowser.open(path.as_uri())):
+        print_result(f"{path}")

@@ -16,6 +16,22 @@ from hybridlio.sources.innovation_gate import UNTESTED, GateResult
 
 
 @dataclass(frozen=True, eq=False)
+class InertialState:
+    """What the backend estimates at a scan beside the pose.
+
+    Attributes:
+        velocity_m_s: ``(3,)`` of the IMU, in world, the lidar frame of the first scan.
+        accel_bias_m_s2, gyro_bias_rad_s: ``(3,)`` each, in the IMU frame.
+        sigmas: ``(9,)`` standard deviations of the three, in this order.
+    """
+
+    velocity_m_s: Array
+    accel_bias_m_s2: Array
+    gyro_bias_rad_s: Array
+    sigmas: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Estimate:
     """The result of one step.
 
@@ -28,6 +44,7 @@ class Estimate:
         step: the same step after the backend's optimisation; None at the first frame.
         seconds: time spent, by stage.
         gate: result of comparing the residual source's pose with the IMU; ``relative`` is what passed the gate.
+        inertial: velocity and biases; None at the first frame and without inertial data.
     """
 
     index: int
@@ -39,6 +56,7 @@ class Estimate:
     step: RelativePose | None
     seconds: dict[str, float]
     gate: GateResult = UNTESTED
+    inertial: InertialState | None = None
 
     def __repr__(self) -> str:
         x, y, z = self.pose[:3, 3]

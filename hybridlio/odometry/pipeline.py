@@ -9,12 +9,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.estimates import Backend, InitialPoseSource, RelativePose, ResidualSource, State, TakesBack
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise
 from hybridlio.odometry.compensation import MotionCompensation
+from hybridlio.odometry.estimate import InertialState
 from hybridlio.sources.imu_trust import ImuTrust, without_imu
 from hybridlio.sources.innovation_gate import GateResult, InnovationGate
 
@@ -164,6 +167,16 @@ class Pipeline:
         T_lidar_imu = se3.inverse(T_imu_lidar)
         covariance = se3.rotate_covariance(state.covariance[:6, :6], T_lidar_imu)
         return T_lidar_imu @ state.T_world_imu @ T_imu_lidar, covariance
+
+    def inertial_state(self, state: State) -> InertialState | None:
+        """Return the state's velocity and biases; None if no inertial data has entered it."""
+        if not state.has_imu:
+            return None
+        R = self.calibration.T_imu_lidar[:3, :3].T  # from the IMU's frame at the first scan to the lidar's
+        velocity_variances = np.diag(R @ state.covariance[6:9, 6:9] @ R.T)
+        variances = np.concatenate([velocity_variances, np.diag(state.covariance)[9:15]])
+        biases = state.accel_bias_m_s2, state.gyro_bias_rad_s
+        return InertialState(R @ state.velocity_m_s, *biases, np.sqrt(variances))
 
 
 @contextmanager

@@ -64,6 +64,14 @@ class Keeps(Protocol):
         ...
 
 
+class Watches(Protocol):
+    """What shows a run while it goes; :class:`hybridlio.viewing.rerun_live.LiveView`."""
+
+    def after_scan(self) -> None:
+        """Show what is new."""
+        ...
+
+
 @dataclass(eq=False)
 class Run:
     """A run over a sequence, complete or up to where it stopped.
@@ -180,7 +188,9 @@ def run_odometry(
     return finish_run(Run(sequence, odometry), progress, keeper)
 
 
-def finish_run(run: Run, progress: Progress | None = None, keeper: Keeps | None = None) -> Run:
+def finish_run(
+    run: Run, progress: Progress | None = None, keeper: Keeps | None = None, watcher: Watches | None = None
+) -> Run:
     """Run the rest of a run; see :func:`run_odometry`."""
     sequence = run.sequence
     _log.info(
@@ -194,6 +204,8 @@ def finish_run(run: Run, progress: Progress | None = None, keeper: Keeps | None 
             run.seconds = time.perf_counter() - start
             if keeper is not None:
                 keeper.after_scan()
+            if watcher is not None:
+                watcher.after_scan()
             if len(run.estimates) > 1:
                 last = run.estimates[-2].pose[:3, 3], run.estimates[-1].pose[:3, 3]
                 distance_m += float(np.linalg.norm(last[1] - last[0]))

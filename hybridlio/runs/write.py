@@ -24,6 +24,7 @@ from hybridlio.record.record import Record
 from hybridlio.runs import folder as run_folder
 from hybridlio.runs.own_files import check_free
 from hybridlio.runs.results.report_input import ONLINE, SMOOTHED, report_data, smoothed_report_data
+from hybridlio.runs.results.states import States
 from hybridlio.runs.run import Run
 from hybridlio.runs.whole_folder import is_held, replaced_folder
 
@@ -72,6 +73,7 @@ def write_run_files(folder: Path, run: Run, config: Config) -> Findings:
             record.keyframes.save(folder / run_folder.KEYFRAMES)
         run_folder.write_graph(folder, trajectory.poses, record.edges, run.skipped)
     run_folder.write_trajectory(folder, trajectory, T_pose_files(run), run.steps, run.stamps_before)
+    States.of_estimates(run.estimates).save(folder / run_folder.STATES)
     if sequence.reference is not None:
         write_tum(folder / run_folder.REFERENCE, sequence.reference)
     text = config_to_yaml(config)
@@ -212,6 +214,9 @@ def _write_smoothed_files(folder: Path, stored: run_folder.StoredRun, record: Re
     trajectory, T = smoothed.trajectory, stored.T_camera_lidar
     steps = Steps(se3.between(trajectory.poses[:-1], trajectory.poses[1:]), smoothed.step_covariances)
     run_folder.write_trajectory(folder, trajectory, T, steps, stored.stamps_before)
+    states = States.of_smoothed(smoothed, record)
+    if states is not None:
+        states.save(folder / run_folder.STATES)
     loops = _closed_loops(smoothed)
     edges = [*record.edges, *((loop.earlier, loop.later, loop.as_relative_pose()) for loop in loops)]
     run_folder.write_graph(folder, trajectory.poses, edges, len(stored.stamps_before))

@@ -31,7 +31,7 @@ def test_simulation_odometry_smoothing_evaluation_and_view_work_together(tmp_pat
     assert smoothed.stamps_ns.tolist() == open_sequence(drive).stamps_ns.tolist()
     for path in ("runs/latest", "runs/latest/smoothed"):
         assert "ATE [m]" in ok("evaluate", path)
-        assert ok("view", path).strip().endswith("report.html")
+        assert ok("view", path, "--report").strip().endswith("report.html")
 
 
 def test_simulating_again_keeps_the_drive_and_other_settings_are_an_error(tiny_drive):
@@ -97,7 +97,7 @@ def test_the_printed_configuration_can_be_edited_and_used(tiny_drive, tmp_path, 
         (("compare", "DRIVE", "--residual", ","), "no name given"),
         (("smooth", "DRIVE"), "not a run folder"),
         (("evaluate", "nowhere", "--reference", "DRIVE"), "nowhere"),
-        (("view", "DRIVE"), "report.html"),
+        (("view", "DRIVE", "--report"), "report.html"),
     ],
 )
 def test_unusable_input_prints_one_line_and_writes_nothing(words, named, tiny_drive, tmp_path, monkeypatch):
