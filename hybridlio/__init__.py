@@ -22,6 +22,7 @@ Estimation:
 
 Results:
     build_map          map of a run: its scans as one cloud, without moving objects; MapSettings has the settings
+    view               show a run in the Rerun viewer, or write a file for it
     Trajectory         stamped lidar poses with covariances
     evaluate           drift, ATE, RPE and consistency against a reference
 
@@ -61,6 +62,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time each name l
     from hybridlio.runs.recordings import Recording, find_recordings
     from hybridlio.simulation.config import SimulationConfig
     from hybridlio.simulation.simulate import simulate
+    from hybridlio.viewing.view import view
 
 __all__ = [
     "Batch",
@@ -94,6 +96,7 @@ __all__ = [
     "run_batch",
     "simulate",
     "smooth",
+    "view",
 ]
 
 _HOMES = {
@@ -118,6 +121,7 @@ _HOMES = {
     "runs.recordings": ("Recording", "find_recordings"),
     "simulation.config": ("SimulationConfig",),
     "simulation.simulate": ("simulate",),
+    "viewing.view": ("view",),
 }
 _HOME_OF = {name: f"hybridlio.{module}" for module, names in _HOMES.items() for name in names}
 

@@ -120,7 +120,6 @@ class Odometry:
             with timed(seconds, "keyframes"):
                 self._keyframes.offer(len(self._recorder), compensated.scan, pose)
         inertial = pipeline.inertial_state(pipeline.state)
-        self.last_scan = compensated.scan
         return self._keep(
             Estimate(
                 frame.index, frame.scan.stamp_ns, pose, covariance, initial, relative, step, seconds, gate, inertial

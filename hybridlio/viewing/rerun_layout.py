@@ -21,7 +21,6 @@ NIS, SPEED = "series/innovation", "series/speed_m_s"
 ACCEL_BIAS, GYRO_BIAS, FIX_RESIDUAL = "series/accel_bias_m_s2", "series/gyro_bias_rad_s", "series/gps_residual_m"
 
 
-
 def doubts(support: str) -> str:
     """Return where scans of one support are marked."""
     return f"{DOUBTS}/{support.replace(' ', '_')}"

@@ -19,8 +19,8 @@ from hybridlio.viewing.scene import SUPPORTED, PlacedFixes, ViewedScan
 if TYPE_CHECKING:
     import rerun as rr
 
-# What is sent together, whichever comes first: ten scans cost a third of what each by itself would, and a viewer that is
-# half a second late is still live.
+# What is sent together, whichever comes first: ten scans cost a third of what each by itself would, and a viewer that
+# is half a second late is still live.
 _BLOCK_SCANS, _BLOCK_S = 10, 0.5
 _ELLIPSOID_SIGMAS = 3.0
 _LEAST_HALF_AXIS_M = 1e-3  # that is still drawn
@@ -169,8 +169,8 @@ class RerunScene:
             self._send(names.PATH, scans[1:], rr.LineStrips3D.columns(strips=steps, colors=colour))
         with_initial = [(scan, scan.initial) for scan in block if scan.initial is not None]
         if with_initial:
-            scans, poses = zip(*with_initial, strict=True)
-            self._send_poses(names.INITIAL, scans, np.array(poses))
+            poses = np.array([initial for _, initial in with_initial])
+            self._send_poses(names.INITIAL, [scan for scan, _ in with_initial], poses)
         for scan in block:
             self._send_ellipsoid(scan)
 
