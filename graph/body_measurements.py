@@ -90,7 +90,7 @@ class BodyMeasurements:
 
     def add_imu(self, i: Key, j: Key, samples: ImuSamples, noise: ImuNoise | None = None) -> int:
         """Add two or more raw samples, the first at pose i, the last at pose j; brings both velocities and biases."""
-        return self._data.add_factor(imu_factor(self._data, (i, j), samples, noise or ImuNoise()))
+        return self._data.add_factor(imu_factor(self._data, (i, j), samples, ImuNoise() if noise is None else noise))
 
     def _add_vectors(
         self, kind: Kind, key: Key, vectors: tuple[ArrayLike, ...], noise: NoiseInput, robust: RobustLike = None

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hybridlio.core.arrays import Array
+from hybridlio.core.errors import ConfigError
 from hybridlio.graph.base.deep_stack import on_deep_stack
 from hybridlio.graph.formats.files import read_graph, write_graph
 from hybridlio.graph.formats.load_report import LoadOptions, LoadReport
@@ -18,7 +19,7 @@ from hybridlio.graph.model.connectivity import components
 from hybridlio.graph.model.graph_data import PosesByKey
 from hybridlio.graph.model.keys import Key, check_key
 from hybridlio.graph.model.measurements import Factor
-from hybridlio.graph.model.new_factors import between_factor, check_vector, prior_factor
+from hybridlio.graph.model.new_factors import between_factor, check_start, check_vector, prior_factor
 from hybridlio.graph.model.noise import NoiseInput, RobustLike
 from hybridlio.graph.solve.batch import solve_batch
 from hybridlio.graph.solve.initial_values import find_initial_values
@@ -105,7 +106,7 @@ class PoseGraph(WholeGraph):
 
     def start_from(self, solution: PosesByKey) -> None:
         """Take a solution's poses and landmarks as initial values, for the keys that both have."""
-        self._data.start_from(solution)
+        self._data.start_from(check_start(self._data, solution))
 
     @property
     def fixed(self) -> frozenset[Key]:
@@ -202,6 +203,8 @@ class PoseGraph(WholeGraph):
             GraphError: the factors do not determine every pose; names the keys.
         """
         settings = Settings(backend, initial, max_iterations, tolerance, lag)
+        if progress is not None and not callable(progress):
+            raise ConfigError("progress must be a function of stage, iteration and error")
         solve = solve_online if backend in ONLINE_SOLVERS else solve_batch
         return on_deep_stack(len(self), lambda: solve(self._data, settings, progress or silent))
 

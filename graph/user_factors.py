@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError, GraphError
+from hybridlio.core.se3 import as_floats
 from hybridlio.graph.landmark_measurements import LandmarkMeasurements
-from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.keys import Key
 from hybridlio.graph.model.measurements import Factor, factor_label
 from hybridlio.graph.model.noise import NoiseInput, RobustLike, make_noise, make_robust
-from hybridlio.graph.model.user_residual import Jacobian, Residual, UserResidual
+from hybridlio.graph.model.user_residual import Jacobian, Residual, UserResidual, sample_poses
 
 
 class UserFactors(LandmarkMeasurements):
@@ -46,10 +46,13 @@ class UserFactors(LandmarkMeasurements):
             DataError: the residual or the Jacobian has another size, or the Jacobian differs from numeric derivatives.
             GraphError: unknown key, no key, or none or both of sigmas and covariance.
         """
-        given = [keys] if isinstance(keys, int | tuple) else list(keys)
+        given = _listed(keys)
         name = factor_label("custom", given)
         known = self._known(given, name)
-        size = len(np.atleast_1d(np.asarray(covariance if sigmas is None else sigmas, dtype=np.float64)))
+        if not callable(residual) or not (jacobian is None or callable(jacobian)):
+            raise DataError(f"{name}: residual and jacobian must be functions")
+        given_noise = covariance if sigmas is None else sigmas
+        size = 1 if given_noise is None else len(np.atleast_1d(as_floats(given_noise, name)))
         noise = make_noise(name, size, NoiseInput(covariance, sigmas=sigmas))
         function = UserResidual(name, size, self._data.dimension, residual, jacobian)
         function.check(self._sample_poses(known))
@@ -67,7 +70,7 @@ class UserFactors(LandmarkMeasurements):
             DataError: not a factor of GTSAM's, or of another number of keys.
             GraphError: unknown key.
         """
-        given = [keys] if isinstance(keys, int | tuple) else list(keys)
+        given = _listed(keys)
         name = factor_label("gtsam", given)
         known = self._known(given, name)
         if not hasattr(factor, "rekey"):
@@ -109,12 +112,9 @@ class UserFactors(LandmarkMeasurements):
             raise GraphError(f"{name}: give at least one key")
         return tuple(self._data.known_keys(*keys, what=name))
 
-    def _sample_poses(self, keys: Sequence[Key]) -> list[Any]:
-        """Return initial values, or poses of no special place where there are none, to check a function at."""
-        rng, used = np.random.default_rng(0), slice(0, 6) if self._data.dimension == 3 else slice(2, 5)
-        found = []
-        for key in keys:
-            at, xi = self._data.initial_value(key), np.zeros(6)
-            xi[used] = rng.uniform(-0.5, 0.5, 6)[used]
-            found.append(se3.exp(xi) if at is None else co.to_matrices(at[None])[0])
-        return found
+    def _sample_poses(self, keys: Sequence[Key]) -> list[Array]:
+        return sample_poses([self._data.initial_value(key) for key in keys], self._data.dimension)
+
+
+def _listed(keys: Key | Sequence[Key]) -> list[Key]:
+    return list(keys) if isinstance(keys, list | range) else [keys]  # type: ignore[list-item]  # one key

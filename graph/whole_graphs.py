@@ -34,17 +34,23 @@ class WholeGraph(UserFactors):
         Raises:
             GraphError: unknown key.
         """
-        kept = set(self._data.known_keys(*keys, what="subgraph"))
+        try:
+            listed = list(keys)
+        except TypeError:
+            raise GraphError(f"subgraph: expected keys, got {type(keys).__name__}") from None
+        kept = set(self._data.known_keys(*listed, what="subgraph"))
         return self._of(_part(self._data, kept))
 
     def remove_pose(self, key: Key) -> None:
-        """Remove a pose and all factors that concern it; an online solver cannot follow this.
+        """Remove a pose and all factors that concern it; online solvers of this graph then refuse to update.
 
         Raises:
             GraphError: unknown key.
         """
         (known,) = self._data.known_keys(key, what="remove_pose")
-        self._data = _part(self._data, set(self._data.keys) - {known})
+        rest = _part(self._data, set(self._data.keys) - {known})
+        self._data.is_replaced = True
+        self._data = rest
 
     def set_noise(
         self, factor_id: int, covariance: ArrayLike | None = None, *, information: ArrayLike | None = None,
@@ -56,9 +62,7 @@ class WholeGraph(UserFactors):
             GraphError: unknown id, or a factor without noise of its own.
             DataError: as for a new factor.
         """
-        if factor_id not in self._data.factors:
-            raise GraphError(f"no factor has id {factor_id}")
-        factor = self._data.factors[factor_id]
+        factor = self._data.factors[self._data.known_factor(factor_id)]
         if factor.noise is None:
             raise GraphError(f"{factor.label}: its noise follows from its samples or is GTSAM's")
         size = len(factor.noise.values)
@@ -81,7 +85,11 @@ class WholeGraph(UserFactors):
         Raises:
             GraphError: a key that is in use, or a graph that cannot be merged.
         """
-        theirs, changes = other._data, {k: check_key(v) for k, v in (keys or {}).items()}
+        keys = {} if keys is None else keys
+        if not isinstance(other, WholeGraph) or not isinstance(keys, Mapping):
+            raise GraphError("merge: expected another graph, and a mapping of its keys to new ones")
+        theirs, changes = other._data, {check_key(k): check_key(v) for k, v in keys.items()}
+        theirs.known_keys(*changes, what="merge")
         renamed = {key: changes.get(key, key) for key in theirs.keys}
         _check_mergeable(self._data, theirs, list(renamed.values()))
         T, initial = None, np.full_like(theirs.initial_values, np.nan)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 from hybridlio.core.errors import DataError
+from hybridlio.core.files import user_path
 from hybridlio.graph.formats.load_report import LoadOptions, LoadReport
 from hybridlio.graph.formats.npz import read_npz, write_npz
 from hybridlio.graph.formats.text_reader import read_text
 from hybridlio.graph.formats.text_writer import write_text
 from hybridlio.graph.model.graph_data import GraphData, PosesByKey
+from hybridlio.graph.model.new_factors import check_start
 
 
 def read_graph(path: str | os.PathLike[str], options: LoadOptions) -> tuple[GraphData, LoadReport]:
@@ -19,7 +20,8 @@ def read_graph(path: str | os.PathLike[str], options: LoadOptions) -> tuple[Grap
     Raises:
         DataError: the file is missing, truncated or malformed; names the row of text.
     """
-    return (read_npz(path), LoadReport()) if Path(path).suffix == ".npz" else read_text(path, options)
+    path = user_path(path)
+    return (read_npz(path), LoadReport()) if path.suffix == ".npz" else read_text(path, options)
 
 
 def write_graph(data: GraphData, path: str | os.PathLike[str], solution: PosesByKey | None) -> None:
@@ -29,10 +31,11 @@ def write_graph(data: GraphData, path: str | os.PathLike[str], solution: PosesBy
         DataError: unknown ending, or the file cannot be written.
         GraphError: the format cannot hold what is in the graph.
     """
+    path = user_path(path)
     if solution is not None:
         data = data.copy()
-        data.start_from(solution)
-    suffix = Path(path).suffix
+        data.start_from(check_start(data, solution))
+    suffix = path.suffix
     if suffix == ".npz":
         write_npz(data, path)
     elif suffix in (".g2o", ".graph", ".toro"):

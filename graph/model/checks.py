@@ -11,7 +11,8 @@ from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.connectivity import components, groups
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, list_keys
-from hybridlio.graph.model.measurements import CODE, OBSERVATIONS, VELOCITIES, Factor
+from hybridlio.graph.model.measurements import OBSERVATIONS, VELOCITIES, Factor
+from hybridlio.graph.model.user_residual import sample_poses
 
 _MOTIONS = ("rotation about x", "rotation about y", "rotation about z", "x", "y", "z")
 # Numerical rank of the observed motions, relative to the largest singular value: far above double rounding (1e-16),
@@ -75,24 +76,23 @@ def free_motions(data: GraphData, part: list[Key]) -> list[str]:
         return []
     names = _MOTIONS if data.dimension == 3 else _MOTIONS[2:5]
     factors = [f for f in data.other_factors.values() if f.keys[0] in inside and f.kind not in ("bias", *OBSERVATIONS)]
-    if any(factor.kind in ("prior", *CODE) for factor in factors):
-        return []  # what a user's code leaves free, the solver finds
-    rows = [_motion_jacobian(factor) for factor in factors]
-    if data.dimension == 2 or not rows:
-        seen = "rotation about z" if any(factor.kind == "heading" for factor in factors) else ""
-        return [name for name in names if name != seen]
-    jacobian = np.vstack(rows)
+    if any(factor.kind in ("prior", "gtsam") for factor in factors):
+        return []  # what a factor of GTSAM's leaves free, the solver finds
+    jacobian = np.vstack([np.zeros((1, 6)), *(_motion_jacobian(data, factor) for factor in factors)])
     # rotations move a far position by metres: scaled down, so that both halves compare in the rank below
     reach = float(np.linalg.norm(jacobian[:, :3], axis=1).max())
     jacobian = jacobian / np.r_[np.full(3, max(reach, 1.0)), np.ones(3)]
+    jacobian = jacobian if data.dimension == 3 else jacobian[:, 2:5]
     _, sizes, directions = np.linalg.svd(jacobian)
     unobserved = directions[int((sizes > _RANK_TOLERANCE * sizes.max()).sum()) :]
     shares = np.abs(unobserved).max(axis=0, initial=0.0)
     return [name for name, share in zip(names, shares, strict=True) if share > _NAMED_SHARE]
 
 
-def _motion_jacobian(factor: Factor) -> Array:
+def _motion_jacobian(data: GraphData, factor: Factor) -> Array:
     """Return rows of six: derivative of the measurement by a rotation and shift ``(ω, v)`` of the whole graph."""
+    if factor.kind == "custom":
+        return _residual_motion_jacobian(data, factor)
     no_shift = np.zeros((3, 3))
     z = factor.measured
     if factor.kind == "gps":
@@ -106,6 +106,18 @@ def _motion_jacobian(factor: Factor) -> Array:
     if factor.kind == "imu":  # gravity shows the vertical
         return np.hstack([-se3.hat(co.UP), no_shift])
     return np.eye(6)
+
+
+def _residual_motion_jacobian(data: GraphData, factor: Factor) -> Array:
+    """Return the rows of a user's residual, scaled to size one, as its unit is not known.
+
+    Poses without an initial value are taken at places of no special kind, where the rank is that of almost everywhere.
+    """
+    poses = sample_poses([data.initial_value(key) for key in factor.keys], data.dimension)
+    used = slice(0, 6) if data.dimension == 3 else slice(2, 5)
+    rows = [J @ se3.adjoint(se3.inverse(T))[used] for J, T in zip(factor.code.derivatives(poses), poses, strict=True)]
+    total = np.sum(rows, axis=0)
+    return np.asarray(total / max(float(np.abs(rows).max()), np.finfo(float).tiny))
 
 
 def _check_velocities(data: GraphData) -> None:

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
+from hybridlio.core.se3 import as_floats
 
 Dimension: TypeAlias = Literal[2, 3]
 
@@ -41,7 +42,7 @@ def from_matrix(T: ArrayLike, dimension: Dimension, name: str) -> Array:
     """
     if isinstance(T, gtsam.Pose3 | gtsam.Pose2):
         T = T.matrix()
-    T = np.asarray(T, dtype=np.float64)
+    T = as_floats(T, name)
     if T.shape == IDENTITY[dimension].shape:
         T = _from_coordinates(T, name)
     if dimension == 3:

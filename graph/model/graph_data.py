@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hybridlio.core.arrays import Array
-from hybridlio.core.errors import GraphError
+from hybridlio.core.errors import GraphError, shown
 from hybridlio.core.geodesy import GeodeticPoint
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.edge_table import FORMS, EdgeTable
@@ -66,11 +66,12 @@ class GraphData:
         other_factors: all other factors by id, in the order they were added.
         next_id: id of the next factor.
         origin: place on Earth of world's origin, whose axes then are east, north and up; None until it is set.
+        is_replaced: whether its graph holds other data now, after the removal of a pose; an online solver may hold it.
     """
 
     def __init__(self, dimension: co.Dimension = 3) -> None:
-        if dimension not in (2, 3):
-            raise GraphError(f"the dimension of a pose graph must be 2 or 3, got {dimension!r}")
+        if not isinstance(dimension, int) or dimension not in (2, 3):
+            raise GraphError(f"the dimension of a pose graph must be 2 or 3, got {shown(dimension)}")
         self.dimension: co.Dimension = dimension
         self._keys: list[Key] = []
         self._index: dict[Key, int] = {}
@@ -82,6 +83,7 @@ class GraphData:
         self.other_factors: dict[int, Factor] = {}
         self.next_id = 0
         self.origin: GeodeticPoint | None = None
+        self.is_replaced = False
 
     def __len__(self) -> int:
         return len(self._keys)
@@ -143,6 +145,12 @@ class GraphData:
             hint = "it is a landmark" if is_landmark else "add it by add_pose, add_prior or add_between"
             raise GraphError(f"{what}: no pose has key {list_keys(unknown)}; {hint}")
         return checked
+
+    def known_factor(self, factor_id: int) -> int:
+        """Return the id of a factor; raise GraphError where no factor has it."""
+        if not isinstance(factor_id, int | np.integer) or factor_id not in self.factors:
+            raise GraphError(f"no factor has id {shown(factor_id)}")
+        return int(factor_id)
 
     def require_space(self, what: str) -> None:
         """Raise GraphError where the graph is planar."""
@@ -270,18 +278,12 @@ class GraphData:
         self.next_id = max(self.next_id, int(ids[-1]) + 1)
 
     def remove(self, factor_id: int) -> None:
-        """Remove a factor; its poses stay.
-
-        Raises:
-            GraphError: no factor has this id.
-        """
-        if factor_id in self.other_factors:
+        """Remove a factor; its poses stay. Raise GraphError where no factor has this id."""
+        if self.known_factor(factor_id) in self.other_factors:
             del self.other_factors[factor_id]
-        elif factor_id in self.edges:
+        else:
             self.edges.remove(factor_id)
             self._edge_factors.pop(factor_id, None)
-        else:
-            raise GraphError(f"no factor has id {factor_id}")
 
     def forget(self, ids: set[int], poses: range, coordinates: Array) -> None:
         """Remove factors that a solver has marginalised; their poses keep ``coordinates`` as initial values."""

@@ -6,9 +6,10 @@ Text formats know only integers. There, (robot, index) is packed like a GTSAM sy
 
 from __future__ import annotations
 
+import operator
 from typing import TypeAlias
 
-from hybridlio.core.errors import GraphError
+from hybridlio.core.errors import GraphError, shown
 
 Key: TypeAlias = "int | tuple[int, int]"
 
@@ -35,11 +36,14 @@ def check_key(key: object) -> Key:
 
 
 def _check_integer(value: object, key: object) -> int:
-    if isinstance(value, bool) or not hasattr(value, "__index__"):
-        raise GraphError(f"key {key!r}: a key must be an integer or (robot, index), both integers")
-    number = int(value.__index__())
+    try:
+        number = operator.index(value)  # type: ignore[arg-type]  # whether it is one is the question
+    except TypeError:
+        number = None
+    if number is None or isinstance(value, bool):
+        raise GraphError(f"key {shown(key)}: a key must be an integer or (robot, index), both integers")
     if number < 0:
-        raise GraphError(f"key {key!r}: a key must not be negative")
+        raise GraphError(f"key {shown(key)}: a key must not be negative")
     return number
 
 

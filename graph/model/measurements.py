@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 from hybridlio.core.arrays import Array
+from hybridlio.core.errors import shown
 from hybridlio.core.sensors import ImuSamples
 from hybridlio.graph.model.keys import Key
 from hybridlio.graph.model.noise import Noise, Robust
@@ -63,4 +64,4 @@ class Factor:
 
 def factor_label(kind: str, keys: Sequence[object]) -> str:
     """Return a factor's kind and keys for messages, such as ``between 3-4``."""
-    return f"{kind} {'-'.join(str(key) for key in keys)}"
+    return f"{kind} {'-'.join(str(key) if isinstance(key, int | tuple) else shown(key) for key in keys)}"

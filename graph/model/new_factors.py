@@ -9,9 +9,10 @@ from numpy.typing import ArrayLike
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError, GraphError
+from hybridlio.core.se3 import as_floats
 from hybridlio.core.sensors import ImuNoise, ImuSamples
 from hybridlio.graph.model import coordinates as co
-from hybridlio.graph.model.graph_data import GraphData
+from hybridlio.graph.model.graph_data import GraphData, PosesByKey
 from hybridlio.graph.model.keys import Key, check_key
 from hybridlio.graph.model.measurements import SCALARS, VECTOR_NOISE_SIZE, Factor, Kind, factor_label
 from hybridlio.graph.model.noise import NoiseInput, RobustLike, make_noise, make_robust
@@ -88,6 +89,9 @@ def imu_factor(data: GraphData, ends: tuple[Key, Key], samples: ImuSamples, nois
     i, j = data.known_keys(*ends, what=name)
     data.require_space(name)
     _require_two_poses(i, j, name)
+    if not isinstance(samples, ImuSamples) or not isinstance(noise, ImuNoise):
+        given = type(noise if isinstance(samples, ImuSamples) else samples).__name__
+        raise DataError(f"{name}: expected ImuSamples and ImuNoise, got {given}")
     if len(samples) < 2:
         raise DataError(f"{name}: at least 2 IMU samples are needed, got {len(samples)}")
     densities = np.array(astuple(noise))
@@ -125,16 +129,16 @@ def observation_factor(
             raise DataError(f"{name}: the point lies at the pose itself, so that it has no bearing")
     else:
         z = _bearing_range(measured, d, name)
-        if noise.sigmas is not None and d == 3 and np.shape(noise.sigmas) == (2,):
-            bearing, distance = np.asarray(noise.sigmas)
+        if noise.sigmas is not None and d == 3 and (sigmas := as_floats(noise.sigmas, name)).shape == (2,):
+            bearing, distance = sigmas
             noise = NoiseInput(sigmas=[bearing, bearing, distance])
     return Factor(kind, (pose,), z, make_noise(name, d, noise), make_robust(robust, d, name), landmark=landmark)
 
 
 def _bearing_range(measured: tuple[ArrayLike, ...], dimension: int, name: str) -> Array:
-    bearing = np.atleast_1d(np.asarray(measured[0], dtype=np.float64))
+    bearing = np.atleast_1d(as_floats(measured[0], name))
     bearing = check_vector(bearing, 1 if dimension == 2 else 3, name)
-    distance = check_vector(np.atleast_1d(np.asarray(measured[1], dtype=np.float64)), 1, name)
+    distance = check_vector(np.atleast_1d(as_floats(measured[1], name)), 1, name)
     if distance[0] <= 0:
         raise DataError(f"{name}: the range must be positive, got {distance[0]}")
     if dimension == 3:
@@ -143,9 +147,23 @@ def _bearing_range(measured: tuple[ArrayLike, ...], dimension: int, name: str) -
     return np.concatenate([bearing, distance])
 
 
+def check_start(data: GraphData, poses: PosesByKey) -> PosesByKey:
+    """Return poses that a graph can start from, such as a solution.
+
+    Raises:
+        DataError: something that holds no poses, or those of a graph of the other dimension.
+    """
+    coordinates = getattr(poses, "coordinates", None)
+    if not hasattr(poses, "keys") or not isinstance(coordinates, np.ndarray):
+        raise DataError(f"start values: expected a solution, got {type(poses).__name__}")
+    if coordinates.shape[1:] != co.IDENTITY[data.dimension].shape:
+        raise DataError(f"start values: the graph is {data.dimension}D, but the solution is of the other dimension")
+    return poses
+
+
 def check_direction(direction: ArrayLike, name: str) -> None:
     """Raise DataError where a vector is zero, and so has no direction."""
-    if not np.any(np.asarray(direction)):
+    if not as_floats(direction, name).any():
         raise DataError(f"{name}: a direction must not be zero")
 
 
@@ -155,7 +173,7 @@ def check_vector(values: ArrayLike, size: int, name: str) -> Array:
     Raises:
         DataError: wrong shape or not finite.
     """
-    array = np.array(values, dtype=np.float64)
+    array = as_floats(values, name).copy()
     if array.shape != (size,) or not np.isfinite(array).all():
         raise DataError(f"{name}: expected {size} finite numbers, got {array.tolist()}")
     return array

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple, TypeAlias
@@ -12,11 +13,13 @@ from numpy.typing import ArrayLike
 from hybridlio.core.arrays import Array
 from hybridlio.core.chi_square import chi_square_quantile
 from hybridlio.core.covariance import check_covariance
-from hybridlio.core.errors import ConfigError, DataError, GraphError
+from hybridlio.core.errors import ConfigError, DataError, GraphError, shown
+from hybridlio.core.se3 import as_floats
 from hybridlio.graph.base.kernels import KERNELS, estimator
 
 Form: TypeAlias = Literal["covariance", "information", "sigmas"]
 
+_LARGEST = sys.float_info.max  # a larger integer is no float
 _INLIER_SHARE = 0.95  # of good measurements that stay within a kernel's width; the usual 5 % significance level
 
 
@@ -72,7 +75,7 @@ def make_noise(name: str, size: int, given: NoiseInput) -> Noise:
     if len(present) != 1:
         raise GraphError(f"{name}: give exactly one of covariance, information and sigmas; got {len(present)} of them")
     form, values = present[0]
-    array = np.asarray(values, dtype=np.float64)
+    array = as_floats(values, name)
     if form == "sigmas":
         return Noise(form, check_sigmas(array, size, name))
     return Noise(form, check_covariance(array, name if form == "covariance" else f"{name}: information", size))
@@ -85,7 +88,7 @@ def check_sigmas(values: Array, size: int, name: str) -> Array:
         DataError: wrong shape, not finite or not positive.
     """
     values = np.full(size, values) if values.ndim == 0 else values
-    if values.shape != (size,) or not np.isfinite(values).all() or values.min() <= 0:
+    if values.shape != (size,) or not size or not (np.isfinite(values) & (values > 0)).all():
         raise DataError(f"{name}: sigmas must be {size} finite, positive standard deviations, got {values.tolist()}")
     return values.copy()
 
@@ -112,6 +115,12 @@ class Robust:
         return float(estimator(self.kernel, self.width).weight(norm))
 
 
+def is_positive(value: object) -> bool:
+    """Return whether a value is a finite real number above zero."""
+    is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    return is_number and bool(0 < value <= _LARGEST)  # type: ignore[operator]
+
+
 RobustLike: TypeAlias = "str | tuple[str, float] | Robust | None"
 
 
@@ -128,11 +137,14 @@ def make_robust(robust: RobustLike, size: int, name: str) -> Robust | None:
     """
     if robust is None or isinstance(robust, Robust):
         return robust
-    kernel, width = (robust, default_width(size)) if isinstance(robust, str) else robust
-    if kernel not in KERNELS:
-        raise ConfigError(f"{name}: unknown robust kernel {kernel!r}; choose one of {', '.join(KERNELS)}")
-    if not (np.isfinite(width) and width > 0):
-        raise ConfigError(f"{name}: the width of a robust kernel must be positive, got {width}")
+    pair = (robust, default_width(size)) if isinstance(robust, str) else robust
+    if not isinstance(pair, tuple | list) or len(pair) != 2:
+        raise ConfigError(f"{name}: a robust kernel is a name, or a name and a width, got {shown(robust)}")
+    kernel, width = pair
+    if not isinstance(kernel, str) or kernel not in KERNELS:
+        raise ConfigError(f"{name}: unknown robust kernel {shown(kernel)}; choose one of {', '.join(KERNELS)}")
+    if not is_positive(width):
+        raise ConfigError(f"{name}: the width of a robust kernel must be positive, got {shown(width)}")
     return Robust(kernel, float(width))
 
 

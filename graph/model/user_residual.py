@@ -11,6 +11,7 @@ import numpy as np
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
+from hybridlio.core.se3 import as_floats
 from hybridlio.graph.model import coordinates as co
 
 Residual: TypeAlias = Callable[..., Any]  # of poses (4, 4), one argument a key: (m,)
@@ -46,7 +47,7 @@ class UserResidual:
         Raises:
             DataError: the function returns another size, or values that are not finite.
         """
-        values = np.atleast_1d(np.asarray(self.call(*poses), dtype=np.float64))
+        values = np.atleast_1d(as_floats(self.call(*poses), f"{self.name}: residual"))
         if values.shape != (self.size,) or not np.isfinite(values).all():
             raise DataError(f"{self.name}: the residual must be {self.size} finite numbers, got {values.tolist()}")
         return values
@@ -60,7 +61,8 @@ class UserResidual:
         if self.jacobian is None:
             return self.numeric_derivatives(poses)
         given = self.jacobian(*poses)
-        matrices = [np.asarray(J, dtype=np.float64) for J in (given if isinstance(given, list | tuple) else [given])]
+        given = given if isinstance(given, list | tuple) else [given]
+        matrices = [as_floats(J, f"{self.name}: Jacobian") for J in given]
         shape = self.size, co.TANGENT_SIZE[self.dimension]
         if len(matrices) != len(poses) or any(J.shape != shape for J in matrices):
             shapes = ", ".join(str(J.shape) for J in matrices)
@@ -122,3 +124,14 @@ def heading(heading_rad: float, name: str, dimension: co.Dimension) -> UserResid
         return np.array([[*turn, 0.0, 0.0, 0.0]])
 
     return UserResidual(name, 1, dimension, residual, jacobian)
+
+
+def sample_poses(initial: Sequence[Array | None], dimension: co.Dimension) -> list[Array]:
+    """Return the poses ``(4, 4)`` of initial values, or ones of no special place for None, to check a function at."""
+    rng, used = np.random.default_rng(0), slice(0, 6) if dimension == 3 else slice(2, 5)
+    found = []
+    for at in initial:
+        xi = np.zeros(6)
+        xi[used] = rng.uniform(-0.5, 0.5, 6)[used]
+        found.append(se3.exp(xi) if at is None else np.asarray(co.to_matrices(at[None])[0]))
+    return found

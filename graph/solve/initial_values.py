@@ -8,7 +8,7 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.errors import ConfigError, GraphError
+from hybridlio.core.errors import GraphError
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.connectivity import group_labels, groups
 from hybridlio.graph.model.edge_arrays import Edges, edges_of
@@ -17,7 +17,7 @@ from hybridlio.graph.model.keys import Key, list_keys
 from hybridlio.graph.model.measurements import Factor
 from hybridlio.graph.solve.chordal import chordal_poses
 from hybridlio.graph.solve.online_start import follow_factors
-from hybridlio.graph.solve.settings import INITIAL_METHODS
+from hybridlio.graph.solve.settings import INITIAL_METHODS, check_choice
 
 _FIXES_TO_ALIGN = 3  # positions that determine a rigid transform, if they are not on one line
 # χ² per degree of freedom up to which given initial values count as good, which saves the search for better ones. It is
@@ -73,8 +73,7 @@ def find_initial_values(data: GraphData, method: str, edges: Edges | None = None
         ConfigError: unknown method.
         GraphError: some poses cannot be reached; names them.
     """
-    if method not in INITIAL_METHODS:
-        raise ConfigError(f"unknown initialisation {method!r}; choose one of {', '.join(INITIAL_METHODS)}")
+    check_choice("initialisation", method, INITIAL_METHODS)
     edges, roots = edges or edges_of(data), _find_roots(data)
     if method == "chordal":
         T = chordal_poses(roots, len(data), edges)

@@ -11,7 +11,7 @@ from gtsam.symbol_shorthand import B, V, X
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.errors import ConfigError, GraphError
+from hybridlio.core.errors import GraphError
 from hybridlio.graph.base.deep_stack import on_deep_stack
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.checks import check_determined
@@ -28,7 +28,7 @@ from hybridlio.graph.solve.nonlinear import NonlinearSolver, biases_of
 from hybridlio.graph.solve.online_factors import NewFactors, new_factors
 from hybridlio.graph.solve.online_landmarks import OnlineLandmarks
 from hybridlio.graph.solve.online_start import OnlineStart, determines_new_poses
-from hybridlio.graph.solve.settings import ONLINE_SOLVERS, silent
+from hybridlio.graph.solve.settings import ONLINE_SOLVERS, check_choice, check_count, silent
 
 _FIRST_ITERATIONS = 100  # as PoseGraph.optimize by default
 _FIRST_TOLERANCE = 1e-9  # of the error: the first update's result is iSAM2's linearisation point, so solve it exactly
@@ -45,10 +45,8 @@ class OnlineSolver:
     """
 
     def __init__(self, data: GraphData, backend: str, lag: int, forget: bool) -> None:
-        if backend not in ONLINE_SOLVERS:
-            raise ConfigError(f"unknown online backend {backend!r}; choose one of {', '.join(ONLINE_SOLVERS)}")
-        if lag < 1:
-            raise ConfigError(f"lag must be positive, got lag {lag}")
+        check_choice("online backend", backend, ONLINE_SOLVERS)
+        check_count("lag", lag)
         self._data, self._tracker = data, ChangeTracker(data)
         self._lag = lag if backend == "fixed-lag" else None
         self._forget = forget and self._lag is not None
@@ -72,8 +70,10 @@ class OnlineSolver:
 
         Raises:
             GraphError: the changes do not determine every pose, or concern one that has left the lag; names the keys.
-                The solver is then as before: correct the graph and update again.
+                The solver is then as before: correct the graph and update again. Or a pose was removed.
         """
+        if self._data.is_replaced:
+            raise GraphError("a pose was removed from the graph, which no solver follows; make a new one by online()")
         on_deep_stack(len(self._data), self._update)
 
     def _update(self) -> None:
@@ -130,7 +130,7 @@ class OnlineSolver:
 
     def point(self, key: Key) -> Array:
         """Return a landmark ``(3,)`` in world, ``(2,)`` in the plane; one that has left the lag as last estimated."""
-        return self._landmarks.point(key, self._engine.solver)
+        return self._landmarks.point(check_key(key), self._engine.solver)
 
     def velocity(self, key: Key) -> Array:
         """Return the body's velocity ``(3,)`` in world, m/s; GraphError where it has none or has left the lag."""
@@ -144,7 +144,7 @@ class OnlineSolver:
 
     def covariance(self, key: Key) -> Array:
         """Return the covariance of a pose or a landmark, as a solution does; only in the lag."""
-        if key in self._data.landmarks:
+        if (key := check_key(key)) in self._data.landmarks:
             covariance = self._marginal(self._landmarks.variable(key))
             return np.asarray((covariance + covariance.T) / 2)
         index = self._in_lag(key)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from hybridlio.core.errors import ConfigError
+import numpy as np
+
+from hybridlio.core.errors import ConfigError, shown
+from hybridlio.graph.model.noise import is_positive
 
 SolverName: TypeAlias = Literal["auto", "batch", "gnc", "incremental", "fixed-lag"]
 OnlineName: TypeAlias = Literal["incremental", "fixed-lag"]
@@ -37,15 +40,24 @@ class Settings:
     lag: int
 
     def __post_init__(self) -> None:
-        if self.backend not in SOLVERS:
-            raise ConfigError(f"unknown backend {self.backend!r}; choose one of {', '.join(SOLVERS)}")
-        if self.initial not in INITIAL:
-            raise ConfigError(f"unknown initial={self.initial!r}; choose one of {', '.join(INITIAL)}")
-        if self.max_iterations < 1 or not self.tolerance > 0 or self.lag < 1:
-            raise ConfigError(
-                "max_iterations, tolerance and lag must be positive, "
-                f"got {self.max_iterations}, {self.tolerance} and {self.lag}"
-            )
+        check_choice("backend", self.backend, SOLVERS)
+        check_choice("initial", self.initial, INITIAL)
+        check_count("max_iterations", self.max_iterations)
+        check_count("lag", self.lag)
+        if not is_positive(self.tolerance):
+            raise ConfigError(f"tolerance must be positive, got {self.tolerance!r:.40}")
+
+
+def check_choice(what: str, value: object, choices: Collection[str]) -> None:
+    """Raise ConfigError where a value is none of the names to choose from."""
+    if not isinstance(value, str) or value not in choices:
+        raise ConfigError(f"unknown {what} {shown(value)}; choose one of {', '.join(choices)}")
+
+
+def check_count(what: str, value: object) -> None:
+    """Raise ConfigError where a value is no positive integer that fits 32 bits, as GTSAM's numbers do."""
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or not 0 < value < 1 << 31:
+        raise ConfigError(f"{what} must be a positive integer below 2**31, got {shown(value)}")
 
 
 def silent(stage: str, iteration: int, error: float) -> None:

@@ -17,7 +17,7 @@ from hybridlio.graph.base.deep_stack import on_deep_stack
 from hybridlio.graph.base.isam import gtsam_message, incremental_solver
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
-from hybridlio.graph.model.keys import Key
+from hybridlio.graph.model.keys import Key, check_key
 from hybridlio.graph.model.measurements import CODE
 from hybridlio.graph.solve.builder import Builder
 from hybridlio.graph.solve.landmark_factors import landmark_point
@@ -111,9 +111,9 @@ class Solution(SolutionViews):
         Raises:
             GraphError: no landmark has this key.
         """
-        if key not in self._data.landmarks:
-            raise GraphError(f"no landmark has key {key}")
-        return self.points[key].copy()
+        if (known := check_key(key)) not in self._data.landmarks:
+            raise GraphError(f"no landmark has key {known}")
+        return self.points[known].copy()
 
     def velocity(self, key: Key) -> Array:
         """Return the body's velocity ``(3,)`` in world, m/s.
@@ -144,7 +144,7 @@ class Solution(SolutionViews):
         Raises:
             GraphError: no pose or landmark has this key, or the graph is too ill-conditioned for covariances.
         """
-        if key in self._data.landmarks:
+        if (key := check_key(key)) in self._data.landmarks:
             covariance = self._marginal(L(self._data.landmarks.index[key]))
             return np.asarray((covariance + covariance.T) / 2)
         covariance = self._marginal(X(self._known(key)))
@@ -239,9 +239,9 @@ class Solution(SolutionViews):
         return isam
 
     def _known(self, key: Key) -> int:
-        if key not in self._index:
-            raise GraphError(f"no pose has key {key}")
-        return self._index[key]
+        if (known := check_key(key)) not in self._index:
+            raise GraphError(f"no pose has key {known}")
+        return self._index[known]
 
     def _variable(self, variable: int, key: Key, what: str) -> int:
         if not self._result.values.exists(variable):
@@ -249,6 +249,4 @@ class Solution(SolutionViews):
         return variable
 
     def _known_factor(self, factor_id: int) -> int:
-        if factor_id not in self._data.factors:
-            raise GraphError(f"no factor has id {factor_id}")
-        return factor_id
+        return self._data.known_factor(factor_id)

@@ -46,6 +46,8 @@ def from_gtsam(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Graph
     Raises:
         DataError: values of other kinds than poses of one dimension, or a factor over other variables.
     """
+    if not isinstance(graph, gtsam.NonlinearFactorGraph) or not isinstance(values, gtsam.Values):
+        raise DataError(f"from_gtsam: expected a NonlinearFactorGraph and Values, got {type(graph).__name__}")
     names = list(values.keys())
     poses = [_pose(values, name) for name in names]
     if len({len(pose) for pose in poses}) != 1:

@@ -1,6 +1,7 @@
 """The errors that the library raises. Messages say what is wrong, where (file, row, frame index), and what to do."""
 
 import re
+import reprlib
 
 _SEQUENCE = re.compile(
     r"\x1b\[[0-?]*[ -/]*[@-~]|\x1b\][^\x07\x1b]*(?:\x07|\x1b\\)?"
@@ -11,6 +12,11 @@ _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2
 def strip_control(text: str) -> str:
     """Return the text without control characters, which a file's name or content could send to the terminal."""
     return _CONTROL.sub("", _SEQUENCE.sub("", text))
+
+
+def shown(value: object) -> str:
+    """Return a value that a user gave, for a message: on one line and short."""
+    return strip_control(" ".join(reprlib.repr(value).split()))
 
 
 class HybridLioError(Exception):

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO, Any
 from zipfile import BadZipFile
 
-from hybridlio.core.errors import DataError, HybridLioError
+from hybridlio.core.errors import DataError, HybridLioError, shown
 
 # raised when an .npz file is damaged or holds something else
 UNREADABLE_NPZ = (
@@ -34,7 +34,7 @@ def user_path(path: str | os.PathLike[str]) -> Path:
         DataError: it is no path on any system: it has a NUL character, is too long, or names an unknown user.
     """
     if not isinstance(path, str | os.PathLike):
-        raise DataError(f"expected a path, got {type(path).__name__} {path!r:.40}")
+        raise DataError(f"expected a path, got {type(path).__name__} {shown(path)}")
     text = os.fspath(path)
     if "\0" in text:
         raise DataError(f"{_shortened(text)!r}: a path cannot contain a NUL character")

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
+from hybridlio.core.se3 import as_floats
 
 EARTH_RADIUS_M = 6378137.0  # equatorial, WGS 84; KITTI's Mercator projection uses it
 _ORIGIN_ITERATIONS = 5  # each gains a factor of distance over Earth radius: three digits at a few kilometres
@@ -28,9 +29,10 @@ def check_geodetic(latitude_deg: float, longitude_deg: float, height_m: float, n
     Raises:
         DataError: not finite, a latitude beyond ±90° or a longitude beyond -180° to 360°; the message carries ``name``.
     """
-    point = GeodeticPoint(float(latitude_deg), float(longitude_deg), float(height_m))
-    if not np.isfinite(point).all():
-        raise DataError(f"{name}: latitude, longitude and height must be finite, got {tuple(point)}")
+    coordinates = as_floats([latitude_deg, longitude_deg, height_m], name)
+    if coordinates.shape != (3,) or not np.isfinite(coordinates).all():
+        raise DataError(f"{name}: latitude, longitude and height must be finite numbers, got {coordinates.tolist()}")
+    point = GeodeticPoint(*coordinates.tolist())
     if abs(point.latitude_deg) > 90:
         raise DataError(f"{name}: a latitude lies between -90 and 90 degrees, got {point.latitude_deg}")
     if not -180 <= point.longitude_deg <= 360:

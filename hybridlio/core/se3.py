@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from hybridlio.core.arrays import Array
-from hybridlio.core.errors import DataError
+from hybridlio.core.errors import DataError, shown
 
 _EYE, _LAST = np.eye(3), [0.0, 0.0, 0.0, 1.0]  # the identity rotation; the last row of every pose
 _SMALL_ANGLE_RAD = 1e-4  # below it the closed forms lose digits, while the series' next terms are below 1e-17
@@ -132,15 +132,31 @@ def rotate_covariance(cov_b: ArrayLike, T_a_b: ArrayLike) -> Array:
     return np.asarray(Ad @ np.asarray(cov_b) @ np.swapaxes(Ad, -1, -2))
 
 
+def as_floats(values: ArrayLike, name: str) -> Array:
+    """Return numbers that a user gave as float64; an array of that type is not copied.
+
+    Raises:
+        DataError: it is no real number and no array of such; the message starts with ``name``.
+    """
+    try:
+        if not np.iscomplexobj(values):
+            return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise DataError(f"{name}: expected numbers, got {type(values).__name__} {shown(values)}")
+
+
 def check_pose(T: ArrayLike, name: str) -> Array:
     """Return the pose as float64 ``(4, 4)``; a rotation that is off by rounding is made orthonormal.
 
     Raises:
         DataError: the shape is not ``(4, 4)``, a value is not finite, or the rotation is off by more than 1e-3.
     """
-    T = np.asarray(T, dtype=np.float64)
+    T = as_floats(T, name)
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise DataError(f"{name}: expected a finite (4, 4) pose, got shape {T.shape}")
+    if np.abs(T[:3, :3]).max() > 2:  # a larger one is no rotation, and its square may overflow
+        raise DataError(f"{name}: not a rigid transform (rotation not orthonormal)")
     if np.abs(T[:3, :3].T @ T[:3, :3] - _EYE).max() < 1e-12 and np.linalg.det(T[:3, :3]) > 0 and T[3].tolist() == _LAST:
         return T.copy()  # almost always; the singular value decomposition below takes three times as long
     clean = orthonormalise(T)
