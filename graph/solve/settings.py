@@ -45,7 +45,7 @@ class Settings:
         check_count("max_iterations", self.max_iterations)
         check_count("lag", self.lag)
         if not is_positive(self.tolerance):
-            raise ConfigError(f"tolerance must be positive, got {self.tolerance!r:.40}")
+            raise ConfigError(f"tolerance must be positive, got {shown(self.tolerance)}")
 
 
 def check_choice(what: str, value: object, choices: Collection[str]) -> None:

@@ -32,8 +32,8 @@ from hybridlio.graph import PoseGraph
 
 KEYS = st.integers(0, 11)
 SEEDS = st.integers(0, 2**31)
-# Of a solver that relinearises where a pose has moved by its thresholds, in metres and in entries of rotations. A robust
-# kernel's weight is that of the last linearisation: up to 0.3 standard deviations off, or 0.01 rad at 12 m.
+# In metres and entries of rotations, of a solver that relinearises where a pose has moved by its thresholds. A robust
+# kernel's weight is that of the last linearisation: poses were 0.3 standard deviations off, 0.01 rad or 0.1 m at 12 m.
 AGREEMENT, ROBUST_AGREEMENT = 0.05, 0.3
 steps: Counter[str] = Counter()  # of this process, by what was done
 
