@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hybridlio.core.arrays import Array
-from hybridlio.core.errors import DataError
-from hybridlio.core.se3 import as_floats
+from hybridlio.core.errors import DataError, shown
 
 EARTH_RADIUS_M = 6378137.0  # equatorial, WGS 84; KITTI's Mercator projection uses it
 _ORIGIN_ITERATIONS = 5  # each gains a factor of distance over Earth radius: three digits at a few kilometres
@@ -29,10 +28,13 @@ def check_geodetic(latitude_deg: float, longitude_deg: float, height_m: float, n
     Raises:
         DataError: not finite, a latitude beyond ±90° or a longitude beyond -180° to 360°; the message carries ``name``.
     """
-    coordinates = as_floats([latitude_deg, longitude_deg, height_m], name)
-    if coordinates.shape != (3,) or not np.isfinite(coordinates).all():
-        raise DataError(f"{name}: latitude, longitude and height must be finite numbers, got {coordinates.tolist()}")
-    point = GeodeticPoint(*coordinates.tolist())
+    try:
+        point = GeodeticPoint(float(latitude_deg), float(longitude_deg), float(height_m))
+    except (TypeError, ValueError, OverflowError):
+        given = ", ".join(shown(value) for value in (latitude_deg, longitude_deg, height_m))
+        raise DataError(f"{name}: latitude, longitude and height must be numbers, got {given}") from None
+    if not np.isfinite(point).all():
+        raise DataError(f"{name}: latitude, longitude and height must be finite, got {tuple(point)}")
     if abs(point.latitude_deg) > 90:
         raise DataError(f"{name}: a latitude lies between -90 and 90 degrees, got {point.latitude_deg}")
     if not -180 <= point.longitude_deg <= 360:
