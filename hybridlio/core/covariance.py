@@ -7,7 +7,6 @@ from numpy.typing import ArrayLike
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
-from hybridlio.core.se3 import as_floats
 
 # Asymmetry that rounding explains: float32 input (relative 6e-8, with a margin), and sums of terms that cancel
 # (absolute, against the largest entry).
@@ -25,7 +24,7 @@ def check_covariance(covariance: ArrayLike, name: str, size: int = 6) -> Array:
     Raises:
         DataError: it has another shape, is not finite, not symmetric or not positive definite.
     """
-    matrix = as_floats(covariance, name)
+    matrix = np.asarray(covariance, dtype=np.float64)
     if matrix.shape != (size, size) or not np.isfinite(matrix).all():
         raise DataError(f"{name}: expected a finite ({size}, {size}) covariance, got shape {matrix.shape}")
     asymmetry, magnitude = np.abs(matrix - matrix.T), np.abs(matrix)
