@@ -138,12 +138,13 @@ def as_floats(values: ArrayLike, name: str) -> Array:
     Raises:
         DataError: it is no real number and no array of such; the message starts with ``name``.
     """
+    said = f"{name}: expected numbers, got {type(values).__name__} {shown(values)}"
     try:
-        if not np.iscomplexobj(values):
-            return np.asarray(values, dtype=np.float64)
+        if np.iscomplexobj(values):
+            raise DataError(said)
+        return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        pass
-    raise DataError(f"{name}: expected numbers, got {type(values).__name__} {shown(values)}")
+        raise DataError(said) from None
 
 
 def check_pose(T: ArrayLike, name: str) -> Array:
