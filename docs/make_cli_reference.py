@@ -17,8 +17,9 @@ HEADER = """# Command line
 
 This page is made from the commands each time the site is built; `hybridlio COMMAND --help` prints the same.
 
-Results go to stdout. Progress, warnings and the one line of an error go to stderr. The exit code is 0 when the command
-succeeded, 2 for input that cannot be used, 1 for a failure on the way and 130 when interrupted (Ctrl-C or SIGTERM).
+Results go to stdout. Progress, warnings and the one line of an error go to stderr.
+[Exit codes](../how_to/runs.md#exit-codes) has the table of exit codes. `hybridlio --install-completion` lets the shell
+complete commands, options and the names of sources, readers, scenes and the like.
 """
 
 

@@ -38,18 +38,18 @@ def pose_covariances(isam: gtsam.ISAM2, poses: Array, progress: Progress) -> tup
     Args:
         isam: the solved graph.
         poses: ``(N, 4, 4)`` solved poses.
-        progress: called before each pose, and at the end.
+        progress: called after each pose.
     """
     count = len(poses)
     absolute, steps = np.empty((count, 6, 6)), np.empty((count - 1, 6, 6))
     if count == 1:
         absolute[0] = isam.marginalCovariance(X(0))
     for k in range(count - 1):
-        progress("covariances", k, count)
         joint = isam.jointMarginalCovariance([X(k), X(k + 1)]).fullMatrix()
         absolute[k], absolute[k + 1] = joint[:6, :6], joint[6:, 6:]
         steps[k] = step_covariance(joint, se3.between(poses[k], poses[k + 1]))
-    progress("covariances", count - 1, count)
+        progress("covariances", k + 1, count)
+    progress("covariances", count, count)
     return _symmetric(absolute), _symmetric(steps)
 
 

@@ -13,8 +13,9 @@ import typer
 
 from hybridlio.commands import common
 from hybridlio.commands.common import INTERRUPTED, guarded
+from hybridlio.commands.shared import completion
+from hybridlio.commands.shared.training_process import Device, first_process_progress, is_first_process
 from hybridlio.commands.terminal import print_message, print_result, print_table
-from hybridlio.commands.training_process import Device, first_process_progress, is_first_process
 from hybridlio.core.errors import ConfigError, HybridLioError
 from hybridlio.datasets.rosbag.choices import NO_CHOICE, BagTopics
 
@@ -41,7 +42,10 @@ Tests = Annotated[
     list[Path] | None, typer.Option("--test", metavar="DATA", help="A recording to test on; may be repeated.")
 ]
 Split = Annotated[
-    str | None, typer.Option(metavar="NAME", help="Split of KITTI odometry, easy or hard; replaces --test.")
+    str | None,
+    typer.Option(
+        metavar="NAME", autocompletion=completion.split, help="Split of KITTI odometry, easy or hard; replaces --test."
+    ),
 ]
 Steps = Annotated[int, typer.Option(min=1, help="Optimiser steps per row.")]
 Out = Annotated[
@@ -57,6 +61,7 @@ Base = Annotated[
     str,
     typer.Option(
         metavar="NAME",
+        autocompletion=completion.base,
         help="The method that the rows are variants of: paper, its set-up as printed, or published, the set-up of the "
         "shipped weights, which learns within hours on a CPU.",
     ),
@@ -64,7 +69,10 @@ Base = Annotated[
 Seeds = Annotated[
     int, typer.Option(min=1, metavar="N", help="Train each row with N seeds; the table gives the spread.")
 ]
-Only = Annotated[str | None, typer.Option("--rows", metavar="A,B,…", help="Only the rows of these presets.")]
+Only = Annotated[
+    str | None,
+    typer.Option("--rows", metavar="A,B,…", autocompletion=completion.preset, help="Only the rows of these presets."),
+]
 
 
 @guarded

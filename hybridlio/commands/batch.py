@@ -9,6 +9,7 @@ import typer
 
 from hybridlio.commands import common
 from hybridlio.commands.common import guarded
+from hybridlio.commands.shared import completion
 from hybridlio.commands.terminal import print_message, print_result, print_table, progress
 from hybridlio.datasets.rosbag.choices import NO_CHOICE, BagTopics
 from hybridlio.runs.engines import LOCAL
@@ -17,27 +18,49 @@ if TYPE_CHECKING:
     from hybridlio.runs.batch_table import Batch
 
 
+Recordings = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="DATA…",
+        help="Recordings: paths, quoted patterns, or .yaml or .txt files that list them.",
+        show_default=False,
+    ),
+]
+Out = Annotated[
+    Path,
+    typer.Option(
+        "-o",
+        "--out",
+        metavar="DIR",
+        help="The folder for the run folders and the results, batch.md.",
+        show_default=False,
+    ),
+]
+Jobs = Annotated[
+    int | None, typer.Option("-j", "--jobs", min=1, help="Number of parallel runs; default: one per core.")
+]
+Threads = Annotated[
+    int | None,
+    typer.Option(min=1, help="Threads per run; default: the cores divided by --jobs, or 1 on a cluster."),
+]
+EngineName = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME",
+        autocompletion=completion.engine,
+        help="loky: processes on this machine; dask or ray: a cluster.",
+    ),
+]
+Scheduler = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="Address of the cluster, such as tcp://head:8786.")
+]
+
+
 @guarded
 @common.with_topic_options
 def batch(
-    data: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="DATA…",
-            help="Recordings: paths, quoted patterns, or .yaml or .txt files that list them.",
-            show_default=False,
-        ),
-    ],
-    out: Annotated[
-        Path,
-        typer.Option(
-            "-o",
-            "--out",
-            metavar="DIR",
-            help="The folder for the run folders and the results, batch.md.",
-            show_default=False,
-        ),
-    ],
+    data: Recordings,
+    out: Out,
     sequence: common.SequenceNames = None,
     reader: common.ReaderName = None,
     raw_root: common.RawRoot = None,
@@ -48,19 +71,10 @@ def batch(
     frames: common.Frames = None,
     vertical_angle: common.VerticalAngle = None,
     check: common.Check = True,
-    jobs: Annotated[
-        int | None, typer.Option("-j", "--jobs", min=1, help="Number of parallel runs; default: one per core.")
-    ] = None,
-    threads: Annotated[
-        int | None,
-        typer.Option(min=1, help="Threads per run; default: the cores divided by --jobs, or 1 on a cluster."),
-    ] = None,
-    engine: Annotated[
-        str, typer.Option(metavar="NAME", help="loky: processes on this machine; dask or ray: a cluster.")
-    ] = LOCAL,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Address of the cluster, such as tcp://head:8786.")
-    ] = None,
+    jobs: Jobs = None,
+    threads: Threads = None,
+    engine: EngineName = LOCAL,
+    scheduler: Scheduler = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Run recordings again that have a run in -o.")] = False,
     topics: BagTopics = NO_CHOICE,
     _verbosity: common.Verbose = 0,

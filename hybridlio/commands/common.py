@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, ParamSpec
 
 import typer
 
+from hybridlio.commands.shared import completion
 from hybridlio.commands.terminal import print_message, progress, set_up_logging
 from hybridlio.core.errors import ConfigError, DataError, HybridLioError
 from hybridlio.datasets.rosbag.choices import BagTopics, option_of
@@ -67,6 +68,7 @@ ReaderName = Annotated[
     typer.Option(
         "--reader",
         metavar="NAME",
+        autocompletion=completion.reader,
         help="kitti-raw, kitti-odometry, folder, rosbag, ouster, velodyne, or a data set: kitti-360, nuscenes, nclt, "
         "mulran, helipr, boreas, newer-college, argoverse-2, apollo; by default detected from the files.",
     ),
@@ -99,18 +101,27 @@ ScanCount = Annotated[int | None, typer.Option("--n-scans", "-n", metavar="N", m
 Every = Annotated[int, typer.Option("--every", "--jump", metavar="N", min=1, help="Use one scan in N.")]
 InitialPoseName = Annotated[
     str | None,
-    typer.Option("--initial-pose", metavar="NAME", help=f"Source of initial poses: {', '.join(INITIAL_POSE_SOURCES)}."),
+    typer.Option(
+        "--initial-pose",
+        metavar="NAME",
+        autocompletion=completion.initial_pose,
+        help=f"Source of initial poses: {', '.join(INITIAL_POSE_SOURCES)}.",
+    ),
 ]
 ResidualName = Annotated[
     str | None,
     typer.Option(
         "--residual",
         metavar="NAME",
+        autocompletion=completion.residual,
         help=f"Source of residuals, which correct initial poses: {', '.join(RESIDUAL_SOURCES)}.",
     ),
 ]
 BackendName = Annotated[
-    str | None, typer.Option("--backend", metavar="NAME", help=f"Factor graph: {', '.join(BACKENDS)}.")
+    str | None,
+    typer.Option(
+        "--backend", metavar="NAME", autocompletion=completion.backend, help=f"Factor graph: {', '.join(BACKENDS)}."
+    ),
 ]
 ConfigFile = Annotated[
     Path | None, typer.Option("--config", metavar="FILE", help="Settings file, as printed by `hybridlio config`.")

@@ -10,6 +10,7 @@ import typer
 
 from hybridlio.commands import common
 from hybridlio.commands.common import guarded
+from hybridlio.commands.shared import completion
 from hybridlio.commands.terminal import print_message, print_result, print_table, progress
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.tables import counted
@@ -34,13 +35,22 @@ def compare(
     reader: common.ReaderName = None,
     raw_root: common.RawRoot = None,
     initial_pose: Annotated[
-        str, typer.Option("--initial-pose", metavar="A,B,…", help=_choice_help(_INITIAL_POSES))
+        str,
+        typer.Option(
+            "--initial-pose", metavar="A,B,…", autocompletion=completion.initial_pose, help=_choice_help(_INITIAL_POSES)
+        ),
     ] = "all",
     residual: Annotated[
-        str | None, typer.Option(metavar="A,B,…", help=_choice_help(_RESIDUALS), show_default=False)
+        str | None,
+        typer.Option(
+            metavar="A,B,…", autocompletion=completion.residual, help=_choice_help(_RESIDUALS), show_default=False
+        ),
     ] = None,
     backend: Annotated[
-        str | None, typer.Option(metavar="A,B,…", help=_choice_help(_BACKENDS), show_default=False)
+        str | None,
+        typer.Option(
+            metavar="A,B,…", autocompletion=completion.backend, help=_choice_help(_BACKENDS), show_default=False
+        ),
     ] = None,
     config: common.ConfigFile = None,
     frames: common.Frames = None,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hybridlio.commands.common import Verbose, guarded
-from hybridlio.commands.gps_options import Antenna, MaxShift, gps_options
+from hybridlio.commands.shared.gps_options import Antenna, MaxShift, gps_options
 from hybridlio.commands.terminal import print_result, print_warning
 from hybridlio.core.errors import ConfigError, DataError
 

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from hybridlio.commands.common import Verbose, guarded
+from hybridlio.commands.shared import completion
 from hybridlio.commands.terminal import print_result, print_warning
 from hybridlio.core.errors import ConfigError
 
@@ -21,7 +22,12 @@ def optimize(
         Path | None, typer.Option("--output", "-o", metavar="OUT", help="Where to write the solved graph.")
     ] = None,
     solver: Annotated[
-        str, typer.Option(metavar="NAME", help="batch, gnc (rejects wrong loops), incremental or fixed-lag.")
+        str,
+        typer.Option(
+            metavar="NAME",
+            autocompletion=completion.solver,
+            help="batch, gnc (rejects wrong loops), incremental or fixed-lag.",
+        ),
     ] = "batch",
     plot: Annotated[
         Path | None, typer.Option(metavar="PNG", help="Where to draw it, with factors coloured by their χ².")

@@ -8,58 +8,90 @@ from typing import Annotated, Any, get_args
 import typer
 
 from hybridlio.commands.common import INTERRUPTED, Verbose, guarded
+from hybridlio.commands.shared import completion
 from hybridlio.commands.terminal import print_message, print_result, progress
 from hybridlio.core.errors import ConfigError
+
+LengthM = Annotated[
+    float | None, typer.Option("--length-m", help="Length of the path in metres, instead of --seconds.")
+]
+DriveSeed = Annotated[
+    int | None,
+    typer.Option("--drive-seed", help="Drive through the same town again: other traffic, parked cars, noise."),
+]
+Driving = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME", autocompletion=completion.driving, help="calm, or hard: brakes late and takes bends fast."
+    ),
+]
+Scene = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME",
+        autocompletion=completion.scene,
+        help="A road: town, corridor or field; or a scene for other platforms: office, "
+        "stairs, house, warehouse, garage, forest, tunnel, mine or campus.",
+    ),
+]
+Platform = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        autocompletion=completion.platform,
+        help="The carrier in those scenes: handheld, quadruped, robot, drone or car; by default the usual one.",
+    ),
+]
+Lidar = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        autocompletion=completion.lidar,
+        help="Roads: hdl-64e, 32-beam or 16-beam; else os0, os1, pandar, hdl-64e, vlp-16, mid360 or rosette.",
+    ),
+]
+ImuGrade = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        autocompletion=completion.imu,
+        help="In those scenes: consumer-mems (default), industrial or tactical.",
+    ),
+]
+Distortion = Annotated[
+    bool, typer.Option("--distortion", help="Let the vehicle move during each sweep, which distorts the scans.")
+]
+Poses = Annotated[Path | None, typer.Option(metavar="FILE", help="Drive along this trajectory (KITTI or TUM format).")]
+PosesFrame = Annotated[
+    str,
+    typer.Option(
+        "--poses-frame",
+        metavar="NAME",
+        autocompletion=completion.poses_frame,
+        help="The frame whose poses a KITTI file holds: camera or lidar.",
+    ),
+]
 
 
 @guarded
 def simulate(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="The folder to write to.", show_default=False)],
     seconds: Annotated[float | None, typer.Option(help="Duration; default 60, or as long as --length-m takes.")] = None,
-    length_m: Annotated[
-        float | None, typer.Option("--length-m", help="Length of the path in metres, instead of --seconds.")
-    ] = None,
+    length_m: LengthM = None,
     seed: Annotated[int, typer.Option(help="Random seed of road, town, traffic and noise.")] = 1,
-    drive_seed: Annotated[
-        int | None,
-        typer.Option("--drive-seed", help="Drive through the same town again: other traffic, parked cars, noise."),
-    ] = None,
+    drive_seed: DriveSeed = None,
     speed: Annotated[float, typer.Option(help="Cruising speed in m/s.")] = 10.0,
-    driving: Annotated[str, typer.Option(help="calm, or hard: brakes late and takes bends fast.")] = "calm",
-    scene: Annotated[
-        str,
-        typer.Option(
-            help="A road: town, corridor or field; or a scene for other platforms: office, "
-            "stairs, house, warehouse, garage, forest, tunnel, mine or campus."
-        ),
-    ] = "town",
-    platform: Annotated[
-        str | None,
-        typer.Option(
-            help="The carrier in those scenes: handheld, quadruped, robot, drone or car; by default the usual one."
-        ),
-    ] = None,
-    lidar: Annotated[
-        str | None,
-        typer.Option(
-            help="Roads: hdl-64e, 32-beam or 16-beam; else os0, os1, pandar, hdl-64e, vlp-16, mid360 or rosette."
-        ),
-    ] = None,
-    imu: Annotated[
-        str | None, typer.Option(help="In those scenes: consumer-mems (default), industrial or tactical.")
-    ] = None,
-    distortion: Annotated[
-        bool, typer.Option("--distortion", help="Let the vehicle move during each sweep, which distorts the scans.")
-    ] = False,
+    driving: Driving = "calm",
+    scene: Scene = "town",
+    platform: Platform = None,
+    lidar: Lidar = None,
+    imu: ImuGrade = None,
+    distortion: Distortion = False,
     gps: Annotated[bool, typer.Option("--gps", help="Also write GPS fixes.")] = False,
     loops: Annotated[bool, typer.Option("--loops", help="Drive through the same streets again.")] = False,
     start_at_rest: Annotated[bool, typer.Option("--start-at-rest", help="Stand still for the first 2 s.")] = False,
-    poses: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Drive along this trajectory (KITTI or TUM format).")
-    ] = None,
-    poses_frame: Annotated[
-        str, typer.Option("--poses-frame", help="The frame whose poses a KITTI file holds: camera or lidar.")
-    ] = "camera",
+    poses: Poses = None,
+    poses_frame: PosesFrame = "camera",
     _verbosity: Verbose = 0,
 ) -> None:
     """Simulate a recording: lidar scans, an IMU and exact poses.

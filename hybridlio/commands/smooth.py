@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hybridlio.commands.common import Verbose, guarded
-from hybridlio.commands.gps_options import Antenna, MaxShift, Outages, gps_options
+from hybridlio.commands.shared import completion
+from hybridlio.commands.shared.gps_options import Antenna, MaxShift, Outages, gps_options
 from hybridlio.commands.terminal import print_message, print_result, print_table, print_warning, progress
 from hybridlio.core.errors import ConfigError, EstimationError
 
@@ -41,7 +42,9 @@ def smooth(
     robust: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME", help="How to reject wrong loops and fixes: gnc, huber, cauchy, geman-mcclure, dcs."
+            metavar="NAME",
+            autocompletion=completion.robust_method,
+            help="How to reject wrong loops and fixes: gnc, huber, cauchy, geman-mcclure, dcs.",
         ),
     ] = None,
     _verbosity: Verbose = 0,
@@ -105,14 +108,5 @@ def _print_result(folder: Path, sequence: str, smoothed: Smoothed, findings: Fin
 def _smooth(record: Record, loops: bool, gps: bool | GpsOptions, robust: str | None) -> Smoothed:
     from hybridlio.graph.run.smooth import smooth as optimise
 
-    with progress("smoothing", "poses") as report:
-
-        def show(stage: str, done: int, total: int) -> None:
-            if stage == "covariances":
-                report(stage, done + 1, total)
-            elif stage == "loops":
-                report("searching for loops", done, total)
-            else:
-                report(f"{stage}, round {done + 1} of {total}", 0, len(record.online))
-
-        return optimise(record, show, loops=loops, gps=gps, robust=robust)
+    with progress("smoothing", "poses", {"loops": "keyframes", "optimising": "rounds"}) as report:
+        return optimise(record, report, loops=loops, gps=gps, robust=robust)

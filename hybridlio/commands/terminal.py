@@ -7,7 +7,7 @@ import io
 import logging
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 from rich.console import Console
@@ -84,22 +84,23 @@ class _Handler(logging.Handler):
 
 
 @contextmanager
-def progress(task: str, unit: str = "scans") -> Iterator[Progress]:
+def progress(task: str, unit: str = "scans", units: Mapping[str, str] | None = None) -> Iterator[Progress]:
     """Show the progress of a loop: a bar on a terminal, otherwise a line after every tenth of the work.
 
     Args:
         task: what the loop does.
         unit: what it counts.
+        units: what it counts in its stages that count something else, by their names.
 
     Yields:
-        The callback to report progress to.
+        The callback to report progress to. A further stage begins where the count falls or its unit changes.
     """
-    with (_bar if _stderr().is_terminal else _lines)(task, unit) as report:
+    with (_bar if _stderr().is_terminal else _lines)(task, _Pace(unit, units or {})) as report:
         yield report
 
 
 @contextmanager
-def _bar(task: str, unit: str) -> Iterator[Progress]:
+def _bar(task: str, pace: _Pace) -> Iterator[Progress]:
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as ProgressBar
 
@@ -111,55 +112,60 @@ def _bar(task: str, unit: str) -> Iterator[Progress]:
         TimeRemainingColumn(),
         TextColumn("{task.fields[stage]}"),
     )
-    rate = _Rate(unit)
     with ProgressBar(*columns, console=_stderr()) as bar:
         row = bar.add_task(task, total=None, rate="", stage="")
 
         def report(stage: str, done: int, total: int) -> None:
-            rate.update(done)
-            bar.update(row, completed=done, total=total, rate=str(rate), stage=stage)
+            if pace.update(stage, done):
+                bar.reset(row)
+            bar.update(row, completed=done, total=total, rate=str(pace), stage=stage)
 
         yield report
 
 
 @contextmanager
-def _lines(task: str, unit: str) -> Iterator[Progress]:
-    rate, printed_tenth, printed_s = _Rate(unit), 0, 0.0
+def _lines(task: str, pace: _Pace) -> Iterator[Progress]:
+    printed_tenth, printed_s = 0, 0.0
 
     def report(stage: str, done: int, total: int) -> None:
         nonlocal printed_tenth, printed_s
-        rate.update(done)
-        tenth, elapsed_s = 10 * done // max(total, 1), rate.elapsed_s
-        is_due = tenth > printed_tenth and elapsed_s > printed_s + _LINE_INTERVAL_S
+        if pace.update(stage, done):
+            printed_tenth = 0
+        tenth, now_s = 10 * done // max(total, 1), time.perf_counter()
+        is_due = tenth > printed_tenth and now_s > max(printed_s, pace.begun_s) + _LINE_INTERVAL_S
         is_last = done == total > 0 and printed_tenth < 10
         if is_due or is_last:
-            printed_tenth, printed_s = tenth, elapsed_s
-            words = [f"{done}/{total} {unit} ({100 * done // total} %)", str(rate)]
-            words += [f"{rate.seconds_for(total - done):.0f} s left", *([stage] if stage else [])]
+            printed_tenth, printed_s = tenth, now_s
+            words = [f"{done}/{total} {pace.unit} ({100 * done // total} %)", str(pace)]
+            words += [f"{pace.seconds_for(total - done):.0f} s left", *([stage] if stage else [])]
             print_message(f"{task}: {', '.join(words)}", "none")
 
     yield report
 
 
-class _Rate:
-    """Units of work per second, counted from the first report: work that was resumed does not count as fast."""
+class _Pace:
+    """Units of work per second, counted from a stage's first report: work that was resumed does not count as fast."""
 
-    def __init__(self, unit: str) -> None:
-        self._unit, self._start_s = unit, time.perf_counter()
+    def __init__(self, unit: str, units: Mapping[str, str]) -> None:
+        self._usual, self._units, self.unit = unit, units, unit
+        self.begun_s = self._reported_s = time.perf_counter()
         self._done_before: int | None = None
-        self._per_s = 0.0
+        self._done, self._per_s = 0, 0.0
 
     def __str__(self) -> str:
-        return f"{self._per_s:.1f} {self._unit}/s"
+        return f"{self._per_s:.1f} {self.unit}/s"
 
-    @property
-    def elapsed_s(self) -> float:
-        return max(time.perf_counter() - self._start_s, 1e-9)
-
-    def update(self, done: int) -> None:
+    def update(self, stage: str, done: int) -> bool:
+        """Take a report; return whether it begins a further stage: the count falls, or something else is counted."""
+        unit = self._units.get(stage, self._usual)
+        is_next = done < self._done or (unit != self.unit and self._done > 0)
+        if is_next:
+            self.begun_s, self._done_before = self._reported_s, None
         if self._done_before is None:
             self._done_before = max(done - 1, 0)
-        self._per_s = (done - self._done_before) / self.elapsed_s
+        self.unit, self._done, self._reported_s = unit, done, time.perf_counter()
+        self._per_s = (done - self._done_before) / max(self._reported_s - self.begun_s, 1e-9)
+        return is_next
 
     def seconds_for(self, units: int) -> float:
         return units / max(self._per_s, 1e-9)

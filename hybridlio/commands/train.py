@@ -11,8 +11,9 @@ import typer
 
 from hybridlio.commands import common
 from hybridlio.commands.common import INTERRUPTED, guarded
+from hybridlio.commands.shared import completion
+from hybridlio.commands.shared.training_process import Device, first_process_progress, is_first_process
 from hybridlio.commands.terminal import print_message, print_result
-from hybridlio.commands.training_process import Device, first_process_progress, is_first_process
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.lidar_models import LIDAR_MODELS
 from hybridlio.datasets.rosbag.choices import NO_CHOICE, BagTopics
@@ -41,12 +42,17 @@ Simulate = Annotated[
 ]
 Lidar = Annotated[
     str,
-    typer.Option(metavar="NAME", help=f"The lidar of simulated drives: {', '.join(LIDAR_MODELS)}."),
+    typer.Option(
+        metavar="NAME",
+        autocompletion=completion.lidar_model,
+        help=f"The lidar of simulated drives: {', '.join(LIDAR_MODELS)}.",
+    ),
 ]
 Preset = Annotated[
     str | None,
     typer.Option(
         metavar="NAME",
+        autocompletion=completion.preset,
         help="default, paper, cho, nubert or another row of the paper's tables; default unless --init-from is given.",
     ),
 ]
@@ -63,6 +69,7 @@ InitialPose = Annotated[
     typer.Option(
         "--initial-pose",
         metavar="NAME",
+        autocompletion=completion.initial_pose,
         help=f"Source of the network's initial poses: {', '.join(INITIAL_POSE_SOURCES)}.",
     ),
 ]
@@ -72,7 +79,11 @@ Validate = Annotated[
 ]
 Split = Annotated[
     str | None,
-    typer.Option(metavar="NAME", help="Split of KITTI odometry, easy or hard; validates on its test sequences."),
+    typer.Option(
+        metavar="NAME",
+        autocompletion=completion.split,
+        help="Split of KITTI odometry, easy or hard; validates on its test sequences.",
+    ),
 ]
 Out = Annotated[
     Path | None, typer.Option("-o", "--out", metavar="DIR", help="The run's folder; default training/<preset>.")

@@ -11,6 +11,7 @@ import typer
 
 from hybridlio.commands import common
 from hybridlio.commands.common import guarded
+from hybridlio.commands.shared import completion
 from hybridlio.commands.terminal import print_result, print_warning, progress
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.tables import counted
@@ -21,7 +22,10 @@ if TYPE_CHECKING:
     from hybridlio.mapping.build import MapTiles
 
 
-Run = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder, smoothed or not.", show_default=False)]
+Run = Annotated[
+    Path,
+    typer.Argument(metavar="RUN", help="A run folder; the smoothed poses are used if it has them.", show_default=False),
+]
 Out = Annotated[
     Path,
     typer.Option(
@@ -42,7 +46,12 @@ Poses = Annotated[
 Voxel = Annotated[float, typer.Option("--voxel", metavar="M", help="Distance between the map's points.")]
 MinRange = Annotated[float, typer.Option("--min-range", metavar="M", help="Leave out points nearer to the lidar.")]
 MaxRange = Annotated[float, typer.Option("--max-range", metavar="M", help="Leave out points farther from the lidar.")]
-Colour = Annotated[str, typer.Option("--color", "--colour", metavar="NAME", help="height, intensity, time or none.")]
+Colour = Annotated[
+    str,
+    typer.Option(
+        "--color", "--colour", metavar="NAME", autocompletion=completion.colour, help="height, intensity, time or none."
+    ),
+]
 KeepMoving = Annotated[
     bool, typer.Option("--keep-moving", help="Keep the points of moving objects, which are removed by default.")
 ]
@@ -50,7 +59,10 @@ Normals = Annotated[bool, typer.Option("--normals/--no-normals", help="Estimate 
 Tiles = Annotated[
     str | None,
     typer.Option(
-        "--tiles", metavar="FORMAT", help="Write a folder of tiles of 50 m, such as `--tiles laz`, for large areas."
+        "--tiles",
+        metavar="FORMAT",
+        autocompletion=completion.map_format,
+        help="Write a folder of tiles of 50 m, such as `--tiles laz`, for large areas.",
     ),
 ]
 Mesh = Annotated[bool, typer.Option("--mesh", help="Write a triangle mesh; for small areas.")]
@@ -82,6 +94,7 @@ def map_(
     from hybridlio.mapping.build import map_tiles
     from hybridlio.mapping.settings import MapSettings
     from hybridlio.runs.results.map_source import open_map_source
+    from hybridlio.runs.whole_folder import held
 
     settings = MapSettings(voxel, min_range, max_range, remove_moving=not keep_moving, normals=normals or mesh)
     output = _Output(out, colour, None if tiles is None else f".{tiles.lstrip('.')}", mesh)
@@ -91,11 +104,12 @@ def map_(
         source = source.georeferenced()
     part = source.part(frames)
     with (
-        progress("map") as report,
+        held(out.expanduser()),  # no second writer
+        progress("map", units={"tiles": "tiles"}) as report,
         map_tiles(part.sequence, part.trajectory, settings, skip=part.skip, progress=report) as built,
     ):
         made = output.write(built, voxel, source.origin, report)
-    print_result(f"{source.name}: {counted(built.scans, 'scan')}, {made}")
+    print_result(f"{source.name}: {counted(built.scans, 'scan')} by the poses of {source.poses_from}, {made}")
     if built.left_out:
         print_warning(f"{counted(built.left_out, 'scan')} left out: without a pose, bridged or unreadable")
     if georeference and source.origin is None:

@@ -13,7 +13,7 @@ from hybridlio.datasets.registry import open_sequence, reopen
 from hybridlio.datasets.sequence import Sequence, frame_range
 from hybridlio.datasets.source import Source
 from hybridlio.record.record import Record
-from hybridlio.runs.folder import RECORD, StoredRun, is_run_folder, read_run
+from hybridlio.runs.folder import RECORD, SMOOTHED, StoredRun, is_run_folder, read_run
 from hybridlio.smoothing.georeference import georeference
 
 _UNSUPPORTED = ("bridged", "rejected")  # lists of frames in metrics.json whose poses no scan supports
@@ -26,6 +26,7 @@ class MapSource:
     Attributes:
         sequence: the recording.
         trajectory: lidar poses ``T_world_lidar``.
+        poses_from: the run folder or the file that they come from.
         skip: frames whose pose is not supported by their scan; left out of a map.
         folder: the run folder, or None for poses from a file.
         origin: of the world frame on Earth, once georeferenced; then the frame is east-north-up.
@@ -33,6 +34,7 @@ class MapSource:
 
     sequence: Sequence
     trajectory: Trajectory
+    poses_from: Path
     skip: frozenset[int] = frozenset()
     folder: Path | None = None
     origin: GeodeticPoint | None = None
@@ -74,7 +76,8 @@ def open_map_source(run: Path, data: Path | None = None, poses: Path | None = No
     """Open the recording and the poses for a map.
 
     Args:
-        run: a run folder, smoothed or not; with ``poses`` it may be the recording itself.
+        run: a run folder; of one that was smoothed in place, the smoothed poses are used. With ``poses`` it may be the
+            recording itself.
         data: the recording, if it is not where the run found it.
         poses: a file of lidar poses (TUM or KITTI format) that replace the run's.
 
@@ -82,14 +85,17 @@ def open_map_source(run: Path, data: Path | None = None, poses: Path | None = No
         ConfigError: the run does not say where its recording is, and ``data`` is not given.
         DataError: run, recording or poses cannot be read.
     """
+    if poses is None and is_run_folder(run / SMOOTHED):
+        run = run / SMOOTHED
     stored = read_run(run) if poses is None or is_run_folder(run) else None
     sequence = _sequence(run, data, stored)
     if poses is not None:
         camera = sequence.calibration.T_camera_lidar if sequence.pose_file_frame == "camera" else None
-        return MapSource(sequence, read_trajectory(poses, sequence.stamps_ns, camera), folder=run if stored else None)
+        trajectory = read_trajectory(poses, sequence.stamps_ns, camera)
+        return MapSource(sequence, trajectory, poses, folder=run if stored else None)
     assert stored is not None
     skip = frozenset(int(k) for name in _UNSUPPORTED for k in stored.metrics.get(name, ()))
-    return MapSource(sequence, stored.trajectory, skip, run)
+    return MapSource(sequence, stored.trajectory, run, skip, run)
 
 
 def _sequence(run: Path, data: Path | None, stored: StoredRun | None) -> Sequence:

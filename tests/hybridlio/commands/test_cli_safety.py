@@ -103,8 +103,10 @@ def test_a_simulation_is_not_written_into_a_run(finished_run, tmp_path):
 
 def test_a_second_writer_is_refused(recording, finished_run, tmp_path):
     folder = shutil.copytree(finished_run, tmp_path / "run")
-    other_folders = [tmp_path / name for name in ("comparison", "batch", "training", "table", "town/drive-0001")]
-    compared, batched, trained, table, drive = other_folders
+    other_folders = [
+        tmp_path / name for name in ("comparison", "batch", "training", "table", "town/drive-0001", "map.ply")
+    ]
+    compared, batched, trained, table, drive, cloud = other_folders
     code = """import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -124,6 +126,7 @@ with ExitStack() as stack:
         ("train", recording, "-o", trained),
         ("ablate", recording, "--table", 1, "--test", recording, "-o", table),
         ("simulate", drive.parent, "--seconds", 1),
+        ("map", folder, "-o", cloud, "--voxel", 1),
     )
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=Path(__file__).parents[3]) as other:
         other.stdout.read(1)

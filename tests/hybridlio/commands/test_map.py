@@ -52,6 +52,16 @@ def test_tiles_are_listed_with_their_extents(whole: np.ndarray, finished_run: Pa
     assert sum(map(len, read.values())) == len(whole)
 
 
+def test_the_smoothed_poses_of_a_run_are_used_and_named(finished_run: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(finished_run, tmp_path / "run")
+    out = ("-o", tmp_path / "map.ply", *COARSE)
+    assert f"by the poses of {run}, " in ok("map", run, *out)
+    ok("smooth", run)
+    assert f"by the poses of {run / 'smoothed'}, " in ok("map", run, *out)
+    online = run / "poses_tum.txt"
+    assert f"by the poses of {online}, " in ok("map", run, "--poses", online, *out)
+
+
 def test_a_mesh_is_written(finished_run: Path, tmp_path: Path) -> None:
     assert "triangles" in ok("map", finished_run, "-o", tmp_path / "mesh.ply", "--mesh", *COARSE)
 

@@ -1,11 +1,11 @@
-"""Control characters in names and files do not reach the terminal."""
+"""What reaches the terminal: no control characters of names and files, and progress that says what it counts."""
 
 from __future__ import annotations
 
 import pytest
 from command_line import refused
 
-from hybridlio.commands.terminal import print_message, print_result, print_table
+from hybridlio.commands.terminal import print_message, print_result, print_table, progress
 from hybridlio.core.errors import strip_control
 from hybridlio.core.tables import for_terminal
 
@@ -32,3 +32,17 @@ def test_an_error_about_a_path_with_control_characters_is_one_clean_line() -> No
     for path in ("/a\x1b[2J" + "x" * 5000, "~nobody-of-this-name/a"):
         assert "\x1b" not in refused(2, "odometry", path)
         assert "\x1b" not in refused(2, "odometry", "/gone", "-o", path)
+
+
+def test_progress_says_what_each_stage_counts_and_begins_anew_with_it(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress("map", units={"tiles": "tiles"}) as report:
+        for stage, total in (("scans added", 30), ("scans compared", 20), ("tiles", 40)):
+            for done in range(1, total + 1):
+                report(stage, done, total)
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.partition(" (100 %)")[0] for line in lines] == [
+        "map: 30/30 scans",
+        "map: 20/20 scans",
+        "map: 40/40 tiles",
+    ]
+    assert "tiles/s" in lines[-1]

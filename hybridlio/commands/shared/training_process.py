@@ -9,10 +9,16 @@ from typing import Annotated
 
 import typer
 
+from hybridlio.commands.shared import completion
 from hybridlio.commands.terminal import progress
 from hybridlio.core.progress import Progress
 
-Device = Annotated[str, typer.Option(metavar="NAME", help="cpu, cuda, …; auto uses a GPU if there is one.")]
+Device = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME", autocompletion=completion.device, help="cpu, cuda, …; auto uses a GPU if there is one."
+    ),
+]
 
 
 def is_first_process() -> bool:

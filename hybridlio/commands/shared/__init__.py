@@ -1,0 +1,1 @@
+"""What several commands share: names that shells complete, and options of GPS and of training."""
