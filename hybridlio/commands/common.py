@@ -70,7 +70,7 @@ ReaderName = Annotated[
         metavar="NAME",
         autocompletion=completion.reader,
         help="kitti-raw, kitti-odometry, folder, rosbag, ouster, velodyne, or a data set: kitti-360, nuscenes, nclt, "
-        "mulran, helipr, boreas, newer-college, argoverse-2, apollo; by default detected from the files.",
+        "mulran, helipr, boreas, newer-college, argoverse-2, apollo, tum-rgbd; by default detected from the files.",
     ),
 ]
 RawRoot = Annotated[

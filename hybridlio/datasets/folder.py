@@ -4,8 +4,8 @@ recording/
     scans/*                      of one kind, see `points.point_files`; also in lidar/, points/, velodyne/, data/,
                                  or directly in recording/
     timestamps.txt or times.txt  one stamp per scan, see `stamps.read_stamps`
-    imu.csv                      optional, see `imu_csv`
-    calibration.yaml             needed with imu.csv, see `calibration_yaml`
+    imu.csv                      optional, see `imu_csv`; also imu0/data.csv and mav0/imu0/data.csv, as of EuRoC
+    calibration.yaml             needed with an IMU, see `calibration_yaml`
     poses_tum.txt                optional reference: lidar poses on the scans' clock, TUM format
     gps.csv                      optional, see `gps_csv`
 """
@@ -43,6 +43,7 @@ from hybridlio.datasets.stamps import (
 LAYOUT = f"a folder with timestamps.txt, and scans in it or in scans/ ({', '.join(SUFFIXES)})"
 
 _SCAN_FOLDERS = ("scans", "lidar", "points", "velodyne", "data", ".")  # the folder itself last: a map may be in it
+_IMU_FILES = ("imu.csv", "imu0/data.csv", "mav0/imu0/data.csv")  # the latter as EuRoC and TUM-VI name them
 _STAMP_FILES = ("timestamps.txt", "times.txt")
 
 
@@ -79,7 +80,8 @@ def open_folder(
     del raw_root
     folder = folder.resolve()
     notes = Notes(folder.name)
-    imu = read_imu_csv(folder / "imu.csv", notes) if (folder / "imu.csv").is_file() else ImuSamples.empty()
+    imu_file = next((folder / name for name in _IMU_FILES if (folder / name).is_file()), None)
+    imu = read_imu_csv(imu_file, notes) if imu_file else ImuSamples.empty()
     stated = read_calibration_yaml(folder / "calibration.yaml", needs_imu=len(imu) > 0)
     stamps, paths = _stamped(folder, _scan_files(folder), stated.rate_hz if rate_hz is None else rate_hz, notes)
     if len(imu):

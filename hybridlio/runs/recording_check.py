@@ -87,9 +87,9 @@ def compare_imu(sequence: Sequence, progress: Progress | None = None) -> ImuChec
         if (check is not None and check.wrong and stretches > 1) or stretches == recording.stretches:
             break
         stretches += 1
-    if check is None or check.offset is None or not recording.are_distorted or compensation.agrees(check.offset):
+    if check is None or check.offset is None or not recording.are_distorted:
         return check
-    return recording.check(recording.paths(stretches, compensation.imu), compensation.error_s(check.offset))
+    return recording.check(recording.paths(stretches, compensation.imu), compensation.more_sigma_s(check.offset))
 
 
 class _Loaded:

@@ -12,6 +12,7 @@ from hybridlio.datasets.published import (
     nclt,
     newer_college,
     nuscenes,
+    tum_rgbd,
 )
 from hybridlio.datasets.published.recording import Layout
 
@@ -25,4 +26,5 @@ PUBLISHED: dict[str, Layout] = {
     "newer-college": newer_college.LAYOUT,
     "argoverse-2": argoverse2.LAYOUT,
     "apollo": apollo.LAYOUT,
+    "tum-rgbd": tum_rgbd.LAYOUT,
 }

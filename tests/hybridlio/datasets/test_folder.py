@@ -173,6 +173,12 @@ class TestInertialData:
         assert len(sequence.imu) == 0
         assert any("no inertial data" in note for note in sequence.notes)
 
+    def test_the_imu_may_stand_where_euroc_has_it(self, folder: Path) -> None:
+        expected = open_sequence(folder).imu
+        (folder / "mav0/imu0").mkdir(parents=True)
+        (folder / "imu.csv").rename(folder / "mav0/imu0/data.csv")
+        np.testing.assert_array_equal(open_sequence(folder).imu.gyro_rad_s, expected.gyro_rad_s)
+
 
 class TestCalibration:
     def test_imu_data_without_extrinsics_raise_an_error_that_says_what_to_write(self, folder: Path) -> None:
