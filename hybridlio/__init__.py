@@ -22,6 +22,7 @@ Estimation:
 
 Results:
     build_map          map of a run: its scans as one cloud, without moving objects; MapSettings has the settings
+    export_mcap        write a run as an MCAP file for Foxglove
     view               show a run in the Rerun viewer, or write a file for it
     Trajectory         stamped lidar poses with covariances
     evaluate           drift, ATE, RPE and consistency against a reference
@@ -62,6 +63,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time each name l
     from hybridlio.runs.recordings import Recording, find_recordings
     from hybridlio.simulation.config import SimulationConfig
     from hybridlio.simulation.simulate import simulate
+    from hybridlio.viewing.mcap_export import export_mcap
     from hybridlio.viewing.view import view
 
 __all__ = [
@@ -89,6 +91,7 @@ __all__ = [
     "build_map",
     "check_recording",
     "evaluate",
+    "export_mcap",
     "find_recordings",
     "load_config",
     "localize",
@@ -121,6 +124,7 @@ _HOMES = {
     "runs.recordings": ("Recording", "find_recordings"),
     "simulation.config": ("SimulationConfig",),
     "simulation.simulate": ("simulate",),
+    "viewing.mcap_export": ("export_mcap",),
     "viewing.view": ("view",),
 }
 _HOME_OF = {name: f"hybridlio.{module}" for module, names in _HOMES.items() for name in names}

@@ -12,6 +12,7 @@ from hybridlio.commands.common import Verbose
 from hybridlio.commands.compare import compare
 from hybridlio.commands.config import config
 from hybridlio.commands.evaluate import evaluate
+from hybridlio.commands.export import export
 from hybridlio.commands.georeference import georeference
 from hybridlio.commands.info import info
 from hybridlio.commands.maps.localize import localize
@@ -63,6 +64,7 @@ for _command in (
     ablate,
     config,
     view,
+    export,
     optimize,
     localize,
 ):
