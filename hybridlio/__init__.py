@@ -18,6 +18,7 @@ Estimation:
     Estimate           the result of a step: pose, covariance and what they were computed from
     smooth             smooth a finished run (odometry.record()) over its whole length, with loops and GPS
     localize           where a recording is in a prior map: a run folder or a map file
+    merge              join the records of several runs by the places that they share, into one world
     run_batch          run many Recordings in parallel; BatchOptions has the settings, Batch the results
 
 Results:
@@ -51,6 +52,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time each name l
     from hybridlio.evaluation.evaluate import evaluate
     from hybridlio.graph.run.smooth import smooth
     from hybridlio.localization.localize import localize
+    from hybridlio.localization.merge import merge
     from hybridlio.mapping.build import build_map
     from hybridlio.mapping.settings import MapSettings
     from hybridlio.odometry.config import Config, load_config
@@ -95,6 +97,7 @@ __all__ = [
     "find_recordings",
     "load_config",
     "localize",
+    "merge",
     "open_sequence",
     "run_batch",
     "simulate",
@@ -112,6 +115,7 @@ _HOMES = {
     "evaluation.evaluate": ("evaluate",),
     "graph.run.smooth": ("smooth",),
     "localization.localize": ("localize",),
+    "localization.merge": ("merge",),
     "mapping.build": ("build_map",),
     "mapping.settings": ("MapSettings",),
     "odometry.config": ("Config", "load_config"),

@@ -17,6 +17,7 @@ from hybridlio.commands.georeference import georeference
 from hybridlio.commands.info import info
 from hybridlio.commands.maps.localize import localize
 from hybridlio.commands.maps.map import map_
+from hybridlio.commands.maps.merge import merge
 from hybridlio.commands.odometry import odometry
 from hybridlio.commands.optimize import optimize
 from hybridlio.commands.report import report
@@ -67,6 +68,7 @@ for _command in (
     export,
     optimize,
     localize,
+    merge,
 ):
     app.command()(_command)
 app.command("map")(map_)

@@ -13,16 +13,13 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.files import UNREADABLE_NPZ, user_path
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.points.point_files import SUFFIXES, read_columns
-from hybridlio.localization.map_places import MapPlaces
 from hybridlio.localization.map_surface import MapSurface
 from hybridlio.localization.prior_map import PriorMap
+from hybridlio.localization.run_places import RunPlaces
 from hybridlio.record.loop_keyframes import LoopKeyframes
 from hybridlio.record.record import Record
 from hybridlio.runs.folder import KEYFRAMES, RECORD, is_run_folder, read_run
-from hybridlio.smoothing.loop_closure import keyframes_of, up_of
-from hybridlio.smoothing.loop_verification import VerificationSettings
-from hybridlio.smoothing.places import KeyframePlaces
-from hybridlio.smoothing.step_uncertainty import OdometryChain
+from hybridlio.smoothing.loop_closure import up_of
 
 
 def open_prior_map(path: str | Path) -> PriorMap:
@@ -48,31 +45,26 @@ def map_of_run(folder: Path) -> PriorMap:
     """
     if not is_run_folder(folder):
         raise DataError(f"{folder}: not a run folder; give one written by `hybridlio odometry`, or a file of points")
+    return map_of_record(*read_record(folder))
+
+
+def read_record(folder: Path) -> tuple[Record, Trajectory]:
+    """Return the record of a run folder with its keyframes, and the folder's poses, which may be smoothed.
+
+    Raises:
+        DataError: a file is missing or malformed.
+    """
     trajectory = read_run(folder).trajectory
     home = folder if (folder / RECORD).is_file() else folder.parent  # a smoothed run lies inside its run
-    record = replace(Record.load(home / RECORD), keyframes=LoopKeyframes.load(home / KEYFRAMES))
-    return map_of_record(record, trajectory)
+    return replace(Record.load(home / RECORD), keyframes=LoopKeyframes.load(home / KEYFRAMES)), trajectory
 
 
 def map_of_record(record: Record, trajectory: Trajectory | None = None) -> PriorMap:
-    """Return the map of a run from its record.
-
-    Args:
-        record: of the run, with keyframes.
-        trajectory: its poses, such as smoothed ones; by default those of the record.
-
-    Raises:
-        DataError: the record has no keyframes, or the trajectory other scans.
-    """
-    keyframes = keyframes_of(record)
-    trajectory = trajectory or record.online
-    if not np.array_equal(trajectory.stamps_ns, record.online.stamps_ns):
-        raise DataError("the trajectory does not belong to this run: its stamps are others")
-    poses = trajectory.poses[keyframes.rows]
-    chain = OdometryChain(trajectory, record.relative)
-    places = KeyframePlaces(keyframes, chain, up_of(record), VerificationSettings().reach_m)
-    points = [se3.transform(pose, keyframes.points(k)) for k, pose in enumerate(poses)]
-    return PriorMap(MapSurface(np.concatenate(points)), MapPlaces(places, poses), up_of(record))
+    """Return the map of a run from its record; see :meth:`RunPlaces.of`."""
+    run = RunPlaces.of(record, trajectory)
+    keyframes = run.keyframes
+    points = [se3.transform(pose, keyframes.points(k)) for k, pose in enumerate(run.map_places.poses)]
+    return PriorMap(MapSurface(np.concatenate(points)), run.map_places, up_of(record))
 
 
 def _points(path: Path) -> Array:

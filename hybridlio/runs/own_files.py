@@ -9,7 +9,7 @@ from typing import Any
 
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.files import remove_leftovers
-from hybridlio.runs.folder import FILES, JOB, LOG, METRICS, RECORD, SMOOTHED, is_own_file
+from hybridlio.runs.folder import FILES, GRAPH, JOB, LOG, METRICS, RECORD, SMOOTHED, is_own_file
 from hybridlio.runs.whole_folder import JOURNAL
 
 
@@ -59,6 +59,7 @@ RUN = OwnFiles((*FILES, SMOOTHED), METRICS, frozenset({"hybridlio", "sequence"})
 BATCH_JOB = OwnFiles((JOB, LOG), JOB, frozenset({"recording", "settings"}))
 BATCH = OwnFiles(("batch.json", "batch.md"), "batch.json", frozenset({"summary", "recordings"}))
 COMPARISON = OwnFiles(("compare.json", "compare.md"), "compare.json", frozenset({"sequence", "scans", "rows"}))
+MERGE = OwnFiles(("merge.json", GRAPH), "merge.json", frozenset({"runs", "pairs", "unjoined"}))
 TRAINING = OwnFiles(
     ("recipe.json", "checkpoint.pt", "weights.safetensors", "best.safetensors", "log.jsonl"),
     "recipe.json",

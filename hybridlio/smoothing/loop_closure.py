@@ -23,6 +23,7 @@ from hybridlio.smoothing.loop_candidates import Candidate, CandidateFinder, Cand
 from hybridlio.smoothing.loop_consistency import (
     ConsistencySettings,
     LoopArrays,
+    TravelledOdometry,
     largest_consistent_set,
     odometry_chi2,
     pairwise_chi2,
@@ -101,18 +102,27 @@ def select_consistent(
         if x > bound
     ]
     left = [one for one, x in zip(verified, chi2, strict=True) if x <= bound]
-    if not left:
-        return (), tuple(rejected)
-    arrays = _arrays(left)
+    kept, others = mutually_consistent(left, chain, settings)
+    return kept, (*rejected, *others)
+
+
+def mutually_consistent(
+    loops: list[Loop], chain: TravelledOdometry, settings: ConsistencySettings
+) -> tuple[tuple[Loop, ...], tuple[RejectedLoop, ...]]:
+    """Return the largest set of loops, each supported by another nearby, that agree; and the others with the reason."""
+    if not loops:
+        return (), ()
+    arrays, bound = _arrays(loops), chi_square_quantile(settings.inlier_share, 6)
     agree = pairwise_chi2(arrays, chain, settings.odometry_scale) <= bound
     has_support = supported(arrays, agree, chain.travelled_m, settings)
-    kept = np.zeros(len(left), bool)
+    kept = np.zeros(len(loops), bool)
     kept[has_support] = largest_consistent_set(agree[np.ix_(has_support, has_support)])
-    for one, is_supported, is_kept in zip(left, has_support, kept, strict=True):
-        if not is_kept:
-            why = "contradicts other loops" if is_supported else "no other loop nearby agrees"
-            rejected.append(_inconsistent(one, why))
-    return tuple(one for one, is_kept in zip(left, kept, strict=True) if is_kept), tuple(rejected)
+    rejected = [
+        _inconsistent(one, "contradicts other loops" if is_supported else "no other loop nearby agrees")
+        for one, is_supported, is_kept in zip(loops, has_support, kept, strict=True)
+        if not is_kept
+    ]
+    return tuple(one for one, is_kept in zip(loops, kept, strict=True) if is_kept), tuple(rejected)
 
 
 def keyframes_of(record: Record) -> LoopKeyframes:

@@ -78,6 +78,15 @@ class Odometry(Protocol):
         ...
 
 
+class TravelledOdometry(Odometry, Protocol):
+    """Odometry that also knows distances along the path."""
+
+    @property
+    def travelled_m(self) -> Array:
+        """``(N,)`` distance travelled to each row."""
+        ...
+
+
 def odometry_chi2(loops: LoopArrays, chain: OdometryChain, scale: float) -> Array:
     """Return χ² ``(M,)`` of the difference between each loop and odometry, with odometry's covariances scaled."""
     predicted = chain.relative(loops.earlier, loops.later)
@@ -85,7 +94,7 @@ def odometry_chi2(loops: LoopArrays, chain: OdometryChain, scale: float) -> Arra
     return _chi2(se3.log(se3.between(predicted, loops.poses)), covariance)
 
 
-def pairwise_chi2(loops: LoopArrays, chain: OdometryChain, scale: float) -> Array:
+def pairwise_chi2(loops: LoopArrays, chain: Odometry, scale: float) -> Array:
     """Return χ² ``(M, M)`` of the cycle of each pair of loops, symmetric, with odometry's covariances scaled."""
     out = np.zeros((len(loops.earlier), len(loops.earlier)))
     for a in range(len(out) - 1):

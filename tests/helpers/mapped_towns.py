@@ -12,6 +12,8 @@ from hybridlio.core.estimates import RelativePose
 from hybridlio.core.sensors import Calibration, ImuNoise, ImuSamples, Scan
 from hybridlio.core.start_state import start_state
 from hybridlio.core.trajectory import Trajectory
+from hybridlio.localization.localizer import MapPose
+from hybridlio.localization.prior_map import PriorMap
 from hybridlio.record.loop_keyframes import LoopKeyframeSelector, LoopKeyframeSettings
 from hybridlio.record.record import Record
 from hybridlio.simulation import SimulationConfig
@@ -37,6 +39,7 @@ class TownDrive:
 
     config: SimulationConfig
     plan: Drive
+    first: int  # the scan of the plan at which it begins
     truth: np.ndarray
     steps: tuple[RelativePose, ...]
     poses: np.ndarray
@@ -54,8 +57,15 @@ class TownDrive:
         """Yield rows and scans."""
         pattern = ray_pattern(self.config.lidar_model)
         for k in range(first, len(self.truth), every):
-            scan = scan_at(self.plan, k, pattern, self.config)
+            scan = scan_at(self.plan, self.first + k, pattern, self.config)
             yield k, Scan(int(self.stamps_ns[k]), scan.points)
+
+    def part(self, first: int, last: int | None = None) -> TownDrive:
+        """Return the drive of some of the scans."""
+        rows = slice(first, last)
+        truth = self.truth[rows]
+        poses = se3.between(self.poses[first], self.poses[rows])
+        return TownDrive(self.config, self.plan, self.first + first, truth, self.steps[first:][: len(truth) - 1], poses)
 
     def record(self, max_range_m: float = 80.0) -> Record:
         """Return the run with its keyframes."""
@@ -73,6 +83,24 @@ class TownDrive:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class MappedTown:
+    """The drive that made the map, its record, and the map."""
+
+    drive: TownDrive
+    record: Record
+    prior: PriorMap
+
+    def true_pose(self, T_town_lidar: np.ndarray) -> np.ndarray:
+        """Pose of a lidar in the map: relative to the nearest pose of the drive that made it."""
+        near = np.linalg.norm(self.drive.truth[:, :3, 3] - T_town_lidar[:3, 3], axis=1).argmin()
+        return np.asarray(self.drive.poses[near] @ se3.between(self.drive.truth[near], T_town_lidar))
+
+    def errors(self, drive: TownDrive, poses: dict[int, MapPose]) -> np.ndarray:
+        """Errors ``(N, 6)`` of poses by row."""
+        return np.array([se3.log(se3.between(one.at.pose, self.true_pose(drive.truth[k]))) for k, one in poses.items()])
+
+
 def town_drive(seed: int, drive_seed: int | None = None, length_m: float = 120.0, lidar: str = "16-beam") -> TownDrive:
     """Return a drive of some length at 10 scans per second and about 10 m/s."""
     config = SimulationConfig(seed=seed, drive_seed=drive_seed, length_m=length_m, lidar=lidar)
@@ -84,4 +112,4 @@ def town_drive(seed: int, drive_seed: int | None = None, length_m: float = 120.0
     poses = [np.eye(4)]
     for step in steps:
         poses.append(poses[-1] @ step.pose)
-    return TownDrive(config, drive, truth, steps, se3.orthonormalise(np.array(poses)))
+    return TownDrive(config, drive, 0, truth, steps, se3.orthonormalise(np.array(poses)))

@@ -2,38 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-import pytest
-from mapped_towns import TownDrive, town_drive
+from mapped_towns import MappedTown, TownDrive
 
 from hybridlio.core import se3
 from hybridlio.evaluation.consistency import pose_consistency
 from hybridlio.localization.fusion import UncertainPose
 from hybridlio.localization.localizer import LocalizationSettings, Localizer, MapPose
 from hybridlio.localization.map_surface import MapSurface
-from hybridlio.localization.open_map import map_of_record
 from hybridlio.localization.prior_map import PriorMap
 from hybridlio.localization.start import start_pose
 from hybridlio.sources.settings import ScanMatchingSettings
-
-
-@dataclass(frozen=True, eq=False)
-class MappedTown:
-    """The drive that made the map, and the map."""
-
-    drive: TownDrive
-    prior: PriorMap
-
-    def true_pose(self, T_town_lidar: np.ndarray) -> np.ndarray:
-        """Pose of a lidar in the map: relative to the nearest pose of the drive that made it."""
-        near = np.linalg.norm(self.drive.truth[:, :3, 3] - T_town_lidar[:3, 3], axis=1).argmin()
-        return np.asarray(self.drive.poses[near] @ se3.between(self.drive.truth[near], T_town_lidar))
-
-    def errors(self, drive: TownDrive, poses: dict[int, MapPose]) -> np.ndarray:
-        """Errors ``(N, 6)`` of poses by row."""
-        return np.array([se3.log(se3.between(one.at.pose, self.true_pose(drive.truth[k]))) for k, one in poses.items()])
 
 
 def follow(
@@ -53,17 +34,6 @@ def follow(
     return out
 
 
-@pytest.fixture(scope="module")
-def town() -> MappedTown:
-    drive = town_drive(9601)
-    return MappedTown(drive, map_of_record(drive.record()))
-
-
-@pytest.fixture(scope="module")
-def again() -> TownDrive:
-    return town_drive(9601, 9701)
-
-
 def test_a_second_drive_is_found_and_followed_within_centimetres(town: MappedTown, again: TownDrive):
     poses = follow(Localizer(town.prior), again)
     assert min(poses) < 50  # five seconds
@@ -75,8 +45,8 @@ def test_a_second_drive_is_found_and_followed_within_centimetres(town: MappedTow
     assert 0.1 < found.rotation.value < 3.0
 
 
-def test_another_town_is_never_taken_for_the_mapped_one(town: MappedTown):
-    assert follow(Localizer(town.prior), town_drive(9602), every=2) == {}
+def test_another_town_is_never_taken_for_the_mapped_one(town: MappedTown, elsewhere: TownDrive):
+    assert follow(Localizer(town.prior), elsewhere, every=2) == {}
 
 
 def test_a_given_start_metres_and_degrees_off_holds_at_the_first_scan(town: MappedTown, again: TownDrive):
