@@ -8,6 +8,7 @@ Estimate the trajectory of a recording (KITTI, or a folder of scans):
 
 Recordings:
     open_sequence      open a recording; find_recordings finds those below a folder
+    calibrate          find its extrinsics and clocks, with standard deviations
     check_recording    compare its IMU with its scans: clocks, units and mounting, corrected or named
     Sequence           a recording: one Frame per scan, with its Scan, ImuSamples and GpsFix objects
     simulate           simulate a drive as KITTI raw data; SimulationConfig has its settings
@@ -61,6 +62,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time each name l
     from hybridlio.odometry.stream import OdometryStream
     from hybridlio.runs.batch import BatchOptions, run_batch
     from hybridlio.runs.batch_table import Batch
+    from hybridlio.runs.calibrate import calibrate
     from hybridlio.runs.recording_check import check_recording
     from hybridlio.runs.recordings import Recording, find_recordings
     from hybridlio.simulation.config import SimulationConfig
@@ -91,6 +93,7 @@ __all__ = [
     "Trajectory",
     "__version__",
     "build_map",
+    "calibrate",
     "check_recording",
     "evaluate",
     "export_mcap",
@@ -124,6 +127,7 @@ _HOMES = {
     "odometry.stream": ("OdometryStream",),
     "runs.batch": ("BatchOptions", "run_batch"),
     "runs.batch_table": ("Batch",),
+    "runs.calibrate": ("calibrate",),
     "runs.recording_check": ("check_recording",),
     "runs.recordings": ("Recording", "find_recordings"),
     "simulation.config": ("SimulationConfig",),

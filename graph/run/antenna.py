@@ -7,7 +7,8 @@ import numpy as np
 from gtsam.symbol_shorthand import O
 
 from hybridlio.core.arrays import Array
-from hybridlio.graph.run.calibrated_links import SETTLED, Covariance, prior_model
+from hybridlio.graph.base import noise
+from hybridlio.graph.run.calibration_prior import SETTLED, Covariance, prior_covariance
 from hybridlio.graph.run.factor_groups import GroupFactors
 from hybridlio.smoothing.calibration import Parameter, undetermined_directions
 
@@ -35,7 +36,7 @@ class Antenna:
     def add_to(self, group: GroupFactors) -> None:
         """Add the variable and its prior."""
         if self._sigma is not None:
-            model = prior_model(self._sigma, self._held)
+            model = noise.gaussian(prior_covariance(self._sigma, self._held), "prior of the antenna")
             group.values.insert(O(0), self.position_m)
             group.trusted.append(gtsam.PriorFactorPoint3(O(0), self._stated, model))
 

@@ -14,7 +14,7 @@ calibrated: φ in the lidar's frame, t in the IMU's, δ.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -27,16 +27,13 @@ from hybridlio.core.arrays import Array, Index
 from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.sensors import NS_PER_S, ImuSamples
 from hybridlio.graph.base import noise
+from hybridlio.graph.run.calibration_prior import SETTLED, Covariance, prior_covariance
 from hybridlio.record.record import Record
 from hybridlio.smoothing.calibration import CalibrationPriors, Parameter, moved_extrinsics, undetermined_directions
 
 # of a step's covariance, where its source does not tell drift and scatter apart: then all of it is drift, and a
 # scatter this small keeps its matrix positive definite
 _NO_SCATTER = 1e-4
-_HELD = 1e-4  # of the prior's standard deviation: of directions that are held at it
-SETTLED = 0.1  # of the standard deviations, by which a round's changes no longer matter
-Covariance = Callable[[Sequence[int]], Array]  # joint marginal covariance of variables
-
 _TURN, _MOVE, _CLOCK = slice(0, 3), slice(3, 6), slice(6, 7)
 _BLOCKS = {"rotation": _TURN, "translation": _MOVE, "time_offset": _CLOCK}
 
@@ -119,7 +116,7 @@ class CalibratedLinks:
     def _prior(self) -> gtsam.noiseModel.Base:
         covariance = np.zeros((len(self._sigmas),) * 2)
         for name, rows in self._rows():
-            covariance[rows, rows] = _prior_covariance(float(self._sigmas[rows][0]), self._held[name])
+            covariance[rows, rows] = prior_covariance(float(self._sigmas[rows][0]), self._held[name])
         return noise.gaussian(covariance, "prior of the calibration")
 
     def _link(self, k: int, values: gtsam.Values, twist: Array, whitener: Array) -> Any:
@@ -141,15 +138,6 @@ class CalibratedLinks:
         unit = gtsam.noiseModel.Unit.Create(6)
         linear = make(M(k), whitener, X(k), -whitener, C(0), by_calibration, -whitener @ apart, unit)
         return gtsam.LinearContainerFactor(linear, at)
-
-
-def prior_model(sigma: float, held: Array) -> gtsam.noiseModel.Base:
-    """Return the noise of a prior of ``d`` components that holds the directions ``(u, d)``."""
-    return noise.gaussian(_prior_covariance(sigma, held), "prior of the calibration")
-
-
-def _prior_covariance(sigma: float, held: Array) -> Array:
-    return np.asarray(sigma**2 * (np.eye(held.shape[1]) - (1 - _HELD**2) * held.T @ held))
 
 
 def _on_map_path(step: RelativePose) -> RelativePose:

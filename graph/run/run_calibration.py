@@ -13,7 +13,8 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import State
 from hybridlio.graph.base.marginals import bayes_tree
 from hybridlio.graph.run.antenna import Antenna
-from hybridlio.graph.run.calibrated_links import CalibratedLinks, Covariance
+from hybridlio.graph.run.calibrated_links import CalibratedLinks
+from hybridlio.graph.run.calibration_prior import Covariance
 from hybridlio.graph.run.gps_factors import GpsGroup
 from hybridlio.graph.run.loop_factors import LoopClosures
 from hybridlio.record.record import Record

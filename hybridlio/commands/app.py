@@ -8,6 +8,7 @@ import typer
 
 from hybridlio.commands.ablate import ablate
 from hybridlio.commands.batch import batch
+from hybridlio.commands.calibrate import calibrate
 from hybridlio.commands.common import Verbose
 from hybridlio.commands.compare import compare
 from hybridlio.commands.config import config
@@ -54,6 +55,7 @@ def main(
 for _command in (
     simulate,
     info,
+    calibrate,
     odometry,
     smooth,
     georeference,

@@ -24,6 +24,7 @@ from hybridlio.datasets.transform_forms import HOW_TO_WRITE, parse_transform
 _KEYS = (
     *("T_imu_lidar", "T_camera_lidar", "lidar", "antenna_imu_m", "imu_time_offset_s", "imu_noise", "rate_hz"),
     *("columns", "point_times", "vehicle", "frames", "imu_frame", "lidar_frame"),
+    "sigmas",
 )
 _LIDAR_KEYS = ("model", "min_range_m", "max_range_m")
 _VEHICLE_KEYS = ("min", "max")
@@ -75,6 +76,7 @@ def read_calibration_yaml(path: Path, needs_imu: bool = False) -> StatedCalibrat
     * ``frames``, ``imu_frame`` and ``lidar_frame``: in place of ``T_imu_lidar``, a list of transforms between frames as
       in a TF tree, each ``parent``, ``child`` and the child's pose in the parent, and the names of the sensors' frames;
     * ``vehicle``: a box in the lidar frame, corners ``min`` and ``max`` in metres, whose points are left out;
+    * ``sigmas``: standard deviations as ``hybridlio calibrate`` writes them, for the reader's information alone;
     * ``rate_hz``: scans per second, for a folder without a file of stamps;
     * ``columns``: see :func:`hybridlio.datasets.points.bin_layout.stated_layout`;
     * ``point_times``: ``none``, or a mapping of the attributes of

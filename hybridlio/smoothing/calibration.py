@@ -7,15 +7,19 @@ this direction, and it stays at its prior.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError
+from hybridlio.core.files import write_atomically
 from hybridlio.core.sensors import Calibration
 from hybridlio.core.setting_checks import check_positive
 
@@ -28,6 +32,8 @@ _AXES = "xyz"
 _ALONG_AXIS = 0.98  # component of a unit vector that is called by the axis' name: within 11 degrees
 _UNITS = {"time_offset": (1e3, "ms"), "gps_clock": (1e3, "ms"), "rotation": (np.rad2deg(1.0), "°")}
 _METRES = (1e2, "cm")
+_SI_UNITS = {"time_offset": "s", "gps_clock": "s", "rotation": "rad"}
+_FRAMES = ("frames", "imu_frame", "lidar_frame")  # keys of calibration.yaml that T_imu_lidar takes the place of
 
 
 @dataclass(frozen=True)
@@ -170,6 +176,27 @@ class Calibrated:
     def summary(self) -> str:
         """Return the parameters' changes on one line."""
         return "; ".join(map(str, self.parameters))
+
+    def save(self, path: str | os.PathLike[str], others: Mapping[str, Any] | None = None) -> None:
+        """Write a ``calibration.yaml``, with standard deviations, for a plain folder of scans or ``hybridlio smooth``.
+
+        Args:
+            path: of the file.
+            others: keys of the recording's own file, which stay where they state something else.
+        """
+        content = {key: value for key, value in (others or {}).items() if key not in _FRAMES}
+        content["T_imu_lidar"] = self.calibration.T_imu_lidar.tolist()
+        names = {parameter.name for parameter in self.parameters}
+        if "lever_arm" in names and self.calibration.antenna_imu_m is not None:
+            content["antenna_imu_m"] = self.calibration.antenna_imu_m.tolist()
+        if "time_offset" in names:
+            content["imu_time_offset_s"] = self.imu_time_offset_s
+        content["sigmas"] = {
+            f"{one.name}_{_SI_UNITS.get(one.name, 'm')}": one.sigmas.tolist() for one in self.parameters
+        }
+        comments = "".join(f"# {doubt}\n" for doubt in self.doubts)
+        text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
+        write_atomically(Path(path), comments + text)
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content for ``metrics.json``."""

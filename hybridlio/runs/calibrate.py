@@ -1,0 +1,155 @@
+"""Calibration of a recording: extrinsics and clocks of its sensors, from the recording alone.
+
+The scans are compensated for motion by the calibration that is to be found, and a wrong one bends the path that they
+give. So odometry and smoothing with the calibration as variables are repeated, each time with the calibration of the
+last round. The error of the clocks falls to about 0.4 of itself in each (a lidar in a hand, compensated by 200 Hz
+samples), so the start matters: the check of a recording finds the clocks within a millisecond.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as Items
+from dataclasses import replace
+
+import numpy as np
+
+from hybridlio.calibration.imu_check import moved
+from hybridlio.core import se3
+from hybridlio.core.errors import DataError
+from hybridlio.core.progress import Progress
+from hybridlio.core.sensors import ImuNoise
+from hybridlio.datasets.sequence import Sequence
+from hybridlio.graph.run.smooth import smooth
+from hybridlio.odometry.config import Config
+from hybridlio.odometry.odometry import Odometry
+from hybridlio.runs.recording_check import compare_imu
+from hybridlio.runs.run import run_odometry
+from hybridlio.smoothing.calibration import OF_GPS, OF_IMU, Calibrated, CalibrationPriors, Parameter
+
+_MOST_ROUNDS = 5
+_SETTLED = 0.5  # standard deviations by which a round may still change a parameter and be the last
+_LARGEST_RATIO = 0.8  # of two rounds' changes that is extrapolated: the sum to come is then four times the last
+_CLOCK = "gps_clock"  # which is found anew in every round
+_LEAST_SCANS = 100  # ten seconds; fewer seldom determine a rotation to a degree
+
+
+def calibrate(
+    sequence: Sequence,
+    parameters: Items[str] | CalibrationPriors = OF_IMU,
+    *,
+    config: Config | None = None,
+    progress: Progress | None = None,
+) -> Calibrated:
+    """Find the calibration of a recording's sensors; turn about every axis while recording.
+
+    Args:
+        sequence: the recording, with IMU samples. Its calibration is where the search starts: extrinsics within 10° and
+            a few decimetres, clocks within 0.2 s.
+        parameters: names of :data:`hybridlio.smoothing.calibration.CALIBRATED`, or what is known of them before.
+        config: settings of the odometry.
+        progress: called with the stage, the steps done and the steps in total.
+
+    Returns:
+        The calibration, with the change of each parameter against the stated one and its covariance, which includes
+        what the last round still changed.
+
+    Raises:
+        ConfigError: an unknown parameter, or one whose sensor the recording lacks.
+        DataError: fewer than 100 scans, or samples that do not belong to the scans at all.
+    """
+    priors = parameters if isinstance(parameters, CalibrationPriors) else CalibrationPriors(parameters)
+    priors.check_sensors(has_imu=len(sequence.imu) > 0, has_gps=len(sequence.gps) > 0)
+    if len(sequence) < _LEAST_SCANS:
+        raise DataError(f"{sequence.name}: {len(sequence)} scans; calibration needs {_LEAST_SCANS} or more")
+    search = _Search(sequence, priors, config or Config(), progress or _silent)
+    search.start()
+    for number in range(1, _MOST_ROUNDS + 1):
+        if search.round(number):
+            break
+    return search.result()
+
+
+class _Search:
+    """The search, with the recording at the calibration that was found last."""
+
+    def __init__(self, sequence: Sequence, priors: CalibrationPriors, config: Config, report: Progress) -> None:
+        self._stated, self._now = sequence.calibration, sequence
+        self._priors, self._config, self._report = priors, config, report
+        self._stated_offset_s = sequence.imu_time_offset_s or 0.0  # the reader has applied it
+        self._offset_s = 0.0  # added to the stamps of the samples since
+        self._last_move_s = 0.0
+        self._found: Calibrated | None = None
+
+    def start(self) -> None:
+        """Correct units, and take the clocks' offset from the check of recordings, which costs a part of a round.
+
+        Raises:
+            DataError: the samples do not belong to the scans.
+        """
+        check = compare_imu(self._now, lambda _, done, total: self._report("comparing the IMU", done, total))
+        if check is None:
+            return
+        if check.wrong:
+            raise DataError(f"{self._now.name}: {check.wrong[0]}")
+        self._now, offset = replace(self._now, imu=check.imu), check.offset
+        if offset is not None and offset.is_significant:
+            self._offset_s = offset.offset_s  # which check.imu has
+        elif offset is not None and offset.is_determined and "time_offset" in self._priors.names:
+            self._move(offset.offset_s)
+
+    def round(self, number: int) -> bool:
+        """Run odometry and smoothing once; return whether the calibration has settled."""
+
+        def odometry(text: str, done: int, total: int) -> None:
+            self._report(f"odometry, round {number}: {text}", done, total)
+
+        run = run_odometry(self._now, Odometry(config=self._config), odometry)
+        if run.stopped is not None:
+            raise run.stopped
+        uses_gps = bool(set(self._priors.names) & set(OF_GPS))
+        # a run that trusts the IMU less does so for the wrong calibration, which here is a variable
+        record = replace(run.odometry.record(), imu_noise=self._config.imu_noise or self._now.imu_noise or ImuNoise())
+        smoothed = smooth(record, gps=uses_gps, calibrate=self._priors)
+        found: Calibrated = smoothed.found["calibration"]
+        self._now = replace(self._now, calibration=found.calibration)
+        move_s = found.imu_time_offset_s
+        self._move(move_s + _to_come(self._last_move_s, move_s))
+        self._last_move_s = move_s
+        self._found = replace(found, parameters=tuple(map(self._against_stated, found.parameters)))
+        settled = [
+            (np.abs(one.change) <= _SETTLED * one.sigmas).all() for one in found.parameters if one.name != _CLOCK
+        ]
+        return bool(all(settled))
+
+    def result(self) -> Calibrated:
+        """Return what the last round found."""
+        assert self._found is not None
+        return replace(self._found, imu_time_offset_s=self._stated_offset_s + self._offset_s)
+
+    def _move(self, seconds: float) -> None:
+        self._now = replace(self._now, imu=moved(self._now.imu, seconds))
+        self._offset_s += seconds
+
+    def _against_stated(self, found: Parameter) -> Parameter:
+        """Return a parameter's change against what was stated; what the round changed adds to its variance."""
+        now, stated, change = self._now.calibration, self._stated, found.change
+        antenna, before = (np.zeros(3) if c.antenna_imu_m is None else c.antenna_imu_m for c in (now, stated))
+        total = {
+            "rotation": se3.so3_log(stated.T_imu_lidar[:3, :3].T @ now.T_imu_lidar[:3, :3]),
+            "translation": now.T_imu_lidar[:3, 3] - stated.T_imu_lidar[:3, 3],
+            "time_offset": np.array([self._offset_s]),
+            "lever_arm": antenna - before,
+        }.get(found.name, change)
+        added = 0.0 if found.name == _CLOCK else np.outer(change, change)
+        return replace(found, change=np.asarray(total), covariance=found.covariance + added)
+
+
+def _to_come(before: float, now: float) -> float:
+    """Return the sum of all further changes, if they shrink by the ratio of the last two (Aitken)."""
+    ratio = now / before if before else 0.0
+    return now * ratio / (1 - ratio) if 0 < ratio < _LARGEST_RATIO else 0.0
+
+
+def _silent(stage: str, done: int, total: int) -> None:
+    """Ignore progress."""
+    del stage, done, total
