@@ -26,6 +26,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -36,10 +37,12 @@ import mutations  # noqa: E402
 import numpy as np  # noqa: E402
 import published_data  # noqa: E402
 import rides  # noqa: E402
+from PIL import Image  # noqa: E402
 
 from hybridlio.core.errors import HybridLioError  # noqa: E402
 from hybridlio.datasets import open_sequence  # noqa: E402
 
+PACKETS = Path(os.environ.get("HYBRIDLIO_SHARED_DATA", "no such folder")) / "other_lidars"
 BAGS = ("sqlite3", "mcap", "ros1", "lz4")
 HANG_S, MEMORY_BYTES = 10, 2 << 30
 LOST_S = 3 * HANG_S  # without a line: the worker hangs where Python's alarm does not reach
@@ -53,6 +56,36 @@ class HangError(BaseException):
 def written_bag(root: Path, name: str) -> dict[str, Any]:
     """Write the ride as a bag of ROS 1, or of ROS 2 in one of its storages."""
     return {"path": rides.write_bag(root, rides.Ride(), name)}
+
+
+def written_cut_bag(root: Path, name: str) -> dict[str, Any]:
+    """Write the ride as a bag without the end of its index, as where its recorder was killed."""
+    path = rides.write_bag(root, rides.Ride(), name)
+    file = path if path.is_file() else next(path.glob("*.mcap"))
+    cut = file.rename(root / f"cut{file.suffix}")
+    cut.write_bytes(cut.read_bytes()[:-40])
+    return {"path": cut}
+
+
+def written_depth(root: Path) -> dict[str, Any]:
+    """Write a recording of depth images."""
+    folder = root / "rgbd_dataset_ride"
+    (folder / "depth").mkdir(parents=True)
+    for k in range(4):
+        depth = np.full((480, 640), 6000 + 100 * k, np.uint16)
+        depth[:, ::7] += 4000
+        Image.fromarray(depth).save(folder / f"depth/{k}.png")
+    (folder / "depth.txt").write_text("".join(f"{10 + 0.1 * k:.2f} depth/{k}.png\n" for k in range(4)))
+    (folder / "groundtruth.txt").write_text("".join(f"{10 + 0.1 * k:.2f} 0 0 {k} 0 0 0 1\n" for k in range(4)))
+    return {"path": folder}
+
+
+def copied_packets(root: Path, name: str, *beside: str) -> dict[str, Any]:
+    """Copy a real capture, and the files beside it."""
+    root.mkdir(parents=True)
+    for file in (name, *beside):
+        shutil.copyfile(PACKETS / file, root / file)
+    return {"path": root / name}
 
 
 def written_odometry(root: Path) -> dict[str, Any]:
@@ -71,8 +104,16 @@ INPUTS: dict[str, Callable[[Path], dict[str, Any]]] = {
     "kitti-odometry": written_odometry,
     "folder": lambda root: {"path": rides.write_folder(root, rides.Ride())},
     **{f"rosbag-{kind}": lambda root, kind=kind: written_bag(root, kind) for kind in BAGS},
+    **{f"rosbag-cut-{kind}": lambda root, kind=kind: written_cut_bag(root, kind) for kind in ("ros1", "mcap")},
     **{name: lambda root, name=name: written_published(root, name) for name in published_data.WRITERS},
+    "tum-rgbd": written_depth,
 }
+if PACKETS.is_dir():  # real captures; there is none that tests could write
+    OUSTER = "OS-1-128_v2.3.0_1024x10"
+    if find_spec("ouster") is not None:
+        INPUTS["ouster"] = lambda root: copied_packets(root, f"{OUSTER}_lb_n3.pcap", f"{OUSTER}.json")
+    if find_spec("velodyne_decoder") is not None:
+        INPUTS["velodyne"] = lambda root: copied_packets(root, "sample_velodyne_vlp16_gps.pcap")
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
@@ -55,7 +56,7 @@ def _meta(path: Path) -> dict[str, Any]:
 
 
 def read_turns(path: Path) -> Turns:
-    """Yield stamp and columns of each turn: of its valid columns the points with a return.
+    """Yield stamp and columns of each turn: of its valid columns the points of every return.
 
     Raises:
         DataError: ouster-sdk is not installed.
@@ -70,19 +71,30 @@ def read_turns(path: Path) -> Turns:
             continue
         stamps = np.asarray(frame.timestamp, dtype=np.int64)
         stamp = int(stamps[valid[0]])
-        keep = np.zeros((frame.h, frame.w), dtype=bool)
-        keep[:, valid] = np.asarray(frame.field("RANGE"))[:, valid] > 0
-        xyz = np.asarray(place(frame))[keep]
-        rows, columns = np.nonzero(keep)
-        yield (
-            stamp,
-            {
-                **dict(zip("xyz", xyz.T, strict=True)),
-                "reflectivity": np.asarray(frame.field("REFLECTIVITY"))[keep],
-                "ring": rows,
-                "t": stamps[columns] - stamp,
-            },
-        )
+        returns = [returned(frame, place, valid, suffix) for suffix in ("", "2") if f"RANGE{suffix}" in frame.fields]
+        xyz, reflectivity, rows, columns = (np.concatenate(parts) for parts in zip(*returns, strict=True))
+        points = dict(zip("xyz", xyz.T, strict=True))
+        yield stamp, points | {"reflectivity": reflectivity, "ring": rows, "t": stamps[columns] - stamp}
+
+
+def returned(
+    frame: Any, place: Any, valid: NDArray[np.intp], suffix: str
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.intp], NDArray[np.intp]]:
+    """Return points ``(N, 3)``, reflectivities, rows and columns of one return of a turn.
+
+    Args:
+        frame: ouster-sdk's scan.
+        place: its table of directions.
+        valid: the columns to use.
+        suffix: of the fields' names: none for the first return, ``2`` for the second of a sensor with two.
+    """
+    ranges = np.asarray(frame.field(f"RANGE{suffix}"))
+    keep = np.zeros(ranges.shape, dtype=bool)
+    keep[:, valid] = ranges[:, valid] > 0
+    rows, columns = np.nonzero(keep)
+    name = f"REFLECTIVITY{suffix}"
+    reflectivity = np.asarray(frame.field(name))[keep] if name in frame.fields else np.zeros(len(rows), np.uint8)
+    return np.asarray(place(ranges))[keep], reflectivity, rows, columns
 
 
 def open_recording(path: Path, vertical_angle_deg: float | None = None) -> Sequence:

@@ -43,6 +43,38 @@ def test_an_ousters_packets_give_the_scans_and_samples_that_were_exported_from_t
         assert np.ptp(ours.time_offsets_ns) == np.ptp(theirs.time_offsets_ns)
 
 
+def test_an_osf_file_gives_the_scans_of_the_packets_it_was_made_from(lidars: Path, tmp_path: Path) -> None:
+    sdk = pytest.importorskip("ouster.sdk")
+    from ouster.sdk import osf
+
+    source = sdk.open_source(str(lidars / OUSTER), sensor_idx=0, meta=[str(lidars / "OS-1-128_v2.3.0_1024x10.json")])
+    writer = osf.Writer(str(tmp_path / "drive.osf"), list(source.sensor_info))
+    for frames in source:
+        writer.save(0, frames[0])
+    writer.close()
+    packets, made = open_sequence(lidars / OUSTER), open_sequence(tmp_path / "drive.osf")
+    np.testing.assert_array_equal(made.stamps_ns, packets.stamps_ns)
+    for k in range(len(packets)):
+        np.testing.assert_array_equal(made[k].scan.points, packets[k].scan.points)
+
+
+def test_both_returns_of_an_ouster_are_points(lidars: Path) -> None:
+    sdk = pytest.importorskip("ouster.sdk")
+    from ouster.sdk import core
+
+    from hybridlio.datasets.packets.ouster import returned
+
+    source = sdk.open_source(str(lidars / OUSTER), sensor_idx=0, meta=[str(lidars / "OS-1-128_v2.3.0_1024x10.json")])
+    frame, place = next(iter(source))[0], core.XYZLut(source.sensor_info[0])
+    farther = np.where(frame.field("RANGE") > 0, frame.field("RANGE") + 500, 0).astype(np.uint32)
+    frame.add_field("RANGE2", farther)
+    valid = np.flatnonzero(np.asarray(frame.status) & 1)
+    first, second = (returned(frame, place, valid, suffix) for suffix in ("", "2"))
+    apart = np.linalg.norm(second[0] - first[0], axis=1)
+    np.testing.assert_allclose(apart, 0.5, atol=1e-6)
+    np.testing.assert_array_equal(first[2], second[2])
+
+
 @pytest.mark.parametrize("name", VELODYNE)
 def test_a_velodynes_packets_give_one_scan_a_turn(lidars: Path, name: str) -> None:
     pytest.importorskip("velodyne_decoder")
