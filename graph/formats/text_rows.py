@@ -79,8 +79,9 @@ def parse_rows(path: Path, tag: str, table: TextTable, repair: bool) -> ParsedRo
         information, repaired = np.empty(0), 0
     else:
         # Poses differ from row to row, information matrices seldom do: each distinct matrix is parsed once.
-        split = [rest.split(None, row_format.head) for rest in table.rests]
-        if any(len(words) <= row_format.head for words in split):
+        head = row_format.head
+        split = [rest.split(None, head) for rest in table.rests]
+        if any(len(words) <= head for words in split):
             _raise_for_first_bad_row(path, tag, table)
         heads = _parse_numbers(path, tag, table, [" ".join(words[:-1]) for words in split])
         last_row = {words[-1]: k for k, words in enumerate(split)}  # by the matrix's text
