@@ -5,13 +5,14 @@
 `--simulated` perturbs true relative poses and measures the error that the network leaves. `--real` does the same for
 recordings without an exact reference; small_gicp's registration of full scans takes its place. `--adapt` trains the
 weights on each of two or more real recordings, without labels, and measures on the others. `--long` chains the steps of
-LSTMs and network, without a graph. `--time` measures the first two scans of the first recording given. Prints Markdown;
--o writes all figures to front_end.json.
+LSTMs and network, without a graph. Each figure is also given for networks that are not trained. `--time` measures the
+first two scans of the first recording given. Prints Markdown; -o writes all figures to front_end.json.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import tempfile
 import time
@@ -34,6 +35,7 @@ from hybridlio.learned.data.pairs import Pairs
 from hybridlio.learned.data.shards import Shard
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
 from hybridlio.learned.networks.weights import Weights, load_weights, weights_path
+from hybridlio.learned.settings import NetworkSettings
 from hybridlio.learned.training.driving import drive
 from hybridlio.learned.training.run_options import RunOptions
 from hybridlio.learned.training.train import train
@@ -42,6 +44,7 @@ from hybridlio.runs.training.recipes import adaptation_recipe
 from hybridlio.runs.training.training_data import DataOptions, prepare_shards
 
 Row = dict[str, str]
+Networks = dict[str, OdometryNetwork]
 Sizes = tuple[tuple[float, float], ...]  # degrees and metres
 
 PERTURBATIONS = ((0.41, 0.145), (0.10, 0.054))  # degrees and metres, RMS over pairs
@@ -90,12 +93,24 @@ def gicp_steps(sequence: Sequence) -> Array:
     return np.array(steps)
 
 
-def accuracy_rows(network: OdometryNetwork, shard: Shard, reference: Array, perturbations: Sizes) -> Iterator[Row]:
-    for rotation_deg, translation_m in perturbations:
+def untrained(settings: NetworkSettings) -> Networks:
+    """Return networks of these settings as training starts with them, also with twice the registration steps."""
+    out = {}
+    for name, steps in (("untrained", 1), ("untrained, twice the steps", 2)):
+        torch.manual_seed(0)
+        network = OdometryNetwork(replace(settings, projective_steps=steps * settings.projective_steps))
+        if steps == 1 or settings.projective_steps:
+            out[name] = network.eval()
+    return out
+
+
+def accuracy_rows(networks: Networks, shard: Shard, reference: Array, perturbations: Sizes) -> Iterator[Row]:
+    for (rotation_deg, translation_m), (name, network) in itertools.product(perturbations, networks.items()):
         figures = errors_by_step(network, shard, reference, perturbed(reference, rotation_deg, translation_m))
         cells = [f"{100 * metres:.2f} cm / {degrees:.3f}°" for degrees, metres in figures]
         yield {
             "recording": shard.info.name,
+            "weights": name,
             "initial error": cells[0],
             "after one step": cells[1],
             "after all steps": cells[-1],
@@ -173,13 +188,14 @@ def time_rows(network: OdometryNetwork, sequence: Sequence, threads: int, runs: 
     ]
 
 
-def drift_rows(network: OdometryNetwork, shards: list[Shard]) -> Iterator[Row]:
-    for shard in shards:
+def drift_rows(networks: Networks, shards: list[Shard]) -> Iterator[Row]:
+    for shard, (name, network) in itertools.product(shards, networks.items()):
         driven = drive(network, shard)
         length = float(np.linalg.norm(driven.reference[:, :3, 3], axis=1).sum())
         (t_rel, r_rel), lstm = driven.drift or (None, None), step_errors(driven.initial, driven.reference)
         yield {
             "recording": shard.info.name,
+            "weights": name,
             "length [m]": f"{length:.0f}",
             "t_rel [%]": tables.number(t_rel, 2),
             "r_rel [°/100 m]": tables.number(r_rel, 2),
@@ -198,7 +214,7 @@ def main() -> None:
     parser.add_argument("-o", "--out", type=Path, metavar="DIR", help="for front_end.json")
     options = parser.parse_args()
     weights = load_weights(weights_path(options.weights))
-    network, found = weights.network(), {}
+    networks, found = {"trained": weights.network(), **untrained(weights.recipe.network)}, {}
 
     def shards(paths: list[Path]) -> list[Shard]:
         return prepare_shards(paths, weights.recipe, DataOptions(options.cache)) if paths else []
@@ -209,21 +225,24 @@ def main() -> None:
             print(f"\n{title}\n\n{tables.to_markdown(rows, ('recording', 'stage', 'weights'))}", flush=True)
 
     simulated = shards(options.simulated)
-    show("Simulated drives", [r for s in simulated for r in accuracy_rows(network, s, s.reference[1:], PERTURBATIONS)])
+    show("Simulated drives", [r for s in simulated for r in accuracy_rows(networks, s, s.reference[1:], PERTURBATIONS)])
     real = [(open_sequence(path), s) for path, s in zip(options.real, shards(options.real), strict=True)]
     steps = {s.info.name: gicp_steps(sequence) for sequence, s in real}
 
-    def real_rows(network: OdometryNetwork, tested: list[Shard]) -> list[Row]:
-        return [r for s in tested for r in accuracy_rows(network, s, steps[s.info.name], REAL_PERTURBATIONS)]
+    def real_rows(networks: Networks, tested: list[Shard]) -> list[Row]:
+        return [r for s in tested for r in accuracy_rows(networks, s, steps[s.info.name], REAL_PERTURBATIONS)]
 
-    show("Real recordings", real_rows(network, [s for _, s in real]))
+    show("Real recordings", real_rows(networks, [s for _, s in real]))
     for _, trained_on in real if options.adapt and len(real) > 1 else []:
         others = [s for _, s in real if s is not trained_on]
-        show(f"Adapted to {trained_on.info.name}", real_rows(adapted(weights, trained_on), others))
-    show("Without a graph", list(drift_rows(network, shards(options.long))))
+        show(f"Adapted to {trained_on.info.name}", real_rows({"adapted": adapted(weights, trained_on)}, others))
+    show("Without a graph", list(drift_rows(networks, shards(options.long))))
     if options.time:
         first = (options.simulated + options.real + options.long)[0]
-        show("Time for each scan", [row for n in (1, 2) for row in time_rows(network, open_sequence(first), n)])
+        show(
+            "Time for each scan",
+            [row for n in (1, 2) for row in time_rows(networks["trained"], open_sequence(first), n)],
+        )
     if options.out:
         write_atomically(options.out / "front_end.json", json.dumps(found, indent=2) + "\n")
 
