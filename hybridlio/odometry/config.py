@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
-from hybridlio.core.errors import ConfigError
+from hybridlio.core.errors import ConfigError, shown
 from hybridlio.core.files import read_yaml
 from hybridlio.core.sensors import ImuNoise
 from hybridlio.core.setting_checks import SettingError
@@ -38,6 +38,9 @@ class Config(BaseModel):
         lstm: settings of the learned initial-pose source.
         network: settings of the learned residual source.
         keyframes: which clouds are kept for loop closure.
+
+    Raises:
+        ConfigError: unknown names, or values out of range; names each.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -52,6 +55,12 @@ class Config(BaseModel):
     network: NetworkResidualSettings = Field(default_factory=NetworkResidualSettings)
     keyframes: LoopKeyframeSettings = Field(default_factory=LoopKeyframeSettings)
 
+    def __init__(self, **settings: Any) -> None:
+        try:
+            super().__init__(**settings)
+        except ValidationError as error:
+            raise ConfigError("; ".join(map(_describe, error.errors()))) from None
+
     @field_validator("initial_pose", "residual", "backend")
     @classmethod
     def _check_name(cls, name: str, info: ValidationInfo) -> str:
@@ -60,6 +69,7 @@ class Config(BaseModel):
 
 
 _SEAMS = {"initial_pose": INITIAL_POSES, "residual": RESIDUALS, "backend": BACKENDS}
+_HINT = ". `hybridlio config` prints all keys with their defaults"
 
 
 def config_to_yaml(config: Config) -> str:
@@ -86,24 +96,23 @@ def parse_config(tree: object, where: str) -> Config:
     Raises:
         ConfigError: unknown keys or values out of range.
     """
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{where}: expected keys with values, got {shown(tree)}{_HINT}")
     try:
-        return Config.model_validate(tree)
+        return Config(**{str(name): value for name, value in tree.items()})
     except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
-    except ValidationError as error:
-        wrong = "; ".join(map(_describe, error.errors()))
-        raise ConfigError(f"{where}: {wrong}. `hybridlio config` prints all keys with their defaults") from None
+        raise ConfigError(f"{where}: {error}{_HINT}") from None
 
 
 def _describe(error: ErrorDetails) -> str:
     """Say what is wrong with one key, and which key may have been meant."""
-    *above, last = map(str, error["loc"] or ("",))
+    *above, last = map(str, error["loc"])
     path = ".".join((*above, last))
-    if not path:
-        return f"expected keys with values, got {error['input']!r:.40}"
     cause = error.get("ctx", {}).get("error")
     if isinstance(cause, SettingError):  # raised by a settings class, which does not know its path in the file
         return f"{path}.{cause.name}: {cause.complaint}"
+    if error["type"] == "dataclass_type":
+        return f"{path}: expected keys with values, got {shown(error['input'])}"
     if error["type"] not in ("extra_forbidden", "unexpected_keyword_argument"):
         return f"{path}: {error['msg'].lower()}"
     every = [".".join(keys) for keys in _keys(Config().model_dump())]

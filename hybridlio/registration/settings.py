@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from hybridlio.cloud.plane_fitting import MIN_NEIGHBOURS
 from hybridlio.core.setting_checks import check_positive, check_setting
 
+_MAX_NEIGHBOURS = 1000  # at spacings of 0.1 m a disc of 1.8 m radius, which is no place on a surface any more
+
 
 @dataclass(frozen=True)
 class RegistrationSettings:
@@ -66,5 +68,6 @@ class LocalMapSettings:
             self, "keyframe_m", "keyframe_deg", "voxel_m", "spacing_m", "horizon_keyframes", "radius_m", "threads"
         )
         check_setting(
-            self, "neighbours", self.neighbours >= MIN_NEIGHBOURS, f"{MIN_NEIGHBOURS} or more, as a plane needs"
-        )
+            self, "neighbours", MIN_NEIGHBOURS <= self.neighbours <= _MAX_NEIGHBOURS,
+            f"from {MIN_NEIGHBOURS}, as a plane needs, to {_MAX_NEIGHBOURS}",
+        )  # fmt: skip

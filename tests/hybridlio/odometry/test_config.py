@@ -213,7 +213,7 @@ def test_all_numbers_out_of_range_are_named(changed: dict, wanted: str):
         (lambda: RegistrationSettings(threads=0), "RegistrationSettings.threads: must be above 0, got 0"),
         (lambda: LocalMapSettings(radius_m=float("nan")), "LocalMapSettings.radius_m: must be above 0, got nan"),
         (lambda: VerificationSettings(neighbours=4), "VerificationSettings.neighbours: must be 5 or more"),
-        (lambda: LocalMapSettings(neighbours=4), "LocalMapSettings.neighbours: must be 5 or more"),
+        (lambda: LocalMapSettings(neighbours=4), "LocalMapSettings.neighbours: must be from 5"),
         (lambda: VerificationSettings(max_cost=1.5), "VerificationSettings.max_cost: must be between 0 and 1, got 1.5"),
         (lambda: CandidateSettings(compared=0), "CandidateSettings.compared: must be above 0, got 0"),
         (lambda: ConsistencySettings(inlier_share=1.0), "ConsistencySettings.inlier_share: must be above 0 and below"),
@@ -228,3 +228,21 @@ def test_settings_made_in_python_are_checked_too(make: Callable[[], object], wan
     with pytest.raises(ConfigError, match=re.escape(wanted)) as error:
         make()
     assert str(pickle.loads(pickle.dumps(error.value))) == str(error.value)  # as between the processes of a batch
+
+
+@pytest.mark.parametrize(
+    ("settings", "wanted"),
+    [
+        ({"backend": "isam2"}, "unknown backend 'isam2'"),
+        ({"backend": 3}, "backend: input should be a valid string"),
+        ({"scan_matching": 5}, "scan_matching: expected keys with values, got 5"),
+        ({"scan_matching": {"registration": [1]}}, "scan_matching.registration: expected keys with values, got [1]"),
+        ({"nonsense": 1}, "nonsense: unknown key"),
+        ({"scan_matching": {"covariance_scale": 1e300}}, "scan_matching.covariance_scale: must be 1e+12 at most"),
+        ({"scan_matching": {"local_map": {"neighbours": 1000000}}}, "local_map.neighbours: must be from 5"),
+    ],
+)
+def test_wrong_settings_given_in_python_are_one_line(settings: dict[str, Any], wanted: str):
+    with pytest.raises(ConfigError, match=re.escape(wanted)) as error:
+        Config(**settings)
+    assert "\n" not in str(error.value)
