@@ -6,9 +6,6 @@ from collections.abc import Callable
 
 from hybridlio.core.errors import ConfigError
 
-# Of any setting: no length, time, number or factor here comes near it, and its square is far from the end of floats.
-_LARGEST = 1e12
-
 
 class SettingError(ConfigError, ValueError):
     """A setting has a value that is out of range.
@@ -30,7 +27,7 @@ class SettingError(ConfigError, ValueError):
 
 
 def check_positive(settings: object, *names: str) -> None:
-    """Check that the named settings are above 0, and no more than 1e12; NaN is not.
+    """Check that the named settings are above 0; NaN is not.
 
     Raises:
         SettingError: names the first setting that is not.
@@ -39,7 +36,7 @@ def check_positive(settings: object, *names: str) -> None:
 
 
 def check_not_negative(settings: object, *names: str) -> None:
-    """Check that the named settings are 0 or more, and no more than 1e12; NaN is not.
+    """Check that the named settings are 0 or more; NaN is not.
 
     Raises:
         SettingError: names the first setting that is not.
@@ -76,6 +73,4 @@ def _check_each(
     settings: object, names: tuple[str, ...], is_allowed: Callable[[float], bool], requirement: str
 ) -> None:
     for name in names:
-        value = getattr(settings, name)
-        check_setting(settings, name, not value > _LARGEST, f"{_LARGEST:g} at most")
-        check_setting(settings, name, is_allowed(value), requirement)
+        check_setting(settings, name, is_allowed(getattr(settings, name)), requirement)

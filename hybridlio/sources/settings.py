@@ -8,6 +8,8 @@ from typing import Literal
 from hybridlio.core.setting_checks import check_fraction, check_not_negative, check_positive, check_setting
 from hybridlio.registration.settings import LocalMapSettings, RegistrationSettings
 
+_MAX_SCALE = 1e6  # of a covariance: its standard deviations a thousand times too large, and registration says nothing
+
 
 @dataclass(frozen=True)
 class ScanMatchingSettings:
@@ -61,6 +63,7 @@ class ScanMatchingSettings:
         if self.scene_scale is not None:
             check_setting(self, "scene_scale", 0 < self.scene_scale <= 1, "above 0 and at most 1")
         check_positive(self, "map_voxel_m", "source_voxel_m", "covariance_scale")
+        check_setting(self, "covariance_scale", self.covariance_scale <= _MAX_SCALE, f"at most {_MAX_SCALE:g}")
         check_not_negative(self, "min_range_m", "min_points", "least_measured")
         check_fraction(self, "min_matched", "drift_share")
         check_setting(
