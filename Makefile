@@ -9,6 +9,7 @@ ARGS ?=
 FUZZ ?=
 SOAK ?= soak
 KILLS ?= 60
+STEPS ?= 600000
 
 RUN := $(VENV)/bin/python
 READY := $(VENV)/.stamp-ready
@@ -23,7 +24,7 @@ help:
 	@echo 'make lint     ruff: rules and format        make format   apply both'
 	@echo 'make types    mypy, strict, on all packages'
 	@echo 'make docs     build the documentation into site/, strictly'
-	@echo 'make soak     kill six commands at random moments and compare their results   (KILLS=60 SOAK=soak)'
+	@echo 'make soak     kill six commands at random moments and compare their results, and use graphs at random   (KILLS=60 STEPS=600000 SOAK=soak)'
 	@echo 'make audit    known vulnerabilities and licences of the dependencies'
 	@echo 'make clean    remove the environment and everything that was built'
 
@@ -52,11 +53,12 @@ docs: $(DOCS_READY)
 
 soak: $(READY)
 	$(RUN) benchmarks/kills.py '$(SOAK)' --kills $(KILLS)
+	$(RUN) tests/fuzz_graph.py --steps $(STEPS)
 
 audit: $(READY)
 	@$(RUN) -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[audit]'
-	$(RUN) -m pip_audit --skip-editable --desc off
 	$(RUN) scripts/licences.py
+	$(RUN) scripts/vulnerabilities.py
 
 clean:
 	rm -rf $(VENV) build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage

@@ -23,6 +23,7 @@ from hybridlio.odometry.config import Config, config_to_yaml
 from hybridlio.record.record import Record
 from hybridlio.runs import folder as run_folder
 from hybridlio.runs.own_files import check_free
+from hybridlio.runs.results.mounting import mounting_doubts
 from hybridlio.runs.results.report_input import ONLINE, SMOOTHED, report_data, smoothed_report_data
 from hybridlio.runs.results.states import States
 from hybridlio.runs.run import Run
@@ -109,6 +110,7 @@ def notes(run: Run) -> list[str]:
     if run.bridged:
         out.append(f"{counted(len(run.bridged), 'unusable scan')} bridged by the initial pose")
     out += imu_conflicts(run)
+    out += mounting_doubts(run)
     listed = [f"frame {k}: {reason}" for k, reason in run.unreadable.items()]
     more = len(listed) - _MAX_SCANS_NOTED
     return out + listed[:_MAX_SCANS_NOTED] + ([f"and {more} more"] if more > 0 else [])
