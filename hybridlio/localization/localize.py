@@ -137,11 +137,11 @@ def localization_of(run: Run, followed: MapOdometry) -> Localization:
         EstimationError: the recording's place in the map was not found.
     """
     poses = followed.poses[: len(run.estimates)]
-    found = next((k for k, one in enumerate(poses) if one is not None), None)
+    found = next((k for k, one in enumerate(poses) if one is not None and one.held), None)
     if found is None:
         raise EstimationError(
             f"{run.sequence.name}: its place in the map was not found in {len(poses)} scans; give a start (x, y, yaw) "
-            "if it is known, or a map of this place"
+            "within a few metres if it is known, or a map of this place"
         )
     estimates = list(run.estimates)
     known = [one for one in poses[found:] if one is not None]

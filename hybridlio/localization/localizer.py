@@ -109,7 +109,8 @@ class Localizer:
         match = None
         if predicted is not None:
             thinned = thin(scan, self.settings.thinning)
-            match = match_with_map(self._prior.surface, thinned, predicted, self.settings.matching)
+            is_vague = predicted.sigma_m > self.settings.sure_m
+            match = match_with_map(self._prior.surface, thinned, predicted, self.settings.matching, is_vague)
             self._last, held = self._corrected(predicted, match, pose)
             if held:
                 return self._hold(self._last, match)

@@ -13,9 +13,11 @@ from hybridlio.core.setting_checks import check_fraction, check_not_negative, ch
 from hybridlio.localization.fusion import UncertainPose
 from hybridlio.localization.map_surface import MapSurface
 from hybridlio.registration.degeneracy import RegistrationProblem, register_with_degeneracy
+from hybridlio.registration.icp import fit_at
 from hybridlio.registration.motion_search import CoarseSearch, refine_best
 from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Surface
+from hybridlio.smoothing.loop_verification import HORIZONTAL
 from hybridlio.sources.thinned_scan import ThinnedScan
 
 _LEVER_M = 10.0  # half of a scan's points are nearer; turns a rotation's uncertainty into a displacement
@@ -34,6 +36,9 @@ class MapMatchingSettings:
         min_points: a scan with fewer points is not matched.
         min_matched: least share of the points with a surface of the map nearby. Outside the map it falls.
         max_cost: largest mean robust cost of the points, 0 to 1. Where places have changed it rises.
+        min_above_ground, min_matched_above, max_cost_above: the same of the points above the ground, where the place is
+            in question: ground fits ground anywhere. From 40 wrong starts the least cost was 0.73, from right ones at
+            most 0.23 (simulated towns 9501 and 9502).
         covariance_scale: factor on the covariance of independent residuals, as in scan matching.
         map_sigmas: errors of the map at one place, in rad and m, of which a scan's points see the same ones.
         registration: kernel, distances, limits.
@@ -45,14 +50,17 @@ class MapMatchingSettings:
     min_points: int = 50
     min_matched: float = 0.6
     max_cost: float = 0.5
+    min_above_ground: int = 50
+    min_matched_above: float = 0.7
+    max_cost_above: float = 0.5
     covariance_scale: float = 5.0
     map_sigmas: tuple[float, float] = (2e-4, 0.005)
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
 
     def __post_init__(self) -> None:
         check_positive(self, "covariance_scale")
-        check_not_negative(self, "min_points")
-        check_fraction(self, "min_matched", "max_cost")
+        check_not_negative(self, "min_points", "min_above_ground")
+        check_fraction(self, "min_matched", "max_cost", "min_matched_above", "max_cost_above")
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +81,21 @@ class MapMatch:
 
 
 def match_with_map(
-    map_surface: MapSurface, scan: ThinnedScan, predicted: UncertainPose, settings: MapMatchingSettings
+    map_surface: MapSurface,
+    scan: ThinnedScan,
+    predicted: UncertainPose,
+    settings: MapMatchingSettings,
+    is_in_question: bool = False,
 ) -> MapMatch | None:
-    """Register a scan to the map from a predicted pose; None where the map has no surface or the scan no points."""
+    """Register a scan to the map from a predicted pose; None where the map has no surface or the scan no points.
+
+    Args:
+        map_surface: of the map.
+        scan: motion compensated.
+        predicted: pose of the scan in the map.
+        settings: limits.
+        is_in_question: whether the scan may be at another place; then the points above the ground must fit too.
+    """
     surface = map_surface.around(predicted.pose[:3, 3])
     if surface is None or len(scan.points) < settings.min_points:
         return None
@@ -87,6 +107,7 @@ def match_with_map(
     found = observed.registration
     covariance = observed.covariance(settings.covariance_scale) + _map_error(settings)
     holds = found.matched >= settings.min_matched and found.cost <= settings.max_cost
+    holds = holds and (not is_in_question or _fits_above_ground(surface, scan, found.pose, settings))
     return MapMatch(UncertainPose(found.pose, covariance), found.matched, found.cost, holds)
 
 
@@ -105,6 +126,17 @@ def _search(surface: Surface, scan: ThinnedScan, predicted: UncertainPose, setti
     few, sparse = scan.source[::_JUDGED_STRIDE], scan.source[::_SPARSE]
     found = refine_best(surface, few, sparse, starts, settings, _SEARCH)
     return min(found, key=lambda one: one.cost).pose
+
+
+def _fits_above_ground(surface: Surface, scan: ThinnedScan, pose: Array, settings: MapMatchingSettings) -> bool:
+    """Return whether the points whose surface is not horizontal fit the map."""
+    registration = settings.registration
+    index, _ = surface.nearest(se3.transform(pose, scan.points), registration.threads)
+    above = scan.points[np.abs(surface.normals[index][:, 2]) <= HORIZONTAL]
+    if len(above) < settings.min_above_ground:
+        return False
+    fit = fit_at(surface, above, pose, registration.kernel_m, registration.threads, registration.max_distance_m)
+    return fit.matched >= settings.min_matched_above and fit.cost <= settings.max_cost_above
 
 
 def _map_error(settings: MapMatchingSettings) -> Array:

@@ -22,7 +22,7 @@ class Localization:
         held: ``(N,)`` whether the map held the pose; else odometry carried it on from the last one held.
         matched: ``(N,)`` share of each scan's points with a surface of the map nearby; NaN where it was not matched.
         cost: ``(N,)`` mean robust cost of the points, 0 to 1; NaN likewise.
-        found: row at which the place was found.
+        found: row at which the map first held the pose.
         run: the odometry's run.
     """
 

@@ -100,7 +100,7 @@ class _Source:
     above_ground: Array
 
 
-_HORIZONTAL = 0.7  # cos 45°: |z| of a normal above which a surface is ground (or a flat roof)
+HORIZONTAL = 0.7  # cos 45°: |z| of a normal above which a surface is ground (or a flat roof)
 _FINE_START_M = 0.5  # first kernel of the final registration; the search leaves errors of decimetres
 _SPARSE = 4  # every fourth point; enough to compare starts metres apart
 # The search: 3 by 3 starts around each guess, no farther apart than the coarse kernel reaches; the best 3 are refined.
@@ -138,7 +138,7 @@ class PreparedPlaces:
         points = points.take(voxel_pick(points, self._settings.source_voxel_m), axis=0)
         surface = self.surface(k)
         index, _ = surface.nearest(points, self._settings.registration.threads)
-        is_ground = np.abs(surface.normals[index][:, 2]) > _HORIZONTAL
+        is_ground = np.abs(surface.normals[index][:, 2]) > HORIZONTAL
         ground = points[is_ground][:: max(1, int(is_ground.sum()) // max(1, int((~is_ground).sum())))]
         return _Source(np.concatenate([points[~is_ground], ground]), points[~is_ground])
 

@@ -59,6 +59,11 @@ def test_a_place_that_is_not_found_is_said_and_nothing_is_written(tiny_drive: Pa
     assert not (tmp_path / "out/poses_tum.txt").exists()
 
 
+def test_a_start_that_the_map_does_not_confirm_is_said(tiny_drive: Path, finished_run: Path, tmp_path: Path):
+    words = ("localize", tiny_drive, "--map", finished_run, "-o", tmp_path / "out", "--no-check", "--frames", "0:4")
+    assert "not found" in refused(1, *words, "--start", "10,12,90")
+
+
 def test_wrong_maps_and_starts_are_refused(tiny_drive: Path, tmp_path: Path):
     words = ("localize", tiny_drive, "-o", tmp_path / "out", "--map")
     assert "no such map" in refused(2, *words, tmp_path / "missing.ply")

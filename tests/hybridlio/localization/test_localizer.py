@@ -64,6 +64,20 @@ def test_a_given_start_metres_and_degrees_off_holds_at_the_first_scan(town: Mapp
         assert np.linalg.norm(se3.log(se3.between(found.at.pose, true))[3:]) < 0.1
 
 
+def test_a_given_start_at_another_place_of_the_street_is_not_believed(town: MappedTown, again: TownDrive):
+    k, scan = next(again.scans(60))
+    surface_only = PriorMap(town.prior.surface, up=town.prior.up)
+    for row in (20, 35, 80, 95):
+        wrong = town.drive.poses[row]
+        start = (float(wrong[0, 3]), float(wrong[1, 3]), float(np.arctan2(wrong[1, 0], wrong[0, 0])))
+        localizer = Localizer(surface_only)
+        localizer.start(start_pose(surface_only, scan, again.up, start), again.poses[k])
+        found = localizer.step(scan, again.poses[k], again.steps[k - 1], again.up)
+        assert found is not None
+        assert not found.held
+        assert found.at.sigma_m > 1.0
+
+
 def test_beyond_the_map_odometry_goes_on_with_growing_covariance_and_joins_again(town: MappedTown, again: TownDrive):
     places = town.drive.poses[:, :3, 3]
     nearest = np.array([np.linalg.norm(places - p, axis=1).argmin() for p in town.prior.surface.points])
