@@ -20,6 +20,9 @@ RESIDUAL_M, RESIDUAL_DEG = "series/residual/translation_m", "series/residual/rot
 NIS, SPEED = "series/innovation", "series/speed_m_s"
 ACCEL_BIAS, GYRO_BIAS, FIX_RESIDUAL = "series/accel_bias_m_s2", "series/gyro_bias_rad_s", "series/gps_residual_m"
 
+_BACKGROUND = (24, 26, 30)  # dark in the viewer's light theme too, in which scans would not be seen
+_EYE_M = (-35.0, -20.0, 30.0)  # behind the lidar and above it, to see as far as a street is wide
+
 
 def doubts(support: str) -> str:
     """Return where scans of one support are marked."""
@@ -38,7 +41,8 @@ def layout() -> rrb.Blueprint:
         origin=WORLD,
         name="World",
         overrides={entity: [until_now] for entity in _STAYS},
-        eye_controls=rrb.EyeControls3D(tracking_entity=f"/{LIDAR}"),
+        background=_BACKGROUND,
+        eye_controls=rrb.EyeControls3D(position=_EYE_M, look_target=(0.0, 0.0, 0.0), tracking_entity=f"/{LIDAR}"),
     )
     support = rrb.StateTimelineView(origin="scans", name="Support of the scans")
     return rrb.Blueprint(
