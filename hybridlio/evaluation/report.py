@@ -16,6 +16,7 @@ from hybridlio.core.version import __version__
 from hybridlio.evaluation.charts.consistency_charts import drift_figure, nees_figure, sigma_figure
 from hybridlio.evaluation.charts.path_charts import map_figure, space_figure
 from hybridlio.evaluation.charts.plotly import Figure, packed_library
+from hybridlio.evaluation.charts.sensor_charts import bias_figure, fix_figure
 from hybridlio.evaluation.charts.time_charts import step_figure, timeline_figure, timing_figure
 from hybridlio.evaluation.consistency import Anees
 from hybridlio.evaluation.drift import Drift
@@ -75,6 +76,10 @@ def charts(data: ReportData, findings: Findings) -> dict[str, Figure]:
         out["drift"] = drift_figure(drifts)
     if findings.step_errors:
         out["steps"] = step_figure(findings)
+    if data.biases is not None and np.isfinite(data.biases).any():
+        out["biases"] = bias_figure(data)
+    if data.fix_residuals_m is not None and len(data.fix_residuals_m):
+        out["fixes"] = fix_figure(data)
     if data.timings_s:
         out["timing"] = timing_figure(data)
     if findings.steps is not None:

@@ -36,6 +36,11 @@ class ReportData:
         conflicts: by verdict of the innovation gate, rows of the estimate whose scan conflicts with the IMU.
         map_points: ``(P, 3)`` points of the scans in the estimate's frame, to draw below the path.
         fixes_m: ``(F, 3)`` GPS fixes in the estimate's frame.
+        fix_covariances_m2: ``(F, 3, 3)`` of these, in the same frame.
+        fix_times_s: ``(F,)`` seconds of the fixes since the estimate's first pose.
+        fix_residuals_m: ``(F, 3)`` antenna minus fix; east, north, up.
+        biases: ``(N, 6)`` of accelerometer (m/s²) and gyroscope (rad/s); NaN where not known.
+        bias_sigmas: ``(N, 6)`` standard deviations of these; NaN where not known.
         reference_doubts: why the reference contradicts itself or other sensors; figures that compare with it are then
             shown as doubtful.
         first_scan: index of the recording's scan that the first pose of the estimate belongs to.
@@ -59,6 +64,11 @@ class ReportData:
     conflicts: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
     map_points: Array | None = None
     fixes_m: Array | None = None
+    fix_covariances_m2: Array | None = None
+    fix_times_s: Array | None = None
+    fix_residuals_m: Array | None = None
+    biases: Array | None = None
+    bias_sigmas: Array | None = None
     reference_doubts: Sequence[str] = ()
     first_scan: int = 0
     loops: NDArray[np.int64] | None = None

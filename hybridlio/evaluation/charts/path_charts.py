@@ -155,20 +155,34 @@ def _ellipses(data: ReportData, path: DrawnPath) -> list[Trace]:
     if data.estimate.covariances is None or len(path.rows) < 2:
         return []
     picked = thinned(len(path.rows), _ELLIPSES)[1:]
-    angle = np.linspace(0, 2 * np.pi, 33)
-    circle = np.stack([np.cos(angle), np.sin(angle)])
     outlines = []
     for k in picked:
         row = path.rows[k]
         R = (path.T_drawn_world @ data.estimate.poses[row])[:3, :3]  # covariances are in the lidar's axes
         covariance = (R @ data.estimate.covariances[row, 3:, 3:] @ R.T)[:2, :2]
-        values, axes = np.linalg.eigh(covariance)
-        outline = path.positions_m[k, :2, None] + axes @ (
-            _PROBABILITY_95 * np.sqrt(np.maximum(values, 0))[:, None] * circle
-        )
-        outlines.append(np.column_stack([outline, [np.nan, np.nan]]))
-    x, y = np.concatenate(outlines, axis=1)
+        outlines.append(_outline(path.positions_m[k, :2], covariance))
+    x, y = np.concatenate(outlines).T
     return [line("95 % of position", x, y, COLOURS[3], width=1.2, hoverinfo="skip")]
+
+
+def _outline(centre_m: Array, covariance_m2: Array) -> Array:
+    """Return the 95 % ellipse ``(34, 2)`` of a horizontal position, with NaN at its end."""
+    angle = np.linspace(0, 2 * np.pi, 33)
+    values, axes = np.linalg.eigh(covariance_m2)
+    half_axes = _PROBABILITY_95 * np.sqrt(np.maximum(values, 0))
+    outline = centre_m[:, None] + axes @ (half_axes[:, None] * np.stack([np.cos(angle), np.sin(angle)]))
+    return np.vstack([outline.T, [np.nan, np.nan]])
+
+
+def _fix_ellipses(data: ReportData, path: DrawnPath, fixes_m: Array) -> list[Trace]:
+    """Return the 95 % ellipses of some GPS fixes ``(F, 3)``, as one trace; none without covariances."""
+    if data.fix_covariances_m2 is None:
+        return []
+    R = path.T_drawn_world[:3, :3]
+    picked = thinned(len(fixes_m), _ELLIPSES)
+    outlines = [_outline(fixes_m[k, :2], (R @ data.fix_covariances_m2[k] @ R.T)[:2, :2]) for k in picked]
+    x, y = np.concatenate(outlines).T
+    return [line("95 % of fixes", x, y, COLOURS[4], width=1.0, hoverinfo="skip")]
 
 
 def _marks(data: ReportData, path: DrawnPath) -> list[Trace]:
@@ -181,6 +195,7 @@ def _marks(data: ReportData, path: DrawnPath) -> list[Trace]:
         out.append(line("loop closure", joined[:, 0], joined[:, 1], LOOP, mode="lines+markers", hoverinfo="name"))
     if data.fixes_m is not None and len(data.fixes_m):
         fixes = _in_reference_frame(path, data.fixes_m)
+        out += _fix_ellipses(data, path, fixes)
         out.append(dots("GPS fix", fixes[:, 0], fixes[:, 1], COLOURS[3], size=7, symbol="cross-thin-open"))
     for (name, rows), symbol in zip(
         data.flagged.items(), ("x", "diamond-open", "triangle-up", "square-open"), strict=False

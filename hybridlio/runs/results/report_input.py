@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Index
+from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.evaluation.evaluate import Steps
 from hybridlio.evaluation.reference_check import reference_doubts
@@ -17,7 +18,9 @@ from hybridlio.odometry.config import Config
 from hybridlio.record.loop_keyframes import LoopKeyframes
 from hybridlio.record.record import Record
 from hybridlio.runs.folder import KEYFRAMES, StoredRun
+from hybridlio.runs.results.states import States
 from hybridlio.runs.run import Run
+from hybridlio.smoothing.gps_alignment import fix_stamps
 from hybridlio.sources.innovation_gate import Verdict
 
 if TYPE_CHECKING:
@@ -63,6 +66,7 @@ def report_data(
         map_points=None if record is None else _map_points(record, trajectory),
         reference_doubts=_reference_doubts(run, forward_speed_length_m),
         first_scan=run.skipped,
+        **_biases(States.of_estimates(run.estimates)),
         facts={"initial pose": config.initial_pose, "residual": config.residual, "backend": config.backend},
         config=config_text,
         warnings=notes,
@@ -94,7 +98,8 @@ def smoothed_report_data(
         ok=np.array([step.ok for step in record.relative]),
         degenerate=np.array([len(step.degenerate) > 0 for step in record.relative]),
         map_points=_map_points(record, smoothed.trajectory, stored),
-        fixes_m=None if fit is None else _fixes(record, fit),
+        **({} if fit is None else _fixes(record, smoothed.trajectory, fit)),
+        **_biases(States.of_smoothed(smoothed, record)),
         reference_doubts=stored.metrics.get("reference_doubts", ()),
         first_scan=len(stored.stamps_before),
         loops=np.array([(loop.earlier, loop.later) for loop in loops], np.int64).reshape(-1, 2),
@@ -127,10 +132,28 @@ def _stored_keyframes(stored: StoredRun) -> LoopKeyframes | None:
     return LoopKeyframes.load(path) if path.is_file() else None
 
 
-def _fixes(record: Record, fit: GpsFit) -> Array:
-    """Return the fixes ``(F, 3)`` that smoothing used, in the trajectory's frame."""
-    positions = np.array([fix.position_m for fix in record.gps]).reshape(-1, 3)[fit.used]
-    return np.asarray(se3.transform(se3.inverse(fit.T_enu_world), positions))
+def _fixes(record: Record, trajectory: Trajectory, fit: GpsFit) -> dict[str, Any]:
+    """Return what the report shows of the fixes that smoothing used, in the trajectory's frame."""
+    used = np.flatnonzero(fit.used)
+    fixes = [record.gps[k] for k in used]
+    T = se3.inverse(fit.T_enu_world)
+    positions = np.array([fix.position_m for fix in fixes]).reshape(-1, 3)
+    covariances = np.array([fix.covariance_m2 for fix in fixes]).reshape(-1, 3, 3)
+    since_ns = fix_stamps(fixes, fit.shift_s) - trajectory.stamps_ns[0]
+    return {
+        "fixes_m": np.asarray(se3.transform(T, positions)),
+        "fix_covariances_m2": fit.noise_scale**2 * T[:3, :3] @ covariances @ T[:3, :3].T,
+        "fix_times_s": since_ns / NS_PER_S,
+        "fix_residuals_m": fit.residuals_m[used],
+    }
+
+
+def _biases(states: States | None) -> dict[str, Any]:
+    """Return what the report shows of the IMU's biases."""
+    if states is None:
+        return {}
+    biases = np.concatenate([states.accel_biases_m_s2, states.gyro_biases_rad_s], axis=1)
+    return {"biases": biases, "bias_sigmas": states.sigmas[:, 3:]}
 
 
 def _reference_doubts(run: Run, forward_speed_length_m: float | None) -> list[str]:
