@@ -218,7 +218,7 @@ def run(name: str, start: int, count: int, until: float | None) -> Result:
                 if not began:
                     result.add(seed, text)
                     seed += 1
-            over = until is not None and time.monotonic() >= until
+            over = until is not None and (time.monotonic() >= until or not (ready or left == LOST_S))
             hangs = worker.poll() is None and not ready and not over
             worker.kill()
             status, said = worker.wait(), worker.stderr.read().strip()
