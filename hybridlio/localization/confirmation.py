@@ -8,6 +8,7 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
+from hybridlio.core.setting_checks import check_fraction, check_not_negative, check_positive
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,9 @@ class ConfirmationSettings:
         max_difference_m, max_difference_deg: between two that agree: as between the two registrations of one loop, and
             as much again for the odometry between them.
         rival_share: a candidate is not believed while others have more than this share of its agreeing scans.
+
+    Raises:
+        SettingError: a value is out of range.
     """
 
     places: int = 3
@@ -29,6 +33,11 @@ class ConfirmationSettings:
     max_difference_m: float = 0.6
     max_difference_deg: float = 1.0
     rival_share: float = 0.5
+
+    def __post_init__(self) -> None:
+        check_positive(self, "places", "window_m", "max_difference_m", "max_difference_deg")
+        check_not_negative(self, "distance_m")
+        check_fraction(self, "rival_share")
 
 
 @dataclass(frozen=True, eq=False)

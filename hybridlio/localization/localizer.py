@@ -11,6 +11,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.chi_square import chi_square_quantile
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.sensors import Scan
+from hybridlio.core.setting_checks import check_positive, check_setting
 from hybridlio.localization.confirmation import Confirmation, ConfirmationSettings, Vote
 from hybridlio.localization.fusion import UncertainPose
 from hybridlio.localization.map_matching import MapMatch, MapMatchingSettings, match_with_map
@@ -37,6 +38,9 @@ class LocalizationSettings:
         inlier_share: share of correct matches that lie within the bound of the prediction.
         sure_m: where the position is less certain than this, a match must be confirmed by others. Within it a
             registration has one minimum (the kernel starts at most a metre wide).
+
+    Raises:
+        SettingError: a value is out of range.
     """
 
     matching: MapMatchingSettings = field(default_factory=MapMatchingSettings)
@@ -46,6 +50,10 @@ class LocalizationSettings:
     odometry_scale: float = 4.0
     inlier_share: float = 0.999
     sure_m: float = 0.5
+
+    def __post_init__(self) -> None:
+        check_positive(self, "odometry_scale", "sure_m")
+        check_setting(self, "inlier_share", 0 < self.inlier_share < 1, "above 0 and below 1")
 
 
 @dataclass(frozen=True, eq=False)

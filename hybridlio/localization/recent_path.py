@@ -38,6 +38,9 @@ class RecentPath:
         self._poses.append(pose)
         self._steps.append(step)
         self._count += 1
+        if self._count % _SCANS == 0:  # older keyframes are of no use, and would grow with the run
+            recent = self._selector.kept_since(self._count - _SCANS)
+            self._selector.restore(recent, self._selector.last_position)
         return self._selector.offer(self._count - 1, scan, pose)
 
     def places(self, up: Array) -> KeyframePlaces:
