@@ -90,4 +90,4 @@ class LocalMap:
         self.surface = None
         if len(near):
             points, normals, weights = (column.take(near, axis=0) for column in planes)
-            self.surface = Surface(points, normals, self._settings.threads, weights)
+            self.surface = Surface(points, normals, self._settings.threads, weights, one_sided=self._settings.one_sided)

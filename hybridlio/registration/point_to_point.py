@@ -19,11 +19,7 @@ import numpy as np
 
 from hybridlio.core.arrays import Array
 from hybridlio.registration.information import lever_arms
-from hybridlio.registration.surface import LinearSystem, Neighbours, PlaneMatches
-
-# Planes of this weight or more are matched as planes: their thickness is below 5 cm, about twice the noise of a range
-# (see the weight in hybridlio/cloud/plane_fitting.py).
-_PLANE_WEIGHT = 0.9
+from hybridlio.registration.surface import THIN_PLANE_WEIGHT, LinearSystem, Neighbours, PlaneMatches
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +85,7 @@ class MixedNeighbours(Neighbours):
         """Match the points at a pose; points without a neighbour within ``max_distance_m`` are left out."""
         index, source = self.within(pose, max_distance_m)
         planes = self._surface.planes(index)
-        flat = planes[:, 4] >= _PLANE_WEIGHT
+        flat = planes[:, 4] >= THIN_PLANE_WEIGHT
         targets = self._surface.points.take(index[~flat], axis=0)
         plane_matches = PlaneMatches.linearised(pose, source[flat], planes[flat])
         return MixedMatches.linearised(plane_matches, source[~flat], targets, planes[~flat, 4])

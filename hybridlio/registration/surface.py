@@ -26,6 +26,13 @@ from hybridlio.cloud.kd_tree import GrowingKdTree
 from hybridlio.core.arrays import Array
 from hybridlio.registration.information import NORMAL_NOISE, NORMAL_NOISE_WEIGHTED, lever_arms
 
+# Planes of this weight or more are thin: their thickness is below 5 cm, about twice the noise of a range (see the
+# weight in hybridlio/cloud/plane_fitting.py). The others are bushes and the like, which have no front.
+THIN_PLANE_WEIGHT = 0.9
+# Sine of the angle under which the lidar may seem to be behind a plane that it sees: twice the usual tilt of normals,
+# 0.045 rad (hybridlio/registration/information.py).
+_LARGEST_FROM_BEHIND = 0.1
+
 
 @dataclass(frozen=True, eq=False)
 class LinearSystem:
@@ -74,6 +81,19 @@ class PlaneMatches:
     def __len__(self) -> int:
         return len(self.source)
 
+    def facing(self) -> PlaneMatches:
+        """Return the matches without those of thin planes that the lidar would have to see from behind.
+
+        Normals must point to where the planes were seen from.
+        """
+        x, y, z = self.source.T
+        away_m = x * self.rows[3] + y * self.rows[4] + z * self.rows[5]
+        ranges_m = np.sqrt(x * x + y * y + z * z)
+        kept = (away_m < _LARGEST_FROM_BEHIND * ranges_m) | (self.planes[:, 4] < THIN_PLANE_WEIGHT)
+        if kept.all():
+            return self
+        return PlaneMatches(self.pose, self.source[kept], self.planes[kept], self.rows[:, kept])
+
     @property
     def lever_arms_m(self) -> Array:
         """``(3,)`` of the points about the scan's axes, see :func:`hybridlio.registration.information.lever_arms`."""
@@ -99,9 +119,12 @@ class Surface:
         threads: for building the tree.
         weights: ``(M,)`` of the planes, see :func:`hybridlio.cloud.plane_fitting.fit_planes`; by default 1.
         base: a surface to extend: its points come first, and its tree is shared instead of built again.
+        one_sided: normals point to where the planes were seen from, and from behind they are not matched. Else the two
+            sides of a wall, as seen from two rooms, would attract each other's points.
 
     Attributes:
         points: ``(M, 3)`` all points, those of ``base`` first.
+        one_sided: as given, or that of ``base``.
         normal_noise: spurious share of the information that its normals give.
     """
 
@@ -112,16 +135,18 @@ class Surface:
         threads: int = 2,
         weights: Array | None = None,
         base: Surface | None = None,
+        one_sided: bool = False,
     ) -> None:
         planes = _planes(points, normals, weights)
         if base is None:
             self.points, self._planes, self._tree = points, planes, GrowingKdTree(points, threads)
             self.normal_noise = NORMAL_NOISE if weights is None else NORMAL_NOISE_WEIGHTED
+            self.one_sided = one_sided
         else:
             self.points = np.concatenate([base.points, points])
             self._planes = np.concatenate([base._planes, planes])
             self._tree = base._tree.extended(self.points, threads)
-            self.normal_noise = base.normal_noise
+            self.normal_noise, self.one_sided = base.normal_noise, base.one_sided
 
     def extended(self, points: Array, normals: Array, threads: int = 2, weights: Array | None = None) -> Surface:
         """Return a surface with more points after its own, cheaper than one built from all points."""
@@ -182,7 +207,11 @@ class Neighbours:
     def matches(self, pose: Array, max_distance_m: float) -> PlaneMatches:
         """Match the points at a pose with planes; points without a neighbour within ``max_distance_m`` are left out."""
         index, source = self.within(pose, max_distance_m)
-        return PlaneMatches.linearised(pose, source, self._surface.planes(index))
+        return self._linearised(pose, source, self._surface.planes(index))
+
+    def _linearised(self, pose: Array, source: Array, planes: Array) -> PlaneMatches:
+        matches = PlaneMatches.linearised(pose, source, planes)
+        return matches.facing() if self._surface.one_sided else matches
 
     def within(self, pose: Array, max_distance_m: float) -> tuple[NDArray[np.int64], Array]:
         """Return indices ``(M,)`` of the neighbours within a distance, and the scan points ``(M, 3)`` that have one."""

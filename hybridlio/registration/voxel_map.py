@@ -63,7 +63,7 @@ class VoxelMap:
             surface: of the points added so far; None if there are none.
 
         Returns:
-            the points that were added, with their planes.
+            the points that were added, with their planes, whose normals point to the lidar.
         """
         spacing_m, threads = self._settings.spacing_m, self._settings.threads
         moved = se3.transform(T_map_lidar, points)
@@ -81,6 +81,8 @@ class VoxelMap:
         self._cells.record_hits(cells, np.bincount(labels[added], minlength=len(cells)), self._insertions)
         self._insertions += 1
         normals = np.concatenate([planes.normals @ T_map_lidar[:3, :3].T, ring_planes.normals])
+        away = np.einsum("ij,ij->i", normals, moved[added] - T_map_lidar[:3, 3]) > 0
+        normals[away] *= -1
         new = Planes(moved[added], normals, np.concatenate([planes.weights, ring_planes.weights]))
         self._parts.append(new)
         return new

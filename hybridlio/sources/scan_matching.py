@@ -21,6 +21,7 @@ from hybridlio.registration.icp import Registration
 from hybridlio.registration.local_map import LocalMap
 from hybridlio.registration.motion_search import best_start, coarse_kernel_m, fits_better, motions
 from hybridlio.sources.matching_state import MatchingState, PathPoint
+from hybridlio.sources.recent_points import RecentPoints
 from hybridlio.sources.scene_scale import SceneScale
 from hybridlio.sources.settings import ScanMatchingSettings
 from hybridlio.sources.thinned_scan import ThinnedScan, thin
@@ -59,6 +60,7 @@ class ScanMatching:
         self._map = LocalMap(self._settings.local_map)
         self._state = MatchingState(PathPoint(np.eye(4)), PathPoint(np.eye(4)))
         self._stamp_ns = 0
+        self._recent = RecentPoints()
         self.current_scan: ThinnedScan | None = None
 
     def start(self, frame: Frame) -> None:
@@ -77,12 +79,16 @@ class ScanMatching:
             )
         self._map = LocalMap(self._settings.local_map)
         self._state = MatchingState.started(scan.points)
+        self._recent = RecentPoints()
+        self._recent.observe(frame.scan)
+        self._recent.add(scan.points, np.eye(4))
         self.current_scan = scan
         self._stamp_ns = frame.scan.stamp_ns
 
     def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:
         """Register the scan; where that fails, return the initial pose with ``ok`` False."""
         self._insert_pending_keyframe()
+        self._recent.observe(frame.scan)
         self.current_scan = scan = self._thin(frame.scan)
         dt_s = (frame.scan.stamp_ns - self._stamp_ns) / NS_PER_S
         self._stamp_ns = frame.scan.stamp_ns
@@ -113,6 +119,7 @@ class ScanMatching:
 
     def take_back(self, initial: RelativePose) -> None:
         """Discard the last match: the path continues by ``initial``, and the scan does not enter the map."""
+        self._recent.discard_last()
         self._state = self._state.taken_back(initial)
 
     def pair(self, earlier: ThinnedScan, current: ThinnedScan, initial: RelativePose) -> RelativePose:
@@ -143,8 +150,12 @@ class ScanMatching:
         """Move the state on to the pose found and return the step to it."""
         pose, before = observed.registration.pose, self._state.current
         self._state = self._state.matched(pose, dt_s, bool(len(observed.degenerate)), _is_vague(initial))
-        if self._settings.target == "last-scan" or self._state.adrift or self._map.needs_keyframe(pose):
+        self._recent.add(scan.points, pose)
+        if self._settings.target == "last-scan" or self._state.adrift:
             self._state = self._state.keyframe_pending(scan.points)
+        elif self._map.needs_keyframe(pose) or self._recent.is_filling:
+            filled = self._recent.together(scan.points, pose, self._settings.map_voxel_m)
+            self._state = self._state.keyframe_pending(filled)
         covariance = self._covariance(observed, self._keyframes)
         drift = self._drift(covariance, before.map_changed)
         if drift is None:  # the scan it is matched to lies before those that were bridged

@@ -143,7 +143,7 @@ def scaled(given: ScanMatchingSettings, scale: float) -> ScanMatchingSettings:
         settings,
         start_speeds_m_s=tuple(scale * speed for speed in given.start_speeds_m_s),
         registration=_shrunk(registration, RegistrationSettings(), noise_scale, "kernel_m"),
-        local_map=_shrunk(local_map, LocalMapSettings(), noise_scale, "spacing_m"),
+        local_map=replace(_shrunk(local_map, LocalMapSettings(), noise_scale, "spacing_m"), one_sided=True),
     )
 
 

@@ -3,8 +3,9 @@ import pytest
 import small_gicp
 
 from hybridlio.core import se3
+from hybridlio.registration.icp import register
 from hybridlio.registration.local_map import LocalMap
-from hybridlio.registration.settings import LocalMapSettings
+from hybridlio.registration.settings import LocalMapSettings, RegistrationSettings
 
 SETTINGS = LocalMapSettings(threads=1)
 
@@ -205,3 +206,19 @@ def test_rebuilding_an_empty_map_does_nothing():
     local_map = LocalMap(SETTINGS)
     local_map.rebuild_if_due()
     assert local_map.surface is None
+
+
+def test_the_next_room_does_not_pull_at_the_wall_as_seen_from_this_one(rng: np.random.Generator):
+    """The two faces of a wall are 12 cm apart, and only one of them is in the map."""
+    sides = [floor(rng, 3.0, -1.5), floor(rng, 3.0, -1.5)[:, [1, 2, 0]] - [0.0, 1.5, 0.0]]
+    local_map = LocalMap(LocalMapSettings(threads=1, one_sided=True))
+    local_map.insert(np.concatenate([*sides, wall_at(rng, 3.0)]), at(0.0))
+    here = at(5.0)
+    scan = np.concatenate([se3.transform(se3.inverse(here), np.concatenate(sides)), wall_at(rng, -1.88)])
+    assert local_map.surface is not None
+    found = register(local_map.surface, scan, here, RegistrationSettings(threads=1))
+    assert np.linalg.norm(found.pose[:3, 3] - here[:3, 3]) < 0.01
+
+
+def wall_at(rng: np.random.Generator, x_m: float) -> np.ndarray:
+    return np.column_stack([np.full(2000, x_m), rng.uniform(-1.5, 1.5, (2000, 2))])

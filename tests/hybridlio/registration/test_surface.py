@@ -91,3 +91,20 @@ def test_the_point_of_a_single_point_surface_is_every_points_neighbour():
     surface = Surface(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))
     source = np.array([[0.1, 0.0, 0.2], [0.0, 0.3, -0.1]])
     np.testing.assert_allclose(Neighbours(surface, source, 1).matches(np.eye(4), 1.0).rows[6], [0.2, -0.1])
+
+
+def test_a_one_sided_wall_is_matched_from_the_side_that_saw_it_and_a_bush_from_both(rng: np.random.Generator):
+    points = np.column_stack([np.full(200, 2.0), rng.uniform(-1, 1, (200, 2))])
+    normals, weights = np.tile([-1.0, 0.0, 0.0], (200, 1)), np.repeat([1.0, 0.5], 100)  # seen from the origin
+    behind = se3.make(np.eye(3), [4.0, 0.0, 0.0])
+    for one_sided, matched in ((False, 200), (True, 100)):
+        surface = Surface(points, normals, 1, weights, one_sided=one_sided)
+        assert len(Neighbours(surface, points, 1).matches(np.eye(4), 1.0)) == 200
+        assert len(Neighbours(surface, seen_from(behind, points), 1).matches(behind, 1.0)) == matched
+    assert surface.extended(points[:5], normals[:5]).one_sided
+
+
+def test_a_wall_at_a_grazing_angle_is_matched_although_its_normal_is_not_exact():
+    point, normal = np.array([[20.0, 1.0, 0.0]]), np.array([[0.08, -1.0, 0.0]]) / np.hypot(0.08, 1.0)
+    surface = Surface(point, normal, 1, one_sided=True)  # by its normal it is seen from 2° behind
+    assert len(Neighbours(surface, point, 1).matches(np.eye(4), 1.0)) == 1

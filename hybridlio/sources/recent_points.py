@@ -1,0 +1,73 @@
+"""Points of the last second together, for lidars that do not repeat their pattern from scan to scan.
+
+One scan of such a lidar is a set of arcs or scattered points with gaps between them. Neighbours within it often lie on
+one arc, and a plane fitted to them leans. Scans of a second fill the gaps. So keyframes of the map are made of the last
+scans, each at the pose where it was matched. A spinning lidar measures in the same directions in every scan, and its
+scans do not need each other.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hybridlio.cloud.voxel import voxel_average
+from hybridlio.core import se3
+from hybridlio.core.arrays import Array, Floats, Index
+from hybridlio.core.sensors import Scan
+
+# A lidar repeats its pattern if more than this share of a scan's directions, in cells of this size, occur in the scan
+# before. On simulated recordings spinning lidars have 0.91 or more, those that do not repeat 0.40 or less.
+_REPEATED_SHARE, _CELL_DEG = 0.65, 1.0
+_SCANS = 10  # one second at 10 Hz, in which patterns cover most of their field of view
+
+
+class RecentPoints:
+    """Collects the points of the last scans; starts empty."""
+
+    def __init__(self) -> None:
+        self._directions: Index | None = None  # of the first scan, until the second has come
+        self._repeats: bool | None = None
+        self._recent: list[tuple[Array, Array]] = []
+
+    @property
+    def is_filling(self) -> bool:
+        """Whether scans fill each other's gaps, and there are still few of them."""
+        return self._repeats is False and len(self._recent) < _SCANS
+
+    def observe(self, scan: Scan) -> None:
+        """Learn from the first two scans whether the lidar repeats its pattern."""
+        if self._repeats is not None:
+            return
+        directions, before = _directions(scan.points), self._directions
+        self._directions = directions
+        if before is not None:
+            shared = len(np.intersect1d(directions, before, assume_unique=True))
+            self._repeats = shared > _REPEATED_SHARE * len(directions)
+            self._directions = None
+
+    def add(self, points: Array, T_map_lidar: Array) -> None:
+        """Add the points ``(N, 3)`` of a scan that was matched at a pose ``(4, 4)``."""
+        if not self._repeats:
+            self._recent = [*self._recent, (points, T_map_lidar)][-_SCANS:]
+
+    def discard_last(self) -> None:
+        """Discard the scan added last."""
+        self._recent = self._recent[:-1]
+
+    def together(self, points: Array, T_map_lidar: Array, voxel_m: float) -> Array:
+        """Return the points ``(N, 3)`` of the scan at a pose, filled up by the scans before, one a voxel."""
+        if self._repeats is not False or not self._recent:
+            return points
+        T_lidar_map = se3.inverse(T_map_lidar)
+        everything = [se3.transform(T_lidar_map @ pose, earlier) for earlier, pose in self._recent]
+        return np.asarray(voxel_average(np.concatenate(everything), None, voxel_m)[0], np.float64)
+
+
+def _directions(points: Array | Floats) -> Index:
+    """Return the cells of the directions in which points ``(N, 3)`` lie, in ascending order.
+
+    Beams at whole degrees lie in the middle of their cells.
+    """
+    x, y, z = points.T.astype(np.float64)
+    cells = np.rint(np.degrees([np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)]) / _CELL_DEG).astype(np.int64)
+    return np.asarray(np.unique(cells[0] * 1000 + cells[1]))

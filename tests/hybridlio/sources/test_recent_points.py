@@ -1,0 +1,58 @@
+import numpy as np
+import pytest
+
+from hybridlio.core import se3
+from hybridlio.core.sensors import Scan
+from hybridlio.sources.recent_points import RecentPoints
+
+HERE = se3.exp(np.array([0.0, 0.1, 0.3, 1.0, -2.0, 0.5]))
+
+
+def scattered(rng: np.random.Generator, count: int = 6000) -> np.ndarray:
+    """Points around the lidar in random directions: no two scans have the same."""
+    directions = rng.standard_normal((count, 3))
+    return 5 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def rings(rng: np.random.Generator) -> np.ndarray:
+    azimuth, elevation = np.meshgrid(np.radians(np.arange(0, 360, 0.4)), np.radians(np.arange(-15, 16, 2.0)))
+    directions = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    return np.stack(directions, axis=-1).reshape(-1, 3) * rng.uniform(3, 30)
+
+
+def recent(scans: list[np.ndarray]) -> RecentPoints:
+    out = RecentPoints()
+    for k, points in enumerate(scans):
+        out.observe(Scan(k, points.astype(np.float32)))
+        out.add(points, HERE)
+    return out
+
+
+def test_scans_with_rings_do_not_fill_each_other(rng: np.random.Generator):
+    scans = [rings(rng) for _ in range(3)]
+    kept = recent(scans)
+    assert not kept.is_filling
+    assert kept.together(scans[-1], HERE, 0.01) is scans[-1]
+
+
+@pytest.mark.parametrize("count", [2, 9, 10, 12])
+def test_scattered_scans_fill_each_other_over_a_second(rng: np.random.Generator, count: int):
+    scans = [scattered(rng, 500) for _ in range(count)]
+    kept = recent(scans)
+    assert kept.is_filling == (count < 10)
+    expected = np.concatenate(scans[-10:])
+    together = kept.together(scans[-1], HERE, 1e-3)  # a voxel for each point
+    np.testing.assert_allclose(np.sort(together, axis=0), np.sort(expected, axis=0), atol=2e-3)
+
+
+def test_earlier_scans_are_moved_to_the_lidar_at_the_last_one(rng: np.random.Generator):
+    points, motion = scattered(rng, 500), se3.exp(np.array([0.1, 0.0, 0.2, 0.5, 0.0, 0.0]))
+    kept = recent([scattered(rng, 500), points])
+    kept.discard_last()
+    kept.discard_last()
+    kept.add(points, HERE)  # seen again from elsewhere
+    again = se3.transform(se3.inverse(motion), points)
+    kept.add(again, HERE @ motion)
+    together = kept.together(again, HERE @ motion, 0.01)
+    assert len(together) < 1.2 * len(points)
+    np.testing.assert_allclose(np.sort(together, axis=0)[::50], np.sort(again, axis=0)[::50], atol=0.3)
