@@ -45,11 +45,11 @@ def _error(rng: np.random.Generator, covariance: Array) -> Array:
     return xi if len(xi) == 6 else np.r_[0, 0, xi, 0]
 
 
-def run(path: Path, share: float, group: int, seeds: int) -> None:
+def run(path: Path, share: float, group: int, seeds: range) -> None:
     clean = PoseGraph.load(path).optimize().poses
     spread = np.sqrt(((clean[:, :3, 3] - clean[:, :3, 3].mean(axis=0)) ** 2).sum(axis=1).mean())
     errors, doubtful, spent_s = [], [], []
-    for seed in range(seeds):
+    for seed in seeds:
         graph = PoseGraph.load(path)
         add_wrong_loops(graph, clean, share, group, seed)
         begin = time.process_time()
@@ -61,7 +61,8 @@ def run(path: Path, share: float, group: int, seeds: int) -> None:
     right = np.array(errors) < _GOOD_PERCENT
     silent = int((~right & ~np.array(doubtful)).sum())
     print(
-        f"{path.stem:20s} {100 * share:3.0f} % {group:5d} {seeds:5d} {right.sum():5d} {silent:13d} {sum(doubtful):8d} "
+        f"{path.stem:20s} {100 * share:3.0f} % {group:5d} {len(seeds):5d} "
+        f"{right.sum():5d} {silent:13d} {sum(doubtful):8d} "
         f"{np.median(errors):8.3f} {max(errors):8.3f} {np.median(spent_s):6.1f}",
         flush=True,
     )
@@ -72,9 +73,11 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="of g2o files")
     parser.add_argument("names", nargs="*", metavar="NAME", help="files without .g2o (default: all)")
     parser.add_argument("--seeds", type=int, default=10, help="runs of each kind (default: %(default)s)")
+    parser.add_argument("--first-seed", type=int, default=0, help="of the runs (default: %(default)s)")
     parser.add_argument("--shares", type=float, nargs="+", default=[0.1, 0.3], help="of wrong loops")
     parser.add_argument("--groups", type=int, nargs="+", default=[1, 5], help="wrong loops that agree")
     options = parser.parse_args()
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
     paths = [options.folder / f"{name}.g2o" for name in options.names] or sorted(options.folder.glob("*.g2o"))
     print(
         f"{'':20s} {'wrong':>5s} {'group':>5s} {'seeds':>5s} {'right':>5s} {'wrong, silent':>13s} {'doubtful':>8s} "
@@ -83,7 +86,7 @@ def main() -> None:
     for path in paths:
         for share in options.shares:
             for group in options.groups:
-                run(path, share, group, options.seeds)
+                run(path, share, group, seeds)
 
 
 if __name__ == "__main__":

@@ -59,9 +59,14 @@ def toggled(solver: WeightedSolver, start: gtsam.Values, cluster: Index, found: 
         moves = groups or [move for move in _other_moves(best.correct, cluster) if move not in tried]
         if not moves:
             return Alternatives(found, True)
-        tried.add(moves[0])
-        search = _around if moves[0].correct else _without
-        again = search(solver, start, cluster == moves[0].cluster, best.cost + solver.bound)
+        move = moves[0]
+        tried.add(move)
+        members = cluster == move.cluster
+        if move.correct:  # from the best result; the start along the odometry leads elsewhere where it has drifted far
+            with_it = solver.found(best.values, best.correct | members)
+            if not np.array_equal(with_it.correct, best.correct):  # no confirmation: it started from there
+                found.append(with_it)
+        again = (_around if move.correct else _without)(solver, start, members, best.cost + solver.bound)
         if again is not None:
             found.append(again)
             left -= 1
@@ -79,7 +84,7 @@ def _rejected_groups(correct: Mask, cluster: Index) -> list[Move]:
 
 
 def _other_moves(correct: Mask, cluster: Index) -> list[Move]:
-    """Return accepted clusters to be taken as wrong, largest first, then rejected loops and accepted clusters to keep.
+    """Return rejected loops to be taken as correct, then accepted clusters to be taken as wrong, then to be kept.
 
     Keeping an accepted cluster in full from the start leads to other results than finding it does.
     """
@@ -87,7 +92,7 @@ def _other_moves(correct: Mask, cluster: Index) -> list[Move]:
     largest_first = np.argsort(-sizes, kind="stable")
     taken = largest_first[accepted[largest_first] > 0].tolist()
     single = np.flatnonzero((sizes == 1) & (accepted == 0)).tolist()
-    return [*(Move(k, False) for k in taken), *(Move(k, True) for k in single), *(Move(k, True) for k in taken)]
+    return [*(Move(k, True) for k in single), *(Move(k, False) for k in taken), *(Move(k, True) for k in taken)]
 
 
 def _around(solver: WeightedSolver, start: gtsam.Values, cluster: Mask, limit: float) -> Found | None:
