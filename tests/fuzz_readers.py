@@ -45,6 +45,7 @@ from hybridlio.datasets import open_sequence  # noqa: E402
 PACKETS = Path(os.environ.get("HYBRIDLIO_SHARED_DATA", "no such folder")) / "other_lidars"
 BAGS = ("sqlite3", "mcap", "ros1", "lz4")
 HANG_S, MEMORY_BYTES = 10, 2 << 30
+START_S = 300  # until the first line: a busy machine imports and writes the recording for a minute
 LOST_S = 3 * HANG_S  # without a line: the worker hangs where Python's alarm does not reach
 UNCLEAR = "the scan cannot be read ("  # an error that no reader foresaw, turned into one by the sequence
 
@@ -208,7 +209,8 @@ def run(name: str, start: int, count: int, until: float | None) -> Result:
             assert worker.stderr is not None
             began, last = False, ""
             while True:
-                left = LOST_S if until is None else min(LOST_S, max(until - time.monotonic(), 0))
+                limit_s = LOST_S if began or result.counts else START_S
+                left = limit_s if until is None else min(limit_s, max(until - time.monotonic(), 0))
                 ready = select.select([worker.stdout], [], [], left)[0]
                 last = worker.stdout.readline() if ready else ""
                 if not last:

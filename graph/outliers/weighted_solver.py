@@ -131,7 +131,7 @@ class WeightedSolver:
             held: ``(M,)`` loops that keep their full weight.
         """
         control, weights = 0.0, np.zeros(len(candidates))
-        for step in range(_MAX_STEPS):
+        for step in range(_MAX_STEPS if candidates.any() else 0):
             chi2 = self.chi2(values)
             first = min(float(chi2[candidates].max()), largest * bound)
             control = control * graduation if step else first_control(first, bound)
