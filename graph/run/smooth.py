@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, G, V, X
+from numpy.typing import ArrayLike
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
@@ -32,6 +33,7 @@ from hybridlio.graph.run.scan_numbers import ScanNumbers
 from hybridlio.record.record import Record
 from hybridlio.smoothing.calibration import CalibrationPriors
 from hybridlio.smoothing.gps_options import GpsOptions
+from hybridlio.smoothing.loops import given_loops
 from hybridlio.smoothing.smoothed import Smoothed
 from hybridlio.smoothing.verdict import Verdict
 
@@ -49,7 +51,7 @@ def smooth(
     record: Record,
     progress: Progress | None = None,
     *,
-    loops: bool | LoopSettings = False,
+    loops: bool | LoopSettings | Sequence[tuple[int, int, ArrayLike, ArrayLike]] = False,
     gps: bool | GpsOptions = False,
     groups: Sequence[FactorGroup] = (),
     robust: str | None = None,
@@ -60,7 +62,8 @@ def smooth(
     Args:
         record: of the run, from :meth:`hybridlio.odometry.odometry.Odometry.record` or a run folder's ``odometry.npz``.
         progress: called with the stage, the steps done and the steps in total.
-        loops: True, or settings, to find and close loops; ``found["loops"]`` is then a
+        loops: True, or settings, to find and close loops; or loops ``(i, j, T_i_j, covariance)`` of lidar poses, scans
+            by row, which GNC may reject. ``found["loops"]`` is then a
             :class:`hybridlio.smoothing.loops.ClosedLoops`.
         gps: True, or options, to use the record's GPS fixes; ``found["gps"]`` is then a
             :class:`hybridlio.smoothing.gps_options.GpsFit`.
@@ -77,7 +80,7 @@ def smooth(
         EstimationError: too few fixes lie in the run's time.
         ConfigError: an unknown robust method or parameter, a parameter without its sensor, or something else than a
             record.
-        DataError: loops are asked for, and the record has no keyframes.
+        DataError: loops are to be found, and the record has no keyframes; or given loops are malformed.
     """
     if not isinstance(record, Record):
         raise ConfigError(f"smooth takes a Record, got {type(record).__name__}; Record.load(path) reads a run's")
@@ -128,9 +131,13 @@ def _own_trajectory(record: Record) -> dict[str, Any]:
     return {"trajectory": record.online, "step_covariances": steps}
 
 
-def _loop_closures(record: Record, loops: bool | LoopSettings, report: Progress) -> list[LoopClosures]:
+def _loop_closures(
+    record: Record, loops: bool | LoopSettings | Sequence[tuple[int, int, ArrayLike, ArrayLike]], report: Progress
+) -> list[LoopClosures]:
     if loops is False:
         return []
+    if isinstance(loops, Sequence):
+        return [LoopClosures(given_loops(loops, len(record.online)), record.calibration.T_imu_lidar)]
     from hybridlio.smoothing.loop_closure import find_loops  # late: only those who close loops load registration
 
     search = find_loops(record, None if loops is True else loops, report)

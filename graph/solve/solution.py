@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -166,6 +166,32 @@ class Solution(SolutionViews):
         T_j_i = se3.between(self.poses[b], self.poses[a])
         return co.relative_covariance(joint, X(a), X(b), T_j_i, self._data.dimension)
 
+    def velocity_covariance(self, key: Key) -> Array:
+        """Return the covariance ``(3, 3)`` of a velocity in world, m²/s²; raises as :meth:`velocity`."""
+        return _symmetric(self._marginal(self._variable(V(self._known(key)), key, "velocity")))
+
+    def bias_covariance(self, key: Key) -> Array:
+        """Return the covariance ``(6, 6)`` of the biases, accelerometer first; raises as :meth:`bias`."""
+        return _symmetric(self._marginal(self._variable(B(self._known(key)), key, "biases")))
+
+    def joint_covariance(self, keys: Sequence[Key]) -> Array:
+        """Return the joint covariance of several poses and landmarks, in blocks in the order of the keys.
+
+        Each block is as in :meth:`covariance`, which also lists what is raised.
+        """
+        variables = [
+            L(self._data.landmarks.index[key]) if key in self._data.landmarks else X(self._known(key)) for key in keys
+        ]
+        joint: Any = on_deep_stack(len(self._index), lambda: self._marginals.jointMarginalCovariance(variables))
+        orders = [
+            np.argsort(co.GTSAM_ORDER[2]) if self._data.dimension == 2 and key in self._index else slice(None)
+            for key in keys
+        ]
+        return _symmetric(
+            np.block([[joint.at(a, b)[m][:, n] for b, n in zip(variables, orders, strict=True)]
+                      for a, m in zip(variables, orders, strict=True)])
+        )  # fmt: skip
+
     def residual(self, factor_id: int) -> Array:
         """Return the difference of a factor's measurement and the solution, not whitened; of rejected factors too.
 
@@ -250,3 +276,7 @@ class Solution(SolutionViews):
 
     def _known_factor(self, factor_id: int) -> int:
         return self._data.known_factor(factor_id)
+
+
+def _symmetric(covariance: Array) -> Array:
+    return np.asarray((covariance + covariance.T) / 2)

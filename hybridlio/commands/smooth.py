@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hybridlio.commands.common import Verbose, guarded
+from hybridlio.commands.common import Verbose, guarded, split_names
 from hybridlio.commands.shared import completion
 from hybridlio.commands.shared.gps_options import Antenna, MaxShift, Outages, gps_options
 from hybridlio.commands.terminal import print_message, print_result, print_table, print_warning, progress
@@ -19,6 +19,13 @@ if TYPE_CHECKING:
     from hybridlio.record.record import Record
     from hybridlio.smoothing.gps_options import GpsOptions
     from hybridlio.smoothing.smoothed import Smoothed
+
+Calibrate = Annotated[
+    str,
+    typer.Option(
+        metavar="A,B,…", help="Also estimate these: time_offset, extrinsics, and with --gps lever_arm, gps_clock."
+    ),
+]
 
 
 @guarded
@@ -39,6 +46,7 @@ def smooth(
     antenna: Antenna = None,
     outage: Outages = None,
     max_shift: MaxShift = None,
+    calibrate: Calibrate = "",
     robust: Annotated[
         str | None,
         typer.Option(
@@ -77,7 +85,7 @@ def smooth(
     start_ns = int(record.online.stamps_ns[0])
     options = gps and gps_options(antenna, max_shift, outage, start_ns)
     with new_run_folder(stored.metrics["sequence"], folder, overwrite or out is None):
-        smoothed = _smooth(record, loops, options, robust)
+        smoothed = _smooth(record, loops, options, robust, split_names(calibrate))
         if smoothed.verdict.refused:
             raise EstimationError("; ".join(smoothed.verdict.doubts))
         findings = write_smoothed(folder, stored, record, smoothed)
@@ -96,6 +104,10 @@ def _print_result(folder: Path, sequence: str, smoothed: Smoothed, findings: Fin
         print_result(f"GPS: {fit.summary()}")
         if fit.is_doubtful:
             print_warning("most GPS fixes are rejected; check their sigma, the antenna position and --max-shift")
+    if (calibrated := smoothed.found.get("calibration")) is not None:
+        print_result(f"calibration: {calibrated.summary()}")
+        for doubt in calibrated.doubts:
+            print_warning(doubt)
     print_result(smoothed.verdict.summary())
     if not smoothed.converged:
         print_warning("the optimiser stopped at its iteration limit, before it converged")
@@ -105,8 +117,10 @@ def _print_result(folder: Path, sequence: str, smoothed: Smoothed, findings: Fin
     print_result(f"report  {folder / REPORT}")
 
 
-def _smooth(record: Record, loops: bool, gps: bool | GpsOptions, robust: str | None) -> Smoothed:
+def _smooth(
+    record: Record, loops: bool, gps: bool | GpsOptions, robust: str | None, calibrate: tuple[str, ...]
+) -> Smoothed:  # fmt: skip
     from hybridlio.graph.run.smooth import smooth as optimise
 
     with progress("smoothing", "poses", {"loops": "keyframes", "optimising": "rounds"}) as report:
-        return optimise(record, report, loops=loops, gps=gps, robust=robust)
+        return optimise(record, report, loops=loops, gps=gps, robust=robust, calibrate=calibrate)

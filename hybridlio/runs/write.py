@@ -248,4 +248,6 @@ def _smoothed_metrics(
         figures |= {"loops": closed.to_json_dict(len(stored.stamps_before))}
     if fit is not None:
         figures |= {"gps": fit.to_json_dict()}
+    if (calibrated := smoothed.found.get("calibration")) is not None:
+        figures |= {"calibration": calibrated.to_json_dict()}
     return figures | (evaluation.to_json_dict() if evaluation is not None else {})

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from hybridlio.core.arrays import Array
+from hybridlio.core.covariance import check_covariance
+from hybridlio.core.errors import DataError
 from hybridlio.core.estimates import RelativePose
+from hybridlio.core.se3 import check_pose
 
 LISTED = 200  # rejected candidates in metrics.json, so that a run of thousands of loops keeps a readable file
 
@@ -69,6 +76,27 @@ class LoopSearch:
     loops: tuple[Loop, ...]
     rejected: tuple[RejectedLoop, ...]
     seconds: dict[str, float]
+
+
+def given_loops(loops: Sequence[tuple[int, int, ArrayLike, ArrayLike]], scans: int) -> LoopSearch:
+    """Return loops ``(i, j, T_i_j, covariance)`` that another program found, as if a search had found them.
+
+    Args:
+        loops: rows of two scans, the lidar pose of j in the frame of i ``(4, 4)``, and its covariance ``(6, 6)``.
+        scans: number of scans in the run.
+
+    Raises:
+        DataError: a row that the run does not have, a pose that is not rigid, or a covariance that is not positive
+            definite; names the loop.
+    """
+    found = []
+    for i, j, T, covariance in loops:
+        name = f"loop {i}-{j}"
+        if i == j or not (0 <= i < scans and 0 <= j < scans):
+            raise DataError(f"{name}: a loop joins two different scans of 0 to {scans - 1}")
+        pose, spread = check_pose(np.asarray(T), name), check_covariance(np.asarray(covariance), name)
+        found.append(Loop(i, j, pose, spread, matched=1.0, cost=0.0))
+    return LoopSearch(scans, len(found), len(found), tuple(found), (), {})
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from gps_fixes import LEVER, SHIFT_S, rmse_m, with_fixes
 from online_runs import composed
 
 from hybridlio.core import se3
-from hybridlio.core.errors import ConfigError
+from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.sensors import ImuSamples
 from hybridlio.graph.run.smooth import smooth
 from hybridlio.record.record import Record
@@ -133,3 +133,16 @@ def test_priors_may_be_given(chain: Callable[..., Any]):
     found = smooth(wrong_record(drive, 1, 0.0, 0.0, 1e-3), calibrate=priors).found["calibration"]
     assert not found.parameter("time_offset").is_determined
     assert abs(found.imu_time_offset_s) < 1e-6
+
+
+def test_loops_of_another_program_are_closed_and_wrong_ones_are_rejected(chain: Callable[..., Any]):
+    drive = chain(713, carried_path(713, 8.5), steps=80, step_sigmas=np.r_[np.full(3, 5e-3), np.full(3, 0.05)])
+    true = se3.between(drive.lidar_poses[0], drive.lidar_poses[80])
+    wrong = true @ se3.exp([0, 0, 0.5, 4.0, 0, 0])
+    covariance = np.diag(np.r_[np.full(3, 1e-6), np.full(3, 1e-4)])
+    smoothed = smooth(drive.record(composed(drive)), loops=[(0, 80, true, covariance), (1, 79, wrong, covariance)])
+    assert [loop.later for loop in smoothed.found["loops"].kept] == [80]
+    error = se3.between(true, se3.between(smoothed.trajectory.poses[0], smoothed.trajectory.poses[80]))
+    assert np.linalg.norm(error[:3, 3]) < 0.05
+    with pytest.raises(DataError, match="loop 3-99: a loop joins two different scans of 0 to 80"):
+        smooth(drive.record(composed(drive)), loops=[(3, 99, true, covariance)])
