@@ -1,4 +1,4 @@
-"""The pages of the site that are made while it is built: the command line's reference and the files of other folders.
+"""The pages of the site that are made while it is built: the command line, notebooks, and files of other folders.
 
 A hook of MkDocs (``hooks`` in mkdocs.yml). Nothing is written to the docs folder.
 """
@@ -14,7 +14,8 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # the commands of this checkout, installed or not
 
-from docs.make_cli_reference import cli_reference  # noqa: E402  (needs the path above)
+from docs import notebooks  # noqa: E402  (needs the path above)
+from docs.make_cli_reference import cli_reference  # noqa: E402
 
 FROM_ELSEWHERE = {  # page of the site: the file that it shows
     "contributing.md": "CONTRIBUTING.md",
@@ -31,6 +32,9 @@ def on_files(files: Any, config: Any) -> Any:
 
     for page, text in made_pages().items():
         files.append(File.generated(config, page, content=text))
+    for name, content in notebooks.notebooks().items():
+        file = f"{notebooks.FOLDER}/{name}.ipynb"
+        files.append(File.generated(config, file, content=notebooks.ipynb(content)))
     return files
 
 
@@ -39,6 +43,8 @@ def made_pages() -> dict[str, str]:
     pages = {"reference/cli.md": cli_reference()}
     for page, file in FROM_ELSEWHERE.items():
         pages[page] = with_links_of_the_site((ROOT / file).read_text(encoding="utf-8"), file)
+    for name, content in notebooks.notebooks().items():
+        pages[f"{notebooks.FOLDER}/{name}.md"] = notebooks.page(name, content)
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     layout = re.search(r"^## Layout\n(.*?)(?=^## )", readme, flags=re.DOTALL | re.MULTILINE)
     pages[LAYOUT] = f"# Layout\n{with_links_of_the_site(layout[1], 'README.md')}" if layout else ""

@@ -102,3 +102,24 @@ def test_a_plain_checkout_works_without_installing(project_root, tmp_path):
     files = run_python("-c", code, cwd=checkout).split()
     assert all(Path(file).is_relative_to(checkout / "hybridlio") for file in files)
     assert hybridlio.__version__ in run_python("-m", "hybridlio", "--version", cwd=checkout)
+
+
+def test_the_image_has_the_system_libraries_that_the_checkout_installs_and_leaves_no_source_out(project_root):
+    script = (project_root / "scripts/system-libraries.sh").read_text()
+    packages = script.partition("packages=(")[2].partition(")")[0].split()
+    image = (project_root / "Dockerfile").read_text()
+    assert [package for package in packages if package not in image.split()] == []
+    ignored = [line for line in (project_root / ".dockerignore").read_text().splitlines() if line and line[0] != "#"]
+    kept = git_files(project_root)
+    for pattern in ignored:  # rooted unless it begins with **
+        name = pattern.removeprefix("**/").rstrip("/")
+        inside = [f for f in kept if Path(f).match(name) or f.startswith(f"{name}/")]
+        assert inside == [], pattern
+
+
+def git_files(root: Path) -> list[str]:
+    """Return the files of the checkout that git keeps; all of them below the packages where there is no git."""
+    done = subprocess.run(["git", "ls-files"], cwd=root, capture_output=True, text=True, check=False)
+    if done.returncode == 0:
+        return done.stdout.split("\n")
+    return [p.relative_to(root).as_posix() for name in PACKAGES for p in (root / name).rglob("*.py")]
