@@ -15,7 +15,6 @@ from hybridlio.commands.shared import completion
 from hybridlio.commands.shared.training_process import Device, first_process_progress, is_first_process
 from hybridlio.commands.terminal import print_message, print_result
 from hybridlio.core.errors import ConfigError
-from hybridlio.core.lidar_models import LIDAR_MODELS
 from hybridlio.datasets.rosbag.choices import NO_CHOICE, BagTopics
 from hybridlio.odometry.registry import INITIAL_POSE_SOURCES
 
@@ -45,7 +44,7 @@ Lidar = Annotated[
     typer.Option(
         metavar="NAME",
         autocompletion=completion.lidar_model,
-        help=f"The lidar of simulated drives: {', '.join(LIDAR_MODELS)}.",
+        help="The lidar of simulated drives: hdl-64e, 32-beam, 16-beam.",
     ),
 ]
 Preset = Annotated[
@@ -166,6 +165,8 @@ def _check_options(
 ) -> None:
     if not data and simulate is None:
         raise ConfigError("nothing to train on: give recordings, or --simulate N for simulated drives")
+    from hybridlio.core.lidar_models import LIDAR_MODELS
+
     if lidar not in LIDAR_MODELS:
         raise ConfigError(f"--lidar: unknown lidar {lidar!r}; choose one of {', '.join(LIDAR_MODELS)}")
     if steps is not None and epochs is not None:

@@ -7,6 +7,7 @@ import yaml
 from typer.testing import CliRunner
 
 from hybridlio.commands.app import app
+from hybridlio.core.lidar_models import LIDAR_MODELS
 from hybridlio.learned.networks.weights import load_weights
 from hybridlio.learned.training.training_log import read_log
 from hybridlio.runs.training import simulated_data
@@ -161,6 +162,10 @@ def test_simulated_drives_train_and_validate_without_recordings_and_are_kept(rec
     assert [name.rsplit("-", 1)[0] for name in drives] == ["simulated-41000", "simulated-45000"]
     assert "simulated-41000" in load_weights(tmp_path / "run" / "weights.safetensors").about["data"]
     assert any("validation/loss" in row for row in read_log(tmp_path / "run" / "log.jsonl"))
+
+
+def test_the_help_names_every_lidar():
+    assert all(name in run("--help").output for name in LIDAR_MODELS)
 
 
 @pytest.mark.parametrize(
