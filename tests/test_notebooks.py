@@ -87,6 +87,6 @@ def test_a_notebook_begins_with_its_title_and_keeps_every_line_of_its_code(name:
     nbformat.validate(notebook)
     code = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
     compile("\n".join(code), name, "exec")
-    lines = [line for line in (FOLDER / f"{name}.py").read_text().splitlines() if line and not line.startswith("# ")]
+    lines = [line for line in (FOLDER / f"{name}.py").read_text().splitlines() if line and not line.startswith("#")]
     assert [line for line in lines if line not in "\n".join(code)] == []
     assert all(block in page(name, content) for block in code)

@@ -9,6 +9,7 @@ import typer
 
 from hybridlio.commands import common
 from hybridlio.commands.common import guarded
+from hybridlio.commands.shared import completion
 from hybridlio.commands.terminal import print_result, print_warning, progress
 from hybridlio.core.errors import ConfigError
 from hybridlio.datasets.rosbag.choices import NO_CHOICE, BagTopics
@@ -27,7 +28,10 @@ def calibrate(
     parameters: Annotated[
         str,
         typer.Option(
-            "--calibrate", metavar="A,B,…", help="What to find: extrinsics, time_offset, lever_arm, gps_clock."
+            "--calibrate",
+            metavar="A,B,…",
+            autocompletion=completion.calibrated,
+            help="What to find: extrinsics, time_offset, lever_arm, gps_clock.",
         ),
     ] = "extrinsics,time_offset",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file.")] = False,

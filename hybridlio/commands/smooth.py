@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 Calibrate = Annotated[
     str,
     typer.Option(
-        metavar="A,B,…", help="Also estimate these: time_offset, extrinsics, and with --gps lever_arm, gps_clock."
+        metavar="A,B,…",
+        autocompletion=completion.calibrated,
+        help="Also estimate these: time_offset, extrinsics, and with --gps lever_arm, gps_clock.",
     ),
 ]
 

@@ -275,5 +275,5 @@ def test_an_empty_graph_and_bad_settings_are_refused(rng):
         graph.online().update()
     with pytest.raises(ConfigError, match="newton"):
         graph.online("newton")
-    with pytest.raises(ConfigError, match="lag 0"):
+    with pytest.raises(ConfigError, match="lag must be"):
         graph.online("fixed-lag", lag=0)

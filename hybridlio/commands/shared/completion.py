@@ -51,6 +51,12 @@ def _robust_methods() -> Iterable[str]:
     return ROBUST_METHODS
 
 
+def _calibrated() -> Iterable[str]:
+    from hybridlio.smoothing.calibration import CALIBRATED
+
+    return CALIBRATED
+
+
 def _solvers() -> Iterable[str]:
     from hybridlio.graph.solve.settings import SOLVERS
 
@@ -120,6 +126,7 @@ def _splits() -> Iterable[str]:
 
 initial_pose, residual, backend = _one_of(_initial_poses), _one_of(_residuals), _one_of(_backends)
 reader, robust_method, solver = _one_of(_readers), _one_of(_robust_methods), _one_of(_solvers)
+calibrated = _one_of(_calibrated)
 lidar_model, colour, map_format = _one_of(_lidar_models), _one_of(_colours), _one_of(_map_formats)
 scene, driving, platform, lidar, imu = map(_one_of, (_scenes, _driving, _platforms, _lidars, _imus))
 preset, split = _one_of(_presets), _one_of(_splits)
