@@ -21,7 +21,7 @@ from common import nanoseconds
 import hybridlio as hl
 from hybridlio.core import se3
 from hybridlio.core.sensors import NS_PER_S
-from hybridlio.core.trajectory_files import read_kitti
+from hybridlio.core.trajectory import read_kitti
 from hybridlio.datasets.imu_faults import without_filled_gaps
 from hybridlio.evaluation.ate_rpe import align, associate
 from hybridlio.record.imu_clock import on_poses_clock

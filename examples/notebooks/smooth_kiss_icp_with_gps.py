@@ -10,7 +10,7 @@ import numpy as np
 
 import hybridlio as hl
 from hybridlio.core import se3
-from hybridlio.core.trajectory_files import read_trajectory, write_tum
+from hybridlio.core.trajectory import read_trajectory, write_tum
 
 config = hl.SimulationConfig(seconds=8, seed=3, lidar="16-beam", gps=True)
 sequence = hl.open_sequence(hl.simulate("drives", config))

@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError, DataError
-from hybridlio.core.trajectory import Trajectory
-from hybridlio.core.trajectory_files import write_tum
+from hybridlio.core.trajectory import Trajectory, write_tum
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, to_integer
 

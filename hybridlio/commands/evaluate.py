@@ -56,7 +56,7 @@ def load_pair(estimate: Path, reference: Path | None) -> tuple[Trajectory, Traje
     """Return the reference, the estimate and, for a run folder, the estimate's steps."""
     import numpy as np
 
-    from hybridlio.core.trajectory_files import read_pair, read_trajectory
+    from hybridlio.core.trajectory import read_pair, read_trajectory
     from hybridlio.runs.folder import read_run
 
     if not estimate.is_dir():

@@ -21,7 +21,7 @@ import numpy as np
 from hybridlio.core.arrays import Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import NS_PER_S, ImuSamples
-from hybridlio.core.trajectory_files import read_tum
+from hybridlio.core.trajectory import read_tum
 from hybridlio.datasets.calibration_yaml import read_calibration_yaml
 from hybridlio.datasets.gps_csv import note_fixes, read_gps_csv
 from hybridlio.datasets.imu_csv import read_imu_csv

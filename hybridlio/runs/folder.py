@@ -20,8 +20,7 @@ from hybridlio.core.estimates import RelativePose
 from hybridlio.core.files import UNREADABLE_NPZ, atomic_path, write_atomically
 from hybridlio.core.motion_limits import unknown_motion_covariance
 from hybridlio.core.sensors import NS_PER_S
-from hybridlio.core.trajectory import Trajectory
-from hybridlio.core.trajectory_files import read_tum, write_kitti, write_tum
+from hybridlio.core.trajectory import Trajectory, read_tum, write_kitti, write_tum
 from hybridlio.evaluation.ate_rpe import select
 from hybridlio.evaluation.evaluate import Steps
 from hybridlio.runs.whole_folder import COMPLETE_MARKER, JOURNAL, STATE

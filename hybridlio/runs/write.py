@@ -12,7 +12,7 @@ from hybridlio.core.errors import EstimationError
 from hybridlio.core.files import write_atomically
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.tables import counted
-from hybridlio.core.trajectory_files import write_tum
+from hybridlio.core.trajectory import write_tum
 from hybridlio.core.version import __version__
 from hybridlio.datasets.notes import labelled
 from hybridlio.datasets.protection import check_output

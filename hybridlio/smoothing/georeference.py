@@ -18,8 +18,7 @@ from hybridlio.core.files import write_atomically
 from hybridlio.core.geodesy import GeodeticPoint, geodetic_from_enu
 from hybridlio.core.pose_interpolation import PosePath
 from hybridlio.core.sensors import NS_PER_S
-from hybridlio.core.trajectory import Trajectory
-from hybridlio.core.trajectory_files import write_tum
+from hybridlio.core.trajectory import Trajectory, write_tum
 from hybridlio.smoothing.gps_alignment import LEVEL_SIGMA_RAD, MAX_SHIFT_S, FixAlignment, align_fixes
 
 if TYPE_CHECKING:

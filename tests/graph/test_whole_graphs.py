@@ -8,7 +8,7 @@ import pytest
 
 from hybridlio.core import se3
 from hybridlio.core.errors import DataError, GraphError
-from hybridlio.core.trajectory_files import read_trajectory
+from hybridlio.core.trajectory import read_trajectory
 from hybridlio.graph import PoseGraph
 
 SIGMAS = np.array([0.02, 0.03, 0.04, 0.1, 0.2, 0.3])

@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Stamps
 from hybridlio.core.sensors import ImuSamples, Scan
-from hybridlio.core.trajectory import Trajectory
-from hybridlio.core.trajectory_files import write_kitti, write_tum
+from hybridlio.core.trajectory import Trajectory, write_kitti, write_tum
 
 EARTH_RADIUS_M, LATITUDE_DEG, LONGITUDE_DEG = 6378137.0, 49.0, 8.4
 SPEED_M_S, YAW_RATE_RAD_S = 8.0, 0.2

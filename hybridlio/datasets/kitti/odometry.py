@@ -17,8 +17,7 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Index, Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import Calibration, ImuSamples
-from hybridlio.core.trajectory import Trajectory
-from hybridlio.core.trajectory_files import read_kitti
+from hybridlio.core.trajectory import Trajectory, read_kitti
 from hybridlio.datasets.kitti.drive_imu import drive_imu
 from hybridlio.datasets.kitti.files import (
     KITTI_LIDAR,

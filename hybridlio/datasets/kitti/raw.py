@@ -24,8 +24,7 @@ import numpy as np
 from hybridlio.core.arrays import Array, Index, Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import Calibration
-from hybridlio.core.trajectory import Trajectory
-from hybridlio.core.trajectory_files import read_kitti
+from hybridlio.core.trajectory import Trajectory, read_kitti
 from hybridlio.datasets.gps_csv import note_fixes, read_gps_csv
 from hybridlio.datasets.kitti.drive_imu import drive_imu, fast_rows
 from hybridlio.datasets.kitti.files import (

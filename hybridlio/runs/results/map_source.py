@@ -7,8 +7,7 @@ from pathlib import Path
 
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.geodesy import GeodeticPoint
-from hybridlio.core.trajectory import Trajectory
-from hybridlio.core.trajectory_files import read_trajectory
+from hybridlio.core.trajectory import Trajectory, read_trajectory
 from hybridlio.datasets.registry import open_sequence, reopen
 from hybridlio.datasets.sequence import Sequence, frame_range
 from hybridlio.datasets.source import Source

@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
-from hybridlio.core.trajectory import Trajectory
-from hybridlio.core.trajectory_files import is_tum_file, read_trajectory
+from hybridlio.core.trajectory import Trajectory, is_tum_file, read_trajectory
 from hybridlio.simulation.drive.path import SmoothPath
 from hybridlio.simulation.rig import SCAN_RATE_HZ, T_CAMERA_LIDAR, T_LIDAR_IMU
 
@@ -29,7 +28,7 @@ def read_lidar_poses(path: Path, frame: str) -> Array:
         frame: what the poses of a KITTI file are of, ``camera`` or ``lidar``.
 
     Raises:
-        DataError: as :func:`hybridlio.core.trajectory_files.read_trajectory`, or fewer than 10 poses.
+        DataError: as :func:`hybridlio.core.trajectory.read_trajectory`, or fewer than 10 poses.
     """
     recorded, is_tum = read_trajectory(path), is_tum_file(path)
     if len(recorded) < _MIN_POSES:

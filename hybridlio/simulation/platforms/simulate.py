@@ -14,7 +14,7 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.files import locked, write_atomically
 from hybridlio.core.progress import Progress
 from hybridlio.core.sensors import ImuSamples, Scan
-from hybridlio.core.trajectory_files import write_tum
+from hybridlio.core.trajectory import write_tum
 from hybridlio.datasets.protection import check_output
 from hybridlio.simulation.platforms.config import PlatformConfig
 from hybridlio.simulation.platforms.recording import PlatformRecording, plan

@@ -8,7 +8,7 @@ import pytest
 from command_line import ok, refused, run
 
 import hybridlio
-from hybridlio.core.trajectory_files import read_tum
+from hybridlio.core.trajectory import read_tum
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.odometry.config import Config, parse_config
 from hybridlio.runs.folder import FILES

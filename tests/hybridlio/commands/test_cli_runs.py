@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from command_line import ok, refused, run
 
-from hybridlio.core.trajectory_files import read_tum
+from hybridlio.core.trajectory import read_tum
 from hybridlio.record.loop_keyframes import LoopKeyframes
 from hybridlio.runs.folder import FILES
 

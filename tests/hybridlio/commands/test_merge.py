@@ -11,7 +11,7 @@ import pytest
 from command_line import ok, refused
 
 from hybridlio.core import se3
-from hybridlio.core.trajectory_files import read_tum, write_tum
+from hybridlio.core.trajectory import read_tum, write_tum
 from hybridlio.graph import PoseGraph
 from hybridlio.localization.open_map import open_prior_map
 from hybridlio.runs.folder import read_run

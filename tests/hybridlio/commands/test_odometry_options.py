@@ -13,7 +13,7 @@ import pytest
 from command_line import ok, refused
 
 from hybridlio.core.errors import ConfigError
-from hybridlio.core.trajectory_files import read_tum
+from hybridlio.core.trajectory import read_tum
 from hybridlio.datasets.sequence import Sequence
 
 pytestmark = pytest.mark.usefixtures("plain_logging", "without_pages")

@@ -11,8 +11,7 @@ import pytest
 from hybridlio.core import se3
 from hybridlio.core.errors import DataError
 from hybridlio.core.lidar_models import LIDAR_MODELS
-from hybridlio.core.trajectory import Trajectory
-from hybridlio.core.trajectory_files import write_tum
+from hybridlio.core.trajectory import Trajectory, write_tum
 from hybridlio.datasets import open_sequence
 
 

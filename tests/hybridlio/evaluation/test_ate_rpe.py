@@ -7,8 +7,7 @@ from evo.core.trajectory import PoseTrajectory3D
 
 from hybridlio.core import se3
 from hybridlio.core.errors import ConfigError, DataError, EstimationError
-from hybridlio.core.trajectory import Trajectory
-from hybridlio.core.trajectory_files import read_kitti
+from hybridlio.core.trajectory import Trajectory, read_kitti
 from hybridlio.evaluation.ate_rpe import associate, ate, rpe
 
 

@@ -5,8 +5,7 @@ import pytest
 
 from hybridlio.core import se3
 from hybridlio.core.errors import DataError
-from hybridlio.core.trajectory import Trajectory
-from hybridlio.core.trajectory_files import read_kitti
+from hybridlio.core.trajectory import Trajectory, read_kitti
 from hybridlio.evaluation.drift import KITTI_LENGTHS_M, kitti_drift, lengths_for
 
 

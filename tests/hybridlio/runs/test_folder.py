@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from hybridlio.core import se3
 from hybridlio.core.errors import DataError, EstimationError
 from hybridlio.core.sensors import Calibration
-from hybridlio.core.trajectory_files import read_kitti, read_tum
+from hybridlio.core.trajectory import read_kitti, read_tum
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.odometry.config import Config, load_config
 from hybridlio.odometry.odometry import Odometry

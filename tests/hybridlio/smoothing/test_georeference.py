@@ -14,8 +14,7 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.geodesy import GeodeticPoint, enu_from_geodetic, geodetic_from_enu, origin_of
 from hybridlio.core.pose_interpolation import PosePath
 from hybridlio.core.sensors import Calibration, GpsFix, ImuSamples
-from hybridlio.core.trajectory import Trajectory
-from hybridlio.core.trajectory_files import read_tum
+from hybridlio.core.trajectory import Trajectory, read_tum
 from hybridlio.datasets.imu_faults import filled_gaps, without_filled_gaps
 from hybridlio.record.odometry_noise import odometry_noise
 from hybridlio.record.record import Record

@@ -12,7 +12,7 @@ import pytest
 
 from hybridlio.core import se3
 from hybridlio.core.errors import DataError
-from hybridlio.core.trajectory_files import read_kitti, write_kitti
+from hybridlio.core.trajectory import read_kitti, write_kitti
 from hybridlio.datasets import open_sequence
 from hybridlio.datasets.kitti.odometry import RAW_DRIVES
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from hybridlio.core.errors import DataError
-from hybridlio.core.trajectory import Trajectory
-from hybridlio.core.trajectory_files import write_kitti
+from hybridlio.core.trajectory import Trajectory, write_kitti
 from hybridlio.datasets import open_sequence
 
 MS = 1_000_000

@@ -13,8 +13,7 @@ import pytest
 from hybridlio.core.errors import DataError
 from hybridlio.core.lidar_models import LIDAR_MODELS
 from hybridlio.core.sensors import ImuNoise
-from hybridlio.core.trajectory import Trajectory
-from hybridlio.core.trajectory_files import write_kitti
+from hybridlio.core.trajectory import Trajectory, write_kitti
 from hybridlio.datasets import open_sequence
 
 MS = 1_000_000

@@ -88,7 +88,7 @@ def small_2(tmp_path: Path) -> SmallBag:
 @pytest.fixture(scope="session")
 def as_folder() -> Callable[[Path, Drive], Path]:
     """Writes the drive as a plain folder."""
-    from hybridlio.core.trajectory_files import write_tum
+    from hybridlio.core.trajectory import write_tum
 
     def write(root: Path, drive: Drive) -> Path:
         sequence, folder = drive.sequence, root / "plain"

@@ -19,7 +19,7 @@ from command_line import ok, refused, run
 
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.sensors import Frame
-from hybridlio.core.trajectory_files import read_tum
+from hybridlio.core.trajectory import read_tum
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.odometry.config import Config

@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridlio.core import se3
-from hybridlio.core.errors import DataError
-from hybridlio.core.trajectory import Trajectory
-from hybridlio.core.trajectory_files import (
+from hybridlio.core.errors import ConfigError, DataError
+from hybridlio.core.trajectory import (
+    Trajectory,
     _format_stamp,
     read_kitti,
     read_pair,
@@ -149,3 +149,17 @@ def test_rotations_rounded_to_four_decimals_are_accepted(tmp_path: Path, traject
         "\n".join(" ".join(f"{v:.4f}" for v in row) for row in trajectory.poses[:, :3].reshape(-1, 12))
     )
     np.testing.assert_allclose(read_kitti(tmp_path / "short.txt").poses, trajectory.poses, atol=2e-4)
+
+
+@pytest.mark.parametrize("format", ["tum", "kitti"])
+def test_a_saved_trajectory_is_loaded_again(tmp_path: Path, trajectory: Trajectory, format: str) -> None:
+    trajectory.save(tmp_path / "t.txt", format)
+    back = Trajectory.load(tmp_path / "t.txt", trajectory.stamps_ns if format == "kitti" else None)
+    assert (back.stamps_ns == trajectory.stamps_ns).all()
+    assert np.allclose(back.poses, trajectory.poses, atol=1e-9)
+
+
+def test_an_unknown_format_lists_the_known_ones(tmp_path: Path, trajectory: Trajectory) -> None:
+    with pytest.raises(ConfigError, match="tum or kitti"):
+        trajectory.save(tmp_path / "t.txt", "evo")
+    assert not (tmp_path / "t.txt").exists()
