@@ -2,8 +2,8 @@
 
 Compares hybridlio with the library ``rosbags`` alone, which iterates over all messages and deserialises each. Prints
 seconds of processor time, the least of the repeats; of hybridlio those of opening, which passes over the bag once, and
-of loading every scan in order; and the process's largest memory. With ``--longer`` each bag is first written again with
-all its messages so many times, one after the other.
+of loading every scan in order; and the process's largest memory. ``--longer N`` first writes each bag again, to FOLDER,
+with all its messages repeated N times.
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ from hybridlio.core.errors import ConfigError, EstimationError
 if TYPE_CHECKING:
     from hybridlio.evaluation.report_data import Findings
     from hybridlio.record.record import Record
+    from hybridlio.runs.folder import StoredRun
     from hybridlio.smoothing.gps_options import GpsOptions
     from hybridlio.smoothing.smoothed import Smoothed
 
@@ -63,11 +64,8 @@ def smooth(
 
     Of a run that was killed, or still goes, the scans so far are smoothed; the default folder is then RUN-smoothed.
     """
-    from hybridlio.record.loop_keyframes import LoopKeyframes
-    from hybridlio.record.record import Record
-    from hybridlio.runs.folder import KEYFRAMES, RECORD, SMOOTHED, is_run_folder, read_run
+    from hybridlio.runs.folder import SMOOTHED, is_run_folder
     from hybridlio.runs.new_folder import new_run_folder
-    from hybridlio.runs.unfinished.kept import read_unfinished
     from hybridlio.runs.whole_folder import JOURNAL, partial_folder
     from hybridlio.runs.write import write_smoothed
 
@@ -77,13 +75,7 @@ def smooth(
     folder = out or (run.with_name(f"{run.name}-{SMOOTHED}") if is_unfinished else run / SMOOTHED)
     if folder.resolve() == run.resolve():
         raise ConfigError(f"{folder} is the run itself; choose another folder with -o")
-    if is_unfinished:
-        stored, record = read_unfinished(run)
-        print_message(f"{run} is not finished: smoothing its first {stored.metrics['frames_done']} scans", "yellow")
-    else:
-        stored, record = read_run(run), Record.load(run / RECORD)
-    if loops and not is_unfinished:
-        record = replace(record, keyframes=LoopKeyframes.load(run / KEYFRAMES))
+    stored, record = _unfinished(run) if is_unfinished else _finished(run, loops)
     start_ns = int(record.online.stamps_ns[0])
     options = gps and gps_options(antenna, max_shift, outage, start_ns)
     with new_run_folder(stored.metrics["sequence"], folder, overwrite or out is None):
@@ -92,6 +84,24 @@ def smooth(
             raise EstimationError("; ".join(smoothed.verdict.doubts))
         findings = write_smoothed(folder, stored, record, smoothed)
     _print_result(folder, stored.metrics["sequence"], smoothed, findings)
+
+
+def _unfinished(run: Path) -> tuple[StoredRun, Record]:
+    from hybridlio.runs.unfinished.kept import read_unfinished
+
+    stored, record = read_unfinished(run)
+    print_message(f"{run} is not finished: smoothing its first {stored.metrics['frames_done']} scans", "yellow")
+    return stored, record
+
+
+def _finished(run: Path, loops: bool) -> tuple[StoredRun, Record]:
+    """Return a run and its record, for loops with the keyframes."""
+    from hybridlio.record.loop_keyframes import LoopKeyframes
+    from hybridlio.record.record import Record
+    from hybridlio.runs.folder import KEYFRAMES, RECORD, read_run
+
+    stored, record = read_run(run), Record.load(run / RECORD)
+    return stored, replace(record, keyframes=LoopKeyframes.load(run / KEYFRAMES)) if loops else record
 
 
 def _print_result(folder: Path, sequence: str, smoothed: Smoothed, findings: Findings) -> None:

@@ -229,12 +229,11 @@ class _Run:
         if validation is not None and due:
             found = validate(self.network, validation, self.recipe, self.place)
             if self.log is not None:
-                self._keep_validation(found)
+                self._keep_validation(found, self.log)
         self._save()
 
-    def _keep_validation(self, found: Validation) -> None:
-        if self.log is not None:
-            self.log.write(self.step, **{f"validation/{name}": value for name, value in asdict(found).items()})
+    def _keep_validation(self, found: Validation, log: TrainingLog) -> None:
+        log.write(self.step, **{f"validation/{name}": value for name, value in asdict(found).items()})
         self.best.offer(found, self.step, self.network, self.recipe, self._origin())
         if self.watchers.validated is not None:
             self.watchers.validated(self.step, found)
