@@ -29,7 +29,7 @@ def drift_percent(sequence: hl.Sequence, scans: int) -> float:
     part = sequence.part(0, min(scans, len(sequence)))
     run = run_odometry(part, hl.Odometry())
     assert part.reference is not None
-    evaluation = hl.evaluate(part.reference, run.trajectory)
+    evaluation = hl.evaluate(run.trajectory, part.reference)
     return 100 * evaluation.ate_m / max(part.reference.length_m, 1e-9)
 
 

@@ -48,7 +48,7 @@ def evaluation_of(trajectory: Trajectory, sequence: Sequence) -> Evaluation | No
     if sequence.reference is None or sequence.reference.length_m < 1:
         return None
     try:
-        return evaluate(sequence.reference, trajectory)
+        return evaluate(trajectory, sequence.reference)
     except HybridLioError as error:
         print(f"not evaluated: {error}")
         return None

@@ -72,7 +72,7 @@ def make_record(odometry: hl.Trajectory, imu: hl.ImuSamples, gps: tuple[hl.GpsFi
 
 
 def report(name: str, truth: hl.Trajectory, estimate: hl.Trajectory, time_spent: str = "") -> None:
-    e = hl.evaluate(truth, estimate)
+    e = hl.evaluate(estimate, truth)
     figures = f"ATE {e.ate_m:6.3f} m  t_rel {e.t_rel_percent:.3f} %  r_rel {e.r_rel_deg_per_100m:.3f} °/100 m"
     print(f"{name:24s} {figures}  RPE {e.rpe_m:.4f} m {e.rpe_deg:.4f}°  {time_spent}", flush=True)
 
@@ -84,9 +84,9 @@ def smooth(name: str, truth: hl.Trajectory, record: Record, gps: GpsOptions | No
     if gps is not None:
         print(f"{'':24s} {smoothed.found['gps'].summary()}")
     for start, end in gps.outages if gps is not None else ():
-        both = associate(truth, smoothed.trajectory)
+        both = associate(smoothed.trajectory, truth)
         inside = (both.reference.stamps_ns >= start) & (both.reference.stamps_ns <= end)
-        aligned = align(both.reference, both.estimate, lever_m=0.0).poses[inside, :3, 3]
+        aligned = align(both.estimate, both.reference, lever_m=0.0).poses[inside, :3, 3]
         off = np.linalg.norm(aligned - both.reference.poses[inside, :3, 3], axis=1)
         print(
             f"{'':24s} during the outage: RMSE {np.sqrt((off**2).mean()):.2f} m, at most {off.max():.2f} m", flush=True

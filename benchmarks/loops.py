@@ -127,7 +127,7 @@ def evaluate(case: Case, robust: str | None) -> dict[str, str]:
     closed = smoothed.found["loops"]
     search = closed.search
     online, without, with_loops = (
-        hl.evaluate(case.truth, t).ate_m for t in (record.online, without_loops.trajectory, smoothed.trajectory)
+        hl.evaluate(t, case.truth).ate_m for t in (record.online, without_loops.trajectory, smoothed.trajectory)
     )
     return {
         "case": case.name,
@@ -153,7 +153,7 @@ def evaluate(case: Case, robust: str | None) -> dict[str, str]:
 
 def true_poses(case: Case) -> np.ndarray:
     """Return the true poses ``(N, 4, 4)`` at the run's scans."""
-    both = associate(case.truth, case.record.online)
+    both = associate(case.record.online, case.truth)
     assert len(both.reference) == len(case.record.online), f"{case.name}: some scans have no true pose"
     return both.reference.poses
 

@@ -60,7 +60,7 @@ def evaluation_of(run: Pass, recording: PlatformRecording) -> Evaluation | str:
     estimate = run.trajectory()
     truth = recording.lidar_poses((estimate.stamps_ns - START_NS) / NS_PER_S)
     try:
-        return evaluate(Trajectory(estimate.stamps_ns, truth).from_first(), estimate, [_OVER_M])
+        return evaluate(estimate, Trajectory(estimate.stamps_ns, truth).from_first(), [_OVER_M])
     except HybridLioError as error:
         return str(error)
 

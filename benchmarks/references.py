@@ -82,7 +82,7 @@ def scatter_of_drift(stamps_ns: NDArray[np.int64], a: Array, b: Array, error: Ar
     for _ in range(_DRAWS):
         noisy = midway @ se3.exp(sigmas * rng.standard_normal((len(midway), 6)))
         reference = Trajectory(stamps_ns, se3.between(noisy[0], noisy))
-        one, other = (drift_of(evaluate(reference, Trajectory(stamps_ns, poses))) for poses in (a, b))
+        one, other = (drift_of(evaluate(Trajectory(stamps_ns, poses), reference)) for poses in (a, b))
         found.append(np.subtract(one, other))
     return np.asarray(np.std(found, axis=0))
 

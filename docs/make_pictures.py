@@ -85,7 +85,7 @@ def main() -> None:
     draw_scan(below, sequence[len(sequence) // 2].scan)
     IMAGES.mkdir(exist_ok=True)
     figure.savefig(IMAGES / "drive.png", dpi=110, facecolor=BACKGROUND)
-    evaluation = hl.evaluate(sequence.reference, hl.Trajectory(sequence.stamps_ns, poses))
+    evaluation = hl.evaluate(hl.Trajectory(sequence.stamps_ns, poses), sequence.reference)
     print(f"{IMAGES / 'drive.png'}: {evaluation.length_m:.0f} m, error at the end {evaluation.end_error_m:.2f} m")
 
 

@@ -46,7 +46,7 @@ def main(folder: str | None = None, *_: str) -> None:
     outage = (int(stamps[70]), int(stamps[135]))
     for name, gps in (("without GPS", False), ("with GPS", True), ("with an outage", GpsOptions(outages=[outage]))):
         smoothed = hl.smooth(record, gps=gps)
-        print(f"{name}: ATE {ate(truth, smoothed.trajectory, lever_m=0.0).rmse_m:.3f} m")
+        print(f"{name}: ATE {ate(smoothed.trajectory, truth, lever_m=0.0).rmse_m:.3f} m")
     print(f"GPS with the outage: {smoothed.found['gps'].summary()}")
     placed = georeference(record, smoothed.trajectory)
     for path in write_georeferenced(Path(folder or tempfile.mkdtemp(prefix="hybridlio-")), placed):

@@ -23,7 +23,7 @@ def main(folder: str | None = None, seconds: str = "6", *_: str) -> None:
 
     smoothed = hl.smooth(Record.load(root / "odometry.npz"))
     for name, trajectory in (("odometry", run.trajectory), ("smoothed", smoothed.trajectory)):
-        found = hl.evaluate(sequence.reference, trajectory)
+        found = hl.evaluate(trajectory, sequence.reference)
         print(f"{name}: RMS error per step {1e3 * found.rpe_m:.1f} mm, {found.rpe_deg:.4f} degrees")
     print(f"error {smoothed.error_before:.4g} -> {smoothed.error_after:.4g} in {smoothed.iterations} iterations")
 

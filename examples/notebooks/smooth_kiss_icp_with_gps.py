@@ -35,4 +35,4 @@ print(smoothed.found["gps"].summary())
 
 # %%
 for name, trajectory in (("KISS-ICP", poses), ("with GPS", smoothed.trajectory)):
-    print(f"{name}: ATE {hl.evaluate(sequence.reference, trajectory).ate_m:.3f} m")
+    print(f"{name}: ATE {hl.evaluate(trajectory, sequence.reference).ate_m:.3f} m")

@@ -42,8 +42,8 @@ def evaluate(
     from hybridlio.evaluation.evaluate import evaluate as evaluate_trajectory
     from hybridlio.evaluation.metrics_table import metrics_table
 
-    true, estimated, steps = load_pair(estimate, reference)
-    result = evaluate_trajectory(true, estimated, lengths_m=_parse_lengths(lengths), steps=steps)
+    estimated, true, steps = load_pair(estimate, reference)
+    result = evaluate_trajectory(estimated, true, lengths_m=_parse_lengths(lengths), steps=steps)
     if as_json:
         print_result(json.dumps(result.to_json_dict(), indent=2, ensure_ascii=False))
     else:
@@ -53,7 +53,7 @@ def evaluate(
 
 
 def load_pair(estimate: Path, reference: Path | None) -> tuple[Trajectory, Trajectory, Steps | None]:
-    """Return the reference, the estimate and, for a run folder, the estimate's steps."""
+    """Return the estimate, the reference and, for a run folder, the estimate's steps."""
     import numpy as np
 
     from hybridlio.core.trajectory import read_pair, read_trajectory
@@ -63,18 +63,18 @@ def load_pair(estimate: Path, reference: Path | None) -> tuple[Trajectory, Traje
         if reference is None:
             raise ConfigError(f"{estimate} is a trajectory file without ground truth; give --reference")
         if reference.is_file():
-            return (*read_pair(reference, estimate), None)
+            return (*read_pair(estimate, reference), None)
         true = _load_reference(reference)
-        return true, read_trajectory(estimate, true.stamps_ns), None
+        return read_trajectory(estimate, true.stamps_ns), true, None
     run = read_run(estimate)
     if reference is None and run.reference is None:
         raise DataError(f"{estimate}: the recording of this run has no reference; give one with --reference")
     if reference is None:
-        return run.reference, run.trajectory, run.steps  # type: ignore[return-value]
+        return run.trajectory, run.reference, run.steps  # type: ignore[return-value]
     if reference.is_dir():
-        return _load_reference(reference), run.trajectory, run.steps
+        return run.trajectory, _load_reference(reference), run.steps
     stamps = np.concatenate([run.stamps_before, run.trajectory.stamps_ns])
-    return read_trajectory(reference, stamps, run.T_camera_lidar), run.trajectory, run.steps
+    return run.trajectory, read_trajectory(reference, stamps, run.T_camera_lidar), run.steps
 
 
 def _load_reference(folder: Path) -> Trajectory:

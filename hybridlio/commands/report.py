@@ -44,9 +44,9 @@ def report(
         raise ConfigError(f"{out} exists; choose another file with -o, or give --overwrite")
     check_output(out.parent, may_hold=True)
     pairs = [load_pair(path, reference) for path in estimates]
-    true, first, steps = pairs[0]
+    first, true, steps = pairs[0]
     names = _names(estimates)
-    others = {name: pair[1] for name, pair in zip(names[1:], pairs[1:], strict=True)}
+    others = {name: pair[0] for name, pair in zip(names[1:], pairs[1:], strict=True)}
     data = ReportData(
         name=" · ".join(names),
         estimate=first,

@@ -178,19 +178,19 @@ def read_trajectory(
     )
 
 
-def read_pair(reference_path: PathLike, estimate_path: PathLike) -> tuple[Trajectory, Trajectory]:
-    """Read reference and estimate for a comparison. If one file has no stamps (KITTI), it gets those of the other.
+def read_pair(estimate_path: PathLike, reference_path: PathLike) -> tuple[Trajectory, Trajectory]:
+    """Read estimate and reference for a comparison. If one file has no stamps (KITTI), it gets those of the other.
 
     Raises:
         DataError: as :func:`read_trajectory`, such as another number of rows than of the stamps taken over.
     """
-    reference, estimate = read_trajectory(reference_path), read_trajectory(estimate_path)
-    stamped = [is_tum_file(path) for path in (reference_path, estimate_path)]
-    if stamped == [False, True]:
-        reference = read_kitti(reference_path, estimate.stamps_ns)
+    estimate, reference = read_trajectory(estimate_path), read_trajectory(reference_path)
+    stamped = [is_tum_file(path) for path in (estimate_path, reference_path)]
     if stamped == [True, False]:
+        reference = read_kitti(reference_path, estimate.stamps_ns)
+    if stamped == [False, True]:
         estimate = read_kitti(estimate_path, reference.stamps_ns)
-    return reference, estimate
+    return estimate, reference
 
 
 def is_tum_file(path: PathLike) -> bool:

@@ -53,20 +53,20 @@ class PoseErrors:
 
 @dataclass(frozen=True, eq=False)
 class Association:
-    """Reference and estimate at the same times.
+    """Estimate and reference at the same times.
 
     Attributes:
-        reference, estimate: ``M`` poses each, with equal stamps.
+        estimate, reference: ``M`` poses each, with equal stamps.
         estimate_rows: ``(M,)`` index of the estimate's pose at, or nearest to, each time.
     """
 
-    reference: Trajectory
     estimate: Trajectory
+    reference: Trajectory
     estimate_rows: NDArray[np.int64]
 
 
-def associate(reference: Trajectory, estimate: Trajectory, max_difference_ns: int = MAX_DIFFERENCE_NS) -> Association:
-    """Resample reference and estimate to common stamps.
+def associate(estimate: Trajectory, reference: Trajectory, max_difference_ns: int = MAX_DIFFERENCE_NS) -> Association:
+    """Resample estimate and reference to common stamps.
 
     The stamps are those of the trajectory with fewer poses per second (of the estimate, if equal). The other trajectory
     is interpolated on the geodesic between neighbouring poses; its covariances are those of the nearest pose. A stamp
@@ -75,11 +75,11 @@ def associate(reference: Trajectory, estimate: Trajectory, max_difference_ns: in
     Raises:
         DataError: a trajectory has fewer than two poses, or fewer than two stamps remain.
     """
-    for name, trajectory in (("reference", reference), ("estimate", estimate)):
+    for name, trajectory in (("estimate", estimate), ("reference", reference)):
         if len(trajectory) < 2:
             raise DataError(f"the {name} has {counted(len(trajectory), 'pose')}; a comparison needs at least two")
     if len(reference) == len(estimate) and (reference.stamps_ns == estimate.stamps_ns).all():
-        return Association(reference, estimate, np.arange(len(estimate)))
+        return Association(estimate, reference, np.arange(len(estimate)))
     keep_reference = _period_ns(reference) > 1.5 * _period_ns(estimate)
     kept, other = (reference, estimate) if keep_reference else (estimate, reference)
     rows, nearest, resampled = _resample(other, kept.stamps_ns, max_difference_ns)
@@ -90,8 +90,8 @@ def associate(reference: Trajectory, estimate: Trajectory, max_difference_ns: in
         )
     kept = select(kept, rows)
     if keep_reference:
-        return Association(kept, resampled, nearest)
-    return Association(resampled, kept, rows)
+        return Association(resampled, kept, nearest)
+    return Association(kept, resampled, rows)
 
 
 def select(trajectory: Trajectory, rows: NDArray[np.int64]) -> Trajectory:
@@ -100,11 +100,11 @@ def select(trajectory: Trajectory, rows: NDArray[np.int64]) -> Trajectory:
     return Trajectory(trajectory.stamps_ns[rows], trajectory.poses[rows], covariances)
 
 
-def align(reference: Trajectory, estimate: Trajectory, how: Alignment = "se3", lever_m: float = LEVER_M) -> Trajectory:
+def align(estimate: Trajectory, reference: Trajectory, how: Alignment = "se3", lever_m: float = LEVER_M) -> Trajectory:
     """Return the estimate, aligned with the reference as a whole.
 
     Args:
-        reference, estimate: ``M`` poses each, at the same times.
+        estimate, reference: ``M`` poses each, at the same times.
         how: ``se3`` for the least-squares rigid motion; ``sim3`` for one with a scale; ``first`` to align the first
             poses; ``none``.
         lever_m: besides each position, align the points at this distance along the pose's axes. Positions alone do
@@ -116,7 +116,7 @@ def align(reference: Trajectory, estimate: Trajectory, how: Alignment = "se3", l
         ConfigError: ``how`` is unknown.
         EstimationError: a scale is to be estimated and the estimate does not move.
     """
-    _check_pairs(reference, estimate)
+    _check_pairs(estimate, reference)
     if how not in get_args(Alignment):
         raise ConfigError(f"unknown alignment {how!r}; choose one of {', '.join(get_args(Alignment))}")
     if how == "none":
@@ -124,30 +124,30 @@ def align(reference: Trajectory, estimate: Trajectory, how: Alignment = "se3", l
     if how == "first":
         T = reference.poses[0] @ se3.inverse(estimate.poses[0])
         return Trajectory(estimate.stamps_ns, T @ estimate.poses, estimate.covariances)
-    R, t, scale = _alignment(reference, estimate, lever_m, with_scale=how == "sim3")
+    R, t, scale = _alignment(estimate, reference, lever_m, with_scale=how == "sim3")
     scaled = se3.make(estimate.poses[:, :3, :3], scale * estimate.poses[:, :3, 3])
     return Trajectory(estimate.stamps_ns, se3.make(R, t) @ scaled, estimate.covariances)
 
 
-def ate(reference: Trajectory, estimate: Trajectory, how: Alignment = "se3", lever_m: float = LEVER_M) -> PoseErrors:
+def ate(estimate: Trajectory, reference: Trajectory, how: Alignment = "se3", lever_m: float = LEVER_M) -> PoseErrors:
     """Return the absolute trajectory error: the error of each pose after alignment of the whole trajectory.
 
     Args:
-        reference, estimate: ``M`` poses each, at the same times.
+        estimate, reference: ``M`` poses each, at the same times.
         how, lever_m: the alignment, see :func:`align`.
 
     Raises:
         DataError, ConfigError, EstimationError: see :func:`align`.
     """
-    error = se3.between(align(reference, estimate, how, lever_m).poses, reference.poses)
+    error = se3.between(align(estimate, reference, how, lever_m).poses, reference.poses)
     return _errors(error, np.arange(len(reference)))
 
 
-def rpe(reference: Trajectory, estimate: Trajectory, delta: float = 1, unit: DeltaUnit = "frames") -> PoseErrors:
+def rpe(estimate: Trajectory, reference: Trajectory, delta: float = 1, unit: DeltaUnit = "frames") -> PoseErrors:
     """Return the relative pose error: the error of the motion from each pose to the first one at least ``delta`` later.
 
     Args:
-        reference, estimate: ``M`` poses each, at the same times.
+        estimate, reference: ``M`` poses each, at the same times.
         delta: the distance between the two poses of a pair.
         unit: of ``delta``: ``frames``, ``seconds``, or ``metres`` along the reference.
 
@@ -155,7 +155,7 @@ def rpe(reference: Trajectory, estimate: Trajectory, delta: float = 1, unit: Del
         DataError: the trajectories have different numbers of poses, or are shorter than ``delta``.
         ConfigError: the unit is unknown, or ``delta`` is not positive.
     """
-    _check_pairs(reference, estimate)
+    _check_pairs(estimate, reference)
     first, last = _pairs(reference, delta, unit)
     true, estimated = (se3.between(t.poses[first], t.poses[last]) for t in (reference, estimate))
     return _errors(se3.between(estimated, true), first)
@@ -181,7 +181,7 @@ def _pairs(reference: Trajectory, delta: float, unit: DeltaUnit) -> tuple[NDArra
 
 
 def _alignment(
-    reference: Trajectory, estimate: Trajectory, lever_m: float, with_scale: bool
+    estimate: Trajectory, reference: Trajectory, lever_m: float, with_scale: bool
 ) -> tuple[Array, Array, float]:
     """Return rotation, translation and scale of the alignment: Umeyama's, with the lever's points (:func:`align`).
 
@@ -207,7 +207,7 @@ def _errors(error: Array, rows: NDArray[np.int64]) -> PoseErrors:
     return PoseErrors(np.linalg.norm(error[:, :3, 3], axis=1), angles, rows)
 
 
-def _check_pairs(reference: Trajectory, estimate: Trajectory) -> None:
+def _check_pairs(estimate: Trajectory, reference: Trajectory) -> None:
     if len(reference) != len(estimate) or len(reference) < 2:
         raise DataError(
             f"cannot compare {len(reference)} reference poses with {len(estimate)} estimated ones: both need the same "

@@ -100,21 +100,21 @@ def pose_consistency(errors: Array, covariances: Array) -> PoseConsistency:
     )
 
 
-def step_consistency(reference: Trajectory, relative_poses: Array, covariances: Array) -> PoseConsistency:
+def step_consistency(relative_poses: Array, covariances: Array, reference: Trajectory) -> PoseConsistency:
     """Return the consistency of the steps from each pose to the next.
 
     Args:
-        reference: ``N`` poses.
         relative_poses: ``(N-1, 4, 4)`` estimated ``T_k_k1``.
         covariances: ``(N-1, 6, 6)`` their covariances, rad² and m², rotation first.
+        reference: ``N`` poses.
 
     Raises:
         DataError: see :func:`anees` and :func:`step_errors`.
     """
-    return pose_consistency(step_errors(reference, relative_poses), covariances)
+    return pose_consistency(step_errors(relative_poses, reference), covariances)
 
 
-def step_errors(reference: Trajectory, relative_poses: Array) -> Array:
+def step_errors(relative_poses: Array, reference: Trajectory) -> Array:
     """Return the errors ``(N-1, 6)`` (rad, m) of estimated steps ``(N-1, 4, 4)`` against ``N`` reference poses.
 
     Raises:
@@ -127,7 +127,7 @@ def step_errors(reference: Trajectory, relative_poses: Array) -> Array:
     return se3.log(se3.between(relative_poses, true))
 
 
-def absolute_consistency(reference: Trajectory, estimate: Trajectory) -> PoseConsistency:
+def absolute_consistency(estimate: Trajectory, reference: Trajectory) -> PoseConsistency:
     """Return the consistency of the poses relative to the first, which has no error and is left out.
 
     Raises:

@@ -101,15 +101,15 @@ class Drift:
 
 
 def kitti_drift(
-    reference: Trajectory,
     estimate: Trajectory,
+    reference: Trajectory,
     lengths_m: Sequence[float] = KITTI_LENGTHS_M,
     step: int = KITTI_STEP,
 ) -> Drift:
     """Return the drift of an estimate over segments that start at every ``step``-th pose.
 
     Args:
-        reference, estimate: ``N`` poses each, at the same times (see :func:`hybridlio.evaluation.ate_rpe.associate`).
+        estimate, reference: ``N`` poses each, at the same times (see :func:`hybridlio.evaluation.ate_rpe.associate`).
         lengths_m: the segments' lengths along the reference.
         step: number of poses from the start of one segment to that of the next.
 

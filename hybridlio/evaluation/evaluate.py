@@ -98,8 +98,8 @@ class Evaluation:
 
 
 def evaluate(
-    reference: Trajectory | None,
     estimate: Trajectory,
+    reference: Trajectory | None,
     lengths_m: Sequence[float] | None = None,
     steps: Steps | None = None,
     max_difference_ns: int = MAX_DIFFERENCE_NS,
@@ -107,28 +107,27 @@ def evaluate(
     """Compare an estimate with a reference.
 
     Args:
+        estimate: poses of the same sensor as the reference's; its world frame may differ. If it has covariances, of the
+            poses relative to the first, their consistency is computed.
         reference: the ground truth; None raises an error, as for a recording without a reference.
-        estimate: poses of the same sensor; its world frame may differ. If it has covariances, of the poses relative to
-            the first, their consistency is computed.
         lengths_m: segment lengths for drift in addition to KITTI's; default: those of
             :func:`~hybridlio.evaluation.drift.lengths_for` for a path under 100 m, otherwise none.
         steps: the estimate's relative poses, to compute the consistency of their covariances.
         max_difference_ns: see :func:`~hybridlio.evaluation.ate_rpe.associate`.
 
     Raises:
-        DataError: there is no reference, fewer than two poses can be associated, or the numbers of steps and poses do
-            not match.
+        DataError: there is no reference, an argument is no trajectory, fewer than two poses can be associated, or the
+            numbers of steps and poses do not match.
     """
-    _check_steps(steps, estimate)
-    both = associate(_require(reference), estimate, max_difference_ns)
-    drift = kitti_drift(both.reference, both.estimate)
+    _check_steps(steps, _require(estimate, "estimate"))
+    both = associate(estimate, _require(reference, "reference"), max_difference_ns)
+    drift = kitti_drift(both.estimate, both.reference)
     chosen = _chosen_drift(both, lengths_m, bool(len(drift)))
     shown = drift if len(drift) or chosen is None else chosen
-    absolute, relative = ate(both.reference, both.estimate), rpe(both.reference, both.estimate)
-    warnings = _warnings(both)
+    absolute, relative = ate(both.estimate, both.reference), rpe(both.estimate, both.reference)
+    warnings = [*_order_warnings(both), *_axis_warnings(both)]
     poses = _consistency_or_none(lambda: _absolute(both), "poses", warnings)
     step = _consistency_or_none(lambda: _steps(both, estimate, steps), "steps", warnings)
-    end = se3.between(both.reference.from_first().poses[-1], both.estimate.from_first().poses[-1])
     return Evaluation(
         poses=len(both.reference),
         duration_s=float((both.reference.stamps_ns[-1] - both.reference.stamps_ns[0]) / NS_PER_S),
@@ -139,11 +138,11 @@ def evaluate(
         chosen_lengths_m=chosen.lengths_m if chosen else None,
         chosen_t_rel_percent=chosen.t_rel_percent if chosen else None,
         chosen_r_rel_deg_per_100m=chosen.r_rel_deg_per_100m if chosen else None,
-        ate_m=ate(both.reference, both.estimate, lever_m=0.0).rmse_m,
+        ate_m=ate(both.estimate, both.reference, lever_m=0.0).rmse_m,
         ate_deg=absolute.rmse_deg,
         rpe_m=relative.rmse_m,
         rpe_deg=relative.rmse_deg,
-        end_error_m=float(np.linalg.norm(end[:3, 3])),
+        end_error_m=_end_error_m(both),
         anees_rotation=poses.rotation.value if poses else None,
         anees_position=poses.position.value if poses else None,
         anees_bounds=(poses.rotation.lower, poses.rotation.upper) if poses else None,
@@ -160,10 +159,14 @@ def evaluate(
     )
 
 
-def _require(reference: Trajectory | None) -> Trajectory:
-    if reference is None:
-        raise DataError("no reference to compare with: the recording has none")
-    return reference
+def _require(trajectory: Trajectory | None, name: str) -> Trajectory:
+    if trajectory is None:
+        raise DataError(f"no {name} to compare with: the recording has none")
+    if not isinstance(trajectory, Trajectory):
+        raise DataError(
+            f"the {name} is a {type(trajectory).__name__}; give a Trajectory, for a file Trajectory.load(path)"
+        )
+    return trajectory
 
 
 def _check_steps(steps: Steps | None, estimate: Trajectory) -> None:
@@ -174,8 +177,23 @@ def _check_steps(steps: Steps | None, estimate: Trajectory) -> None:
         )
 
 
-def _warnings(both: Association) -> list[str]:
-    """Return a warning if reference and estimate are poses of different sensors, such as camera and lidar.
+def _end_error_m(both: Association) -> float:
+    end = se3.between(both.reference.from_first().poses[-1], both.estimate.from_first().poses[-1])
+    return float(np.linalg.norm(end[:3, 3]))
+
+
+def _order_warnings(both: Association) -> list[str]:
+    """Return a warning if the arguments look swapped: ground truth has no covariances, odometry's estimates do."""
+    if both.reference.covariances is None or both.estimate.covariances is not None:
+        return []
+    return [
+        "the reference has covariances and the estimate has none: the estimate comes first, evaluate(estimate, "
+        "reference), and only the covariances of the estimate are tested"
+    ]
+
+
+def _axis_warnings(both: Association) -> list[str]:
+    """Return a warning if estimate and reference are poses of different sensors, such as camera and lidar.
 
     Such trajectories align well as a whole, but their relative errors are meaningless. They show in the mean direction
     of motion, which the axes of one sensor see alike.
@@ -197,9 +215,9 @@ def _warnings(both: Association) -> list[str]:
 
 def _chosen_drift(both: Association, lengths_m: Sequence[float] | None, has_kitti_drift: bool) -> Drift | None:
     if lengths_m is not None:
-        return kitti_drift(both.reference, both.estimate, lengths_m, step=1)
+        return kitti_drift(both.estimate, both.reference, lengths_m, step=1)
     lengths = () if has_kitti_drift else lengths_for(min(both.reference.length_m, KITTI_LENGTHS_M[0]))
-    return kitti_drift(both.reference, both.estimate, lengths, step=1) if lengths else None
+    return kitti_drift(both.estimate, both.reference, lengths, step=1) if lengths else None
 
 
 def _consistency_or_none(
@@ -217,7 +235,7 @@ def _absolute(both: Association) -> PoseConsistency | None:
     # covariances are relative to the estimate's first pose, so the reference must have that pose too
     if both.estimate.covariances is None or both.estimate_rows[0] != 0:
         return None
-    return absolute_consistency(both.reference, both.estimate)
+    return absolute_consistency(both.estimate, both.reference)
 
 
 def _steps(both: Association, estimate: Trajectory, steps: Steps | None) -> PoseConsistency | None:

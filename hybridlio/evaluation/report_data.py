@@ -174,7 +174,7 @@ def analyse(data: ReportData) -> Findings:
         paths[name] = _path(trajectory, both)
         if both is not None and data.reference is not None:
             is_own = trajectory is data.estimate
-            evaluations[name] = evaluate(data.reference, trajectory, steps=steps if is_own else None)
+            evaluations[name] = evaluate(trajectory, data.reference, steps=steps if is_own else None)
             notes += [f"{name}: {warning}" for warning in evaluations[name].warnings]
             own = both if is_own else own
     errors = _step_errors(data, own)
@@ -191,7 +191,7 @@ def _associate(reference: Trajectory | None, trajectory: Trajectory, name: str, 
     if reference is None:
         return None
     try:
-        return associate(reference, trajectory)
+        return associate(trajectory, reference)
     except DataError as error:
         notes.append(f"{name}: not compared with the reference: {error}")
         return None
@@ -202,7 +202,7 @@ def _path(trajectory: Trajectory, both: Association | None) -> DrawnPath:
         none, T = np.empty(0), se3.inverse(trajectory.poses[0])
         return DrawnPath(np.arange(len(trajectory)), (T @ trajectory.poses)[:, :3, 3], none, none, none, T)
     true = both.reference.poses[:, :3, 3]
-    at_start, as_whole = (align(both.reference, both.estimate, how).poses for how in ("first", "se3"))
+    at_start, as_whole = (align(both.estimate, both.reference, how).poses for how in ("first", "se3"))
     off, off_as_whole = (np.linalg.norm(poses[:, :3, 3] - true, axis=1) for poses in (at_start, as_whole))
     T = at_start[0] @ se3.inverse(both.estimate.poses[0])
     return DrawnPath(both.estimate_rows, at_start[:, :3, 3], travelled_m(true), off, off_as_whole, T)

@@ -155,7 +155,7 @@ def _row(config: Config, run: Run) -> ComparisonRow:
     reference, evaluation, initial, final = run.sequence.reference, None, None, None
     if reference is not None and len(run.estimates) > 1:
         try:
-            evaluation = evaluate(reference, run.trajectory, steps=run.steps)
+            evaluation = evaluate(run.trajectory, reference, steps=run.steps)
             initial, final = (_step_errors(run, poses) for poses in (run.initial_poses, run.steps.poses))
         except DataError as error:
             run.stopped = run.stopped or error
@@ -179,7 +179,7 @@ def _step_errors(run: Run, poses: Array) -> StepErrors | None:
     reference = run.sequence.reference
     if reference is None:
         return None
-    _, errors = associated_step_errors(associate(reference, run.trajectory), run.trajectory, poses)
+    _, errors = associated_step_errors(associate(run.trajectory, reference), run.trajectory, poses)
     if not len(errors):
         return None
     metres, degrees = np.linalg.norm(errors[:, 3:], axis=1), np.rad2deg(np.linalg.norm(errors[:, :3], axis=1))

@@ -88,7 +88,7 @@ def drift_of(poses: Array, reference: Array) -> tuple[float, float] | None:
     if not len(poses) or not np.isfinite(reference).all():
         return None
     path_m = float(np.linalg.norm(reference[:, :3, 3], axis=1).sum())
-    drift = kitti_drift(_chained(reference), _chained(poses), lengths_for(path_m), step=1)
+    drift = kitti_drift(_chained(poses), _chained(reference), lengths_for(path_m), step=1)
     t_rel, r_rel = drift.t_rel_percent, drift.r_rel_deg_per_100m
     return None if t_rel is None or r_rel is None else (t_rel, r_rel)
 

@@ -47,4 +47,4 @@ def with_fixes(drive: Any, seed: int, rate_hz: float = 2.0, sigma_m: float = SIG
 
 def rmse_m(smoothed: Any, drive: Any) -> float:
     """Return the RMS error after alignment of the whole path, so that the first heading does not dominate."""
-    return ate(Trajectory(smoothed.trajectory.stamps_ns, drive.lidar_poses), smoothed.trajectory, lever_m=0.0).rmse_m
+    return ate(smoothed.trajectory, Trajectory(smoothed.trajectory.stamps_ns, drive.lidar_poses), lever_m=0.0).rmse_m

@@ -180,7 +180,7 @@ def test_covariances_of_smoothed_steps_are_consistent(many: list[tuple[Any, Smoo
     for drive, smoothed in many:
         reference = Trajectory(smoothed.trajectory.stamps_ns, drive.lidar_poses)
         poses = smoothed.trajectory.poses
-        errors.append(step_errors(reference, se3.between(poses[:-1], poses[1:])))
+        errors.append(step_errors(se3.between(poses[:-1], poses[1:]), reference))
         covariances.append(smoothed.step_covariances)
     consistency = pose_consistency(np.concatenate(errors), np.concatenate(covariances))
     assert 0.85 < consistency.rotation.value < 1.18

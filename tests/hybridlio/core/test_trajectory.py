@@ -100,7 +100,7 @@ def test_the_format_is_recognised_by_its_columns(tmp_path: Path, trajectory: Tra
 def test_a_file_without_stamps_gets_those_of_the_other(tmp_path: Path, trajectory: Trajectory, stamped: str) -> None:
     for name in ("reference", "estimate"):
         (write_tum if name == stamped else write_kitti)(tmp_path / name, trajectory)
-    reference, estimate = read_pair(tmp_path / "reference", tmp_path / "estimate")
+    estimate, reference = read_pair(tmp_path / "estimate", tmp_path / "reference")
     assert (reference.stamps_ns == estimate.stamps_ns).all()
     assert (reference.stamps_ns == trajectory.stamps_ns).all()
 

@@ -72,8 +72,8 @@ def test_steps_with_right_perturbations_and_their_chain_are_consistent(rng: np.r
             covariance.append(se3.compose_covariance(covariance[-1], step, cov))
         truth = Trajectory(np.arange(n + 1), np.array(reference))
         estimate = Trajectory(np.arange(n + 1), np.array(poses), np.array(covariance))
-        per_step.append(step_consistency(truth, steps, covariances).pose.value)
-        whole = absolute_consistency(truth, estimate)
+        per_step.append(step_consistency(steps, covariances, truth).pose.value)
+        whole = absolute_consistency(estimate, truth)
         chained.append(whole.pose.nees[-1])
         position.append(whole.position.nees[-1])
     assert np.mean(per_step) == pytest.approx(1, abs=0.05)
@@ -101,6 +101,6 @@ def test_the_error_for_an_invalid_row_names_it(rng: np.random.Generator) -> None
 def test_numbers_of_steps_and_covariances_that_do_not_match_are_an_error() -> None:
     reference = Trajectory(np.arange(5), np.tile(np.eye(4), (5, 1, 1)))
     with pytest.raises(DataError, match="5 steps do not match 5 reference poses"):
-        step_consistency(reference, reference.poses, np.tile(np.eye(6), (5, 1, 1)))
+        step_consistency(reference.poses, np.tile(np.eye(6), (5, 1, 1)), reference)
     with pytest.raises(DataError, match="0 covariances for 5"):
         absolute_consistency(reference, reference)

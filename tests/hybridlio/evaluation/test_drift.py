@@ -21,7 +21,7 @@ def straight(n: int, spacing_m: float = 1.0, yaw_rad_per_m: float = 0.0, scale: 
 def test_every_segment_agrees_with_kittis_program(shared_data: Path, sequence: str) -> None:
     results = shared_data / "results" / "orbslam2_stereo"
     reference = read_kitti(shared_data / "kitti_odometry" / "poses" / f"{sequence}.txt")
-    drift = kitti_drift(reference, read_kitti(results / "data" / f"{sequence}.txt"))
+    drift = kitti_drift(read_kitti(results / "data" / f"{sequence}.txt"), reference)
     theirs = np.loadtxt(results / "errors" / f"{sequence}.txt")
     assert drift.rows().shape == theirs.shape
     np.testing.assert_array_equal(drift.rows()[:, [0, 3]], theirs[:, [0, 3]])
@@ -35,14 +35,14 @@ def test_every_segment_agrees_with_kittis_program(shared_data: Path, sequence: s
 
 def test_the_drift_of_kiss_icp_agrees_with_its_log(shared_data: Path) -> None:
     folder = shared_data / "results" / "kiss_icp_00"
-    drift = kitti_drift(read_kitti(folder / "00_gt_kitti.txt"), read_kitti(folder / "00_poses_kitti.txt"))
+    drift = kitti_drift(read_kitti(folder / "00_poses_kitti.txt"), read_kitti(folder / "00_gt_kitti.txt"))
     assert drift.t_rel_percent == pytest.approx(0.527, abs=5e-4)
     assert drift.r_rel_deg_per_100m == pytest.approx(0.2, abs=0.05)
 
 
 def test_a_path_one_percent_too_long_drifts_one_percent() -> None:
     # a segment ends at the first frame beyond its length: at a spacing of 0.1 m up to 0.1 % later
-    drift = kitti_drift(straight(10_000, 0.1), straight(10_000, 0.1, scale=1.01))
+    drift = kitti_drift(straight(10_000, 0.1, scale=1.01), straight(10_000, 0.1))
     assert drift.t_rel_percent == pytest.approx(1.0, rel=1e-3)
     assert drift.r_rel_deg_per_100m == pytest.approx(0.0, abs=1e-9)
 
@@ -50,19 +50,19 @@ def test_a_path_one_percent_too_long_drifts_one_percent() -> None:
 def test_a_constant_rotation_rate_error_is_the_rotational_drift() -> None:
     turn_deg_per_100m = 0.5
     estimate = straight(10_000, 0.1, yaw_rad_per_m=np.radians(turn_deg_per_100m) / 100)
-    drift = kitti_drift(straight(10_000, 0.1), estimate)
+    drift = kitti_drift(estimate, straight(10_000, 0.1))
     assert drift.r_rel_deg_per_100m == pytest.approx(turn_deg_per_100m, rel=1e-3)
 
 
 def test_drift_does_not_depend_on_where_either_trajectory_starts() -> None:
     rng = np.random.default_rng(0)
     reference, estimate = straight(400), straight(400, yaw_rad_per_m=1e-4)
-    moved = [Trajectory(t.stamps_ns, se3.exp(rng.normal(size=6)) @ t.poses) for t in (reference, estimate)]
-    np.testing.assert_allclose(kitti_drift(*moved).t_err, kitti_drift(reference, estimate).t_err, atol=1e-9)
+    moved = [Trajectory(t.stamps_ns, se3.exp(rng.normal(size=6)) @ t.poses) for t in (estimate, reference)]
+    np.testing.assert_allclose(kitti_drift(*moved).t_err, kitti_drift(estimate, reference).t_err, atol=1e-9)
 
 
 def test_averages_by_length_and_by_speed_cover_every_segment() -> None:
-    drift = kitti_drift(straight(400), straight(400, scale=1.01))
+    drift = kitti_drift(straight(400, scale=1.01), straight(400))
     assert [a.at for a in drift.by_length()] == [100, 200, 300]
     assert sum(a.count for a in drift.by_length()) == len(drift)
     assert {a.at for a in drift.by_speed()} == {8, 10}  # under 10 m/s: KITTI counts one frame more
@@ -87,6 +87,6 @@ def test_short_paths_get_eight_fitting_lengths_and_long_ones_kittis() -> None:
 
 def test_unequal_numbers_of_poses_and_non_positive_lengths_are_an_error() -> None:
     with pytest.raises(DataError, match="400 reference poses but 399"):
-        kitti_drift(straight(400), straight(399))
+        kitti_drift(straight(399), straight(400))
     with pytest.raises(DataError, match="must be positive"):
         kitti_drift(straight(400), straight(400), lengths_m=(0.0, 100.0))

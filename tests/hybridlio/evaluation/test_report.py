@@ -107,10 +107,10 @@ def test_the_page_contains_the_metrics_of_the_evaluation(data: ReportData, html:
     assert data.final_poses is not None
     assert data.step_covariances is not None
     steps = Steps(data.final_poses, data.step_covariances)
-    for heading, value in format_metrics(evaluate(data.reference, data.estimate, steps=steps)).items():
+    for heading, value in format_metrics(evaluate(data.estimate, data.reference, steps=steps)).items():
         assert heading in html
         assert f"<td>{value}</td>" in html
-    for average in evaluate(data.reference, data.estimate).segments:
+    for average in evaluate(data.estimate, data.reference).segments:
         assert f"<td>{average.t_rel_percent:.3f}</td>" in html
 
 
@@ -260,7 +260,7 @@ def test_points_of_the_scans_lie_below_the_path(data: ReportData) -> None:
 
 def test_the_timeline_shows_both_alignments(data: ReportData) -> None:
     assert data.reference is not None
-    evaluation = evaluate(data.reference, data.estimate)
+    evaluation = evaluate(data.estimate, data.reference)
     figure = charts(data, analyse(data))["timeline"]
     start, whole = (values_of(trace(figure, f"error, aligned {how}")["y"]) for how in ("at the start", "as a whole"))
     assert start[0] == pytest.approx(0, abs=1e-6)

@@ -34,8 +34,8 @@ def smoothed(round_trip: Any) -> Smoothed:
 
 
 def test_loops_remove_most_of_the_drift(round_trip: Any, smoothed: Smoothed):
-    before = hl.evaluate(round_trip.truth, hl.smooth(round_trip.record).trajectory)
-    after = hl.evaluate(round_trip.truth, smoothed.trajectory)
+    before = hl.evaluate(hl.smooth(round_trip.record).trajectory, round_trip.truth)
+    after = hl.evaluate(smoothed.trajectory, round_trip.truth)
     assert before.ate_m > 0.5
     assert after.ate_m < 0.3 * before.ate_m
 
@@ -73,8 +73,8 @@ def test_a_false_loop_is_rejected_in_the_solve(
     closed: ClosedLoops = with_false_loops.found["loops"]
     solve = {(one.earlier, one.later) for one in closed.rejected if one.stage == "solve"}
     assert solve >= {(loops[k].earlier, loops[k].later) for k in (3, 17)}
-    good = hl.evaluate(round_trip.truth, smoothed.trajectory).ate_m
-    assert hl.evaluate(round_trip.truth, with_false_loops.trajectory).ate_m < 1.5 * good
+    good = hl.evaluate(smoothed.trajectory, round_trip.truth).ate_m
+    assert hl.evaluate(with_false_loops.trajectory, round_trip.truth).ate_m < 1.5 * good
 
 
 def test_loops_are_between_lidars_for_any_mount_of_the_imu(round_trip: Any, closed_round_trip: LoopSearch):
