@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from hybridlio.core import se3_single
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError, shown
 
@@ -65,6 +66,8 @@ def make(R: ArrayLike, t: ArrayLike) -> Array:
 def exp(xi: ArrayLike) -> Array:
     """Return the poses ``(..., 4, 4)`` of tangent vectors ``(..., 6)`` (rad, m); inverse of :func:`log`."""
     xi = np.asarray(xi, dtype=np.float64)
+    if xi.ndim == 1:
+        return se3_single.exp(xi)
     t = (so3_left_jacobian(xi[..., :3]) @ xi[..., 3:, None])[..., 0]
     return make(so3_exp(xi[..., :3]), t)
 
@@ -72,6 +75,8 @@ def exp(xi: ArrayLike) -> Array:
 def log(T: ArrayLike) -> Array:
     """Return the tangent vectors ``(..., 6)`` (rad, m) of poses ``(..., 4, 4)``; the angle is at most π."""
     T = np.asarray(T, dtype=np.float64)
+    if T.ndim == 2 and (xi := se3_single.log(T)) is not None:
+        return xi
     rotvec = so3_log(T[..., :3, :3])
     v = np.linalg.solve(so3_left_jacobian(rotvec), T[..., :3, 3, None])[..., 0]
     return np.concatenate([rotvec, v], axis=-1)
@@ -138,13 +143,16 @@ def as_floats(values: ArrayLike, name: str) -> Array:
     Raises:
         DataError: it is no real number and no array of such; the message starts with ``name``.
     """
-    said = f"{name}: expected numbers, got {type(values).__name__} {shown(values)}"
     try:
-        if np.iscomplexobj(values):
-            raise DataError(said)
-        return np.asarray(values, dtype=np.float64)
+        if not np.iscomplexobj(values):
+            return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise DataError(said) from None
+        raise _not_numbers(values, name) from None
+    raise _not_numbers(values, name)
+
+
+def _not_numbers(values: ArrayLike, name: str) -> DataError:
+    return DataError(f"{name}: expected numbers, got {type(values).__name__} {shown(values)}")
 
 
 def check_pose(T: ArrayLike, name: str) -> Array:

@@ -77,13 +77,19 @@ def scaled_spectrum(hessian: Array, lever_arms_m: Array | None = None) -> tuple[
         eigenvalues ``(6,)`` in ascending order, eigenvectors as columns ``(6, 6)``, and the scale ``(6,)`` by which a
         vector in these units is multiplied to become a tangent vector (rad, m).
     """
+    scale = _units(hessian, lever_arms_m)
+    values, vectors = np.linalg.eigh(hessian * (scale[:, None] * scale))
+    return values, vectors, scale
+
+
+def _units(hessian: Array, lever_arms_m: Array | None) -> Array:
+    """Return the scale ``(6,)`` of :func:`scaled_spectrum`."""
     if lever_arms_m is None:
         mean = np.sqrt(max(np.trace(hessian[:3, :3]), 1e-12) / max(np.trace(hessian[3:, 3:]), 1e-12))
         lever_arms_m = np.full(3, mean)
     scale = np.ones(6)
     scale[:3] /= lever_arms_m
-    values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
-    return values, vectors, scale
+    return scale
 
 
 def strong_directions(hessian: Array, values: Array, normal_noise: float = NORMAL_NOISE.mean) -> NDArray[np.bool_]:
@@ -163,9 +169,11 @@ def newton_step(
         fixed: ``(6, D)`` orthonormal directions, in the units of :func:`scaled_spectrum`, that are left out instead of
             the weak ones; D may be 0.
     """
-    values, vectors, scale = scaled_spectrum(hessian, lever_arms_m)
-    strong = strong_directions(hessian, values, normal_noise)
-    if fixed is not None:
+    if fixed is None:
+        values, vectors, scale = scaled_spectrum(hessian, lever_arms_m)
+        strong = strong_directions(hessian, values, normal_noise)
+    else:
+        scale = _units(hessian, lever_arms_m)
         values, vectors, strong = _without(fixed, hessian, scale)
     inverse = np.where(strong, 1 / np.maximum(values, 1e-12), 0.0)
     reduced = -(vectors @ (inverse * (vectors.T @ (scale * gradient))))
@@ -175,5 +183,5 @@ def newton_step(
 def _without(fixed: Array, hessian: Array, to_tangent: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return the scaled Hessian's spectrum in the complement of ``fixed``, and which vectors lie there."""
     complement = np.eye(6) - fixed @ fixed.T
-    values, vectors = np.linalg.eigh(complement @ (hessian * np.outer(to_tangent, to_tangent)) @ complement)
+    values, vectors = np.linalg.eigh(complement @ (hessian * (to_tangent[:, None] * to_tangent)) @ complement)
     return values, vectors, np.abs(fixed.T @ vectors).max(axis=0, initial=0.0) < _HALF

@@ -61,6 +61,17 @@ class TestLaws:
         T = poses(angle)
         close(se3.exp(se3.log(T)), T, atol=1e-12)
 
+    def test_one_pose_alone_gives_what_it_gives_in_a_batch(self, angle: float) -> None:
+        xi, T = tangents(angle), poses(angle)
+        close(np.array([se3.exp(one) for one in xi]), T, atol=1e-14)
+        alone, together = np.array([se3.log(one) for one in T]), se3.log(T)
+        close(alone, as_turned(together, alone) if angle == np.pi else together, atol=1e-12)
+
+    def test_turns_about_the_axes_have_their_logarithm(self, angle: float) -> None:
+        for axis in np.eye(3):
+            for T in (se3.exp(np.r_[angle * axis, axis]), se3.exp(np.r_[-angle * axis, axis])):
+                close(se3.exp(se3.log(T)), T, atol=1e-12)
+
     def test_products_are_associative_with_the_identity_as_neutral_element(self, angle: float) -> None:
         A = poses(angle)
         for other in ANGLES:
