@@ -13,7 +13,19 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-HEAVY = {"torch", "gtsam", "open3d", "matplotlib", "small_gicp", "scipy", "pydantic", "typer", "joblib", "rerun"}
+HEAVY = {
+    "torch",
+    "gtsam",
+    "open3d",
+    "matplotlib",
+    "small_gicp",
+    "scipy",
+    "pydantic",
+    "typer",
+    "joblib",
+    "rerun",
+    "numba",
+}
 # a room imports only rooms of lower floors
 FLOORS = {
     "core": 1,

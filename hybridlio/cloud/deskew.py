@@ -9,7 +9,7 @@ constant speed. The pose ``s`` seconds into the interval is then ``T·Exp(s·ξ)
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
@@ -19,7 +19,6 @@ from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, Scan
 from hybridlio.core.trajectory import Trajectory
 
 _MIN_IMU_SAMPLES = 2  # one interval to integrate
-_CHUNK = 16384  # points at a time, so that temporaries (0.4 MB each) stay in the processor's cache
 _MIN_RATE_RAD_S = 1e-9  # avoids 0/0; a sweep at this rate turns by less than rounding errors
 
 
@@ -107,20 +106,16 @@ def deskew(scan: Scan, motion: Trajectory) -> Scan:
             f"scan at {scan.stamp_ns} ns: motion compensation needs at least two poses around the sweep, "
             f"got {len(motion)}; give IMU poses or a constant twist"
         )
+    from hybridlio.cloud.deskew_loop import move_points  # late: compiled
+
     # times relative to the stamp: a float64 cannot hold nanoseconds since 1970
     knots_s = (motion.stamps_ns - scan.stamp_ns) / NS_PER_S
     twists = se3.log(se3.between(motion.poses[:-1], motion.poses[1:])) / (np.diff(motion.stamps_ns) / NS_PER_S)[:, None]
     T_stamp_world = se3.inverse(_pose_at(0.0, knots_s, motion.poses, twists))
-    times_s = scan.time_offsets_ns / NS_PER_S
-    interval = np.clip(np.searchsorted(knots_s, times_s, side="right") - 1, 0, len(twists) - 1)
-    columns, points = np.ascontiguousarray(scan.points.T), np.empty_like(scan.points)
-    for k in np.flatnonzero(np.bincount(interval, minlength=len(twists))):
-        members = np.flatnonzero(interval == k)
-        for start in range(0, len(members), _CHUNK):
-            chunk = members[start : start + _CHUNK]
-            seconds = times_s[chunk] - knots_s[k]
-            points[chunk] = _screw(T_stamp_world @ motion.poses[k], twists[k], seconds, columns[:, chunk]).T
-    return Scan(scan.stamp_ns, points, scan.intensity)
+    rates = np.maximum(np.linalg.norm(twists[:, :3], axis=1), _MIN_RATE_RAD_S)
+    moving = screws(T_stamp_world @ motion.poses[:-1], twists, rates)
+    points, offsets_ns = np.ascontiguousarray(scan.points), np.ascontiguousarray(scan.time_offsets_ns)
+    return Scan(scan.stamp_ns, move_points(points, offsets_ns, knots_s, rates, moving), scan.intensity)
 
 
 def _pose_at(time_s: float, knots_s: Array, poses: Array, twists: Array) -> Array:
@@ -128,18 +123,16 @@ def _pose_at(time_s: float, knots_s: Array, poses: Array, twists: Array) -> Arra
     return np.asarray(poses[k] @ se3.exp((time_s - knots_s[k]) * twists[k]))
 
 
-def _screw(T: Array, twist: Array, seconds: Array, points: NDArray[np.float32]) -> Array:
-    """Return ``T·Exp(s_i·ξ)·p_i`` ``(3, N)`` of points ``(3, N)`` and seconds ``(N,)``, for one pose and one twist."""
-    R, velocity = T[:3, :3], twist[3:]
-    rate = max(float(np.linalg.norm(twist[:3])), _MIN_RATE_RAD_S)
-    K = se3.hat(twist[:3] / rate)
-    p = points.astype(np.float64)
-    angle = rate * seconds
-    sine, versine = np.sin(angle), 1 - np.cos(angle)
-    # Rodrigues' formula for the rotation, and its integral over the angle for the translation
-    KKv = R @ (K @ (K @ velocity)) / rate
-    moved = R @ p + T[:3, 3:] + np.outer(R @ velocity, seconds)
-    moved += sine * ((R @ K) @ p - KKv[:, None])
-    moved += versine * ((R @ K @ K) @ p + (R @ K @ velocity / rate)[:, None])
-    moved += np.outer(KKv, angle)
-    return np.asarray(moved)
+def screws(T: Array, twists: Array, rates: Array) -> Array:
+    """Return what ``T·Exp(s·ξ)·p`` is made of, ``(K, 3, 13)``, for poses, twists and angular rates of ``K`` intervals.
+
+    By Rodrigues' formula for the rotation, and its integral over the angle for the translation, it is
+    ``A·(p, 1) + s·d + sin(θ)·B·(p, 1) + (1 − cos(θ))·C·(p, 1)`` with ``θ`` the rate times ``s``. Columns 0 to 3 are A,
+    4 to 7 B, 8 to 11 C, and the last is d.
+    """
+    R, velocity, turn = T[:, :3, :3], twists[:, 3:, None], rates[:, None, None]
+    K = se3.hat(twists[:, :3] / rates[:, None])
+    KKv = R @ (K @ (K @ velocity)) / turn
+    A = [R, T[:, :3, 3:]]
+    B, C = [R @ K, -KKv], [R @ K @ K, R @ K @ velocity / turn]
+    return np.concatenate([*A, *B, *C, R @ velocity + turn * KKv], axis=2)

@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 from hybridlio.core.arrays import Floats
 from hybridlio.core.errors import ConfigError, DataError
 
-_DENSE_CELLS = 1 << 23  # 8 MiB of flags: up to this number of cells a table of all is faster than sorting
 _FINEST_M, _COARSEST_M = 1e-3, 1e5  # limits of the side: below the noise of any lidar, above the extent of any cloud
 _BRACKET_CLOSED = 1e-5  # relative width at which the search for a side ends; 1e-5 of a side moves hardly any point
 
@@ -51,13 +50,15 @@ def voxel_average(points: ArrayLike, normals: ArrayLike | None, voxel_size_m: fl
         ConfigError: the side is not positive, or too small for the cloud's extent.
         DataError: points and normals differ in shape.
     """
+    from hybridlio.cloud import voxel_loops  # late: compiled
+
     points, normals = _checked(points, normals)
     labels, count = voxel_labels(points, voxel_size_m)
     mean = label_means(points, labels, count)
-    return mean, None if normals is None else _unit(_sums(normals, labels, count))
+    return mean, None if normals is None else _unit(voxel_loops.sums(normals, labels, count)[0])
 
 
-def voxel_pick(points: ArrayLike, voxel_size_m: float) -> NDArray[np.intp]:
+def voxel_pick(points: ArrayLike, voxel_size_m: float) -> NDArray[np.int64]:
     """Return indices ``(M,)`` of the points ``(N, 3)`` that are nearest to the mean of their voxel, one per voxel.
 
     In a corner the mean lies off both surfaces: means of large voxels, compared with those of small ones, seem farther
@@ -66,29 +67,40 @@ def voxel_pick(points: ArrayLike, voxel_size_m: float) -> NDArray[np.intp]:
     Raises:
         ConfigError, DataError: as :func:`voxel_average`; here points must all be finite.
     """
+    from hybridlio.cloud import voxel_loops  # late: compiled
+
     points = _checked(points, None)[0]
     labels, count = voxel_labels(points, voxel_size_m)
-    offset = points - label_means(points, labels, count).take(labels, axis=0)
-    distance2, least = np.einsum("ij,ij->i", offset, offset), np.full(count, np.inf, np.float32)
-    np.minimum.at(least, labels, distance2)
-    nearest = np.flatnonzero(distance2 <= least.take(labels))[::-1]
-    picked = np.empty(count, np.intp)
-    picked[labels[nearest]] = nearest  # reversed, so that of equally near points the first is written last and stays
-    return picked
+    return voxel_loops.nearest_to(label_means(points, labels, count), points, labels)
 
 
-def voxel_labels(points: Floats, voxel_size_m: float) -> tuple[NDArray[np.intp], int]:
+def voxel_labels(points: Floats, voxel_size_m: float) -> tuple[NDArray[np.int64], int]:
     """Label the finite points ``(N, 3)`` by their voxel, from 0 in the order of :func:`voxel_average`.
 
     Returns:
         the labels ``(N,)``, and the number of occupied voxels.
     """
-    return _labels(*_keys(np.ascontiguousarray(points.T), voxel_size_m))
+    from hybridlio.cloud import voxel_loops  # late: compiled
+
+    if not (math.isfinite(voxel_size_m) and voxel_size_m > 0):
+        raise ConfigError(f"voxel size must be positive, got {voxel_size_m}")
+    side_m, points = np.float32(voxel_size_m), np.ascontiguousarray(points)
+    if not len(points):
+        return np.empty(0, np.int64), 0
+    low, high = voxel_loops.extent(points, side_m)
+    nx, ny, _ = _cell_counts(low, high, voxel_size_m)
+    labels, keys = voxel_loops.label(points, side_m, low, ny, nx)
+    rank = np.empty(len(keys), np.int64)
+    rank[np.argsort(keys)] = np.arange(len(keys))
+    return rank.take(labels), len(keys)
 
 
-def label_means(values: Floats, labels: NDArray[np.intp], count: int) -> Floats:
+def label_means(values: Floats, labels: NDArray[np.int64], count: int) -> Floats:
     """Return the mean ``(M, C)`` of the values ``(N, C)`` of each of ``count`` labels, which must all occur."""
-    return (_sums(values, labels, count) / np.bincount(labels, minlength=count)[:, None]).astype(np.float32)
+    from hybridlio.cloud import voxel_loops  # late: compiled
+
+    total, members = voxel_loops.sums(np.ascontiguousarray(values), labels, count)
+    return (total / members[:, None]).astype(np.float32)
 
 
 def voxel_to_count(
@@ -118,17 +130,17 @@ def voxel_to_count(
     points, normals = _checked(points, normals)
     if len(points) <= count + tolerance:
         return VoxelCloud(points, None if normals is None else _unit(normals), 0.0)
-    size = _size_for(np.ascontiguousarray(points.T), count, tolerance, start_size_m)
+    size = _size_for(points, count, tolerance, start_size_m)
     return VoxelCloud(*voxel_average(points, normals, size), size)
 
 
-def _size_for(columns: Floats, count: int, tolerance: int, start_size_m: float) -> float:
+def _size_for(points: Floats, count: int, tolerance: int, start_size_m: float) -> float:
     """Return a side that leaves ``count`` ± ``tolerance`` voxels, or the nearest found (regula falsi in logarithms)."""
     size, best, best_miss = start_size_m, start_size_m, math.inf
     fine: tuple[float, float] | None = None  # (log side, log of found / wanted) with too many voxels
     coarse: tuple[float, float] | None = None  # the same with too few
     while not (fine and coarse and coarse[0] - fine[0] < _BRACKET_CLOSED):
-        found = _count(columns, size)
+        found = _count(points, size)
         if abs(found - count) < best_miss:
             best, best_miss = size, abs(found - count)
         if best_miss <= tolerance or (found < count and size <= _FINEST_M) or (found > count and size >= _COARSEST_M):
@@ -161,49 +173,16 @@ def _checked(points: ArrayLike, normals: ArrayLike | None) -> tuple[Floats, Floa
     return points[finite], None if normals is None else normals[finite]
 
 
-def _keys(columns: Floats, voxel_size_m: float) -> tuple[NDArray[np.int32] | NDArray[np.int64], int]:
-    """Return an integer for the voxel of each of the points ``(3, N)``, and the number of voxels in the cloud's box."""
-    if not (math.isfinite(voxel_size_m) and voxel_size_m > 0):
-        raise ConfigError(f"voxel size must be positive, got {voxel_size_m}")
-    if not columns.shape[1]:
-        return np.empty(0, np.int32), 0
-    cells = columns / np.float32(voxel_size_m)
-    np.floor(cells, out=cells)
-    low = cells.min(axis=1)
-    nx, ny, nz = (int(n) + 1 for n in cells.max(axis=1).astype(np.float64) - low)
+def _cell_counts(low: Floats, high: Floats, voxel_size_m: float) -> tuple[int, int, int]:
+    """Return the number of cells along each axis of a cloud's box, from its lowest to its highest cell."""
+    nx, ny, nz = (int(n) + 1 for n in high.astype(np.float64) - low)
     if nx * ny * nz >= 1 << 62:
         raise ConfigError(f"voxels of {voxel_size_m} m are too small: the cloud's box holds {nx} x {ny} x {nz} of them")
-    x, y, z = (cells - low[:, None]).astype(np.int32 if nx * ny * nz < 1 << 31 else np.int64)
-    return (z * ny + y) * nx + x, nx * ny * nz
+    return nx, ny, nz
 
 
-def _count(columns: Floats, voxel_size_m: float) -> int:
-    keys, cells = _keys(columns, voxel_size_m)
-    if cells > _DENSE_CELLS:
-        return len(np.unique(keys))
-    occupied = np.zeros(cells, bool)
-    occupied[keys] = True
-    return int(np.count_nonzero(occupied))
-
-
-def _labels(keys: NDArray[np.int32] | NDArray[np.int64], cells: int) -> tuple[NDArray[np.intp], int]:
-    if cells > _DENSE_CELLS:
-        unique, inverse = np.unique(keys, return_inverse=True)
-        return inverse, len(unique)
-    occupied = np.zeros(cells, bool)
-    occupied[keys] = True
-    present = np.flatnonzero(occupied)
-    number = np.empty(cells, np.int32)  # written and read at occupied cells only
-    number[present] = np.arange(len(present), dtype=np.int32)
-    return number.take(keys).astype(np.intp), len(present)
-
-
-def _sums(values: Floats, labels: NDArray[np.intp], count: int) -> NDArray[np.float64]:
-    """Return sums per label by a sparse matrix: twice as fast as a bincount per column, and in the same order."""
-    from scipy.sparse import csc_array  # late: slow to import
-
-    ones = csc_array((np.ones(len(values)), labels, np.arange(len(values) + 1)), shape=(count, len(values)))
-    return np.asarray(ones @ values.astype(np.float64))
+def _count(points: Floats, voxel_size_m: float) -> int:
+    return voxel_labels(points, voxel_size_m)[1]
 
 
 def _unit(vectors: NDArray[np.float32] | NDArray[np.float64]) -> Floats:

@@ -27,7 +27,7 @@ from hybridlio.evaluation.trust import headline, statements
 
 __all__ = ["Findings", "ReportData", "analyse", "charts", "picture", "write_report"]
 
-_PACKAGES = ("numpy", "scipy", "gtsam", "small_gicp", "open3d", "torch", "filterpy")
+_PACKAGES = ("numpy", "scipy", "numba", "gtsam", "small_gicp", "open3d", "torch", "filterpy")
 _SPEED = "speed"
 _MAX_STRETCHES = 200  # about a page
 
