@@ -1,4 +1,6 @@
-"""Measure time and memory of online solvers: ``python benchmarks/pose_graphs_online.py [--poses N] [--loop-every M]``.
+"""Measure time and memory of online solvers.
+
+    python benchmarks/pose_graphs_online.py [--poses N] [--loop-every M] [--robust KERNEL]
 
 A robot drives laps of 400 steps with noisy odometry and closes a loop to the previous lap at every M-th pose
 (``fixed-lag``: to the middle of its lag). Each backend runs in its own process. Prints, at five points of the run, the
@@ -23,7 +25,7 @@ _SIGMAS = np.r_[np.full(3, 1e-3), np.full(3, 0.02)]  # of a step: rad, m
 _LOOP_SIGMAS = 5 * _SIGMAS
 
 
-def drive(backend: str, poses: int, loop_every: int, lag: int) -> None:
+def drive(backend: str, poses: int, loop_every: int, lag: int, robust: str | None) -> None:
     rng = np.random.default_rng(0)
     step = np.array([0, 0, 2 * np.pi / _LAP, 1.0, 0, 0])
     graph = PoseGraph()
@@ -36,7 +38,7 @@ def drive(backend: str, poses: int, loop_every: int, lag: int) -> None:
             graph.add_between(k - 1, k, se3.exp(step) @ se3.exp(_SIGMAS * rng.standard_normal(6)), sigmas=_SIGMAS)
         if k > loop_length and k % loop_every == 0:
             back = se3.exp(-loop_length * step) @ se3.exp(_LOOP_SIGMAS * rng.standard_normal(6))
-            graph.add_between(k, k - loop_length, back, sigmas=_LOOP_SIGMAS)
+            graph.add_between(k, k - loop_length, back, sigmas=_LOOP_SIGMAS, robust=robust)
         begin = time.process_time()
         solver.update()
         solver.pose(k)
@@ -54,11 +56,12 @@ def main() -> None:
     parser.add_argument("--poses", type=int, default=10_000, help="of the drive (default: %(default)s)")
     parser.add_argument("--loop-every", type=int, default=100, metavar="M", help="poses (default: %(default)s)")
     parser.add_argument("--lag", type=int, default=200, help="of fixed-lag, in poses (default: %(default)s)")
+    parser.add_argument("--robust", help="kernel of the loops (default: none)")
     options = parser.parse_args()
     print(f"{'':12s} {'poses':>7s} {'median ms':>10s} {'p99 ms':>10s} {'RSS MiB':>9s}")
     for backend in ("incremental", "fixed-lag"):
         run = multiprocessing.get_context("spawn").Process(
-            target=drive, args=(backend, options.poses, options.loop_every, options.lag)
+            target=drive, args=(backend, options.poses, options.loop_every, options.lag, options.robust)
         )
         run.start()
         run.join()

@@ -70,10 +70,14 @@ def _row_kind(factor: Factor) -> str:
 
 
 def _vertex_lines(data: GraphData, tag: str) -> Iterator[str]:
-    """Return all vertices, or none where no pose has an initial value but the one that a reader places by itself."""
+    """Return all vertices, or none where no pose has an initial value but the one that a reader places by itself.
+
+    A pose without a vertex exists for a reader only where a factor names it.
+    """
     missing = [key for key in data.keys if data.initial_value(key) is None]
     given = [key for key in data.keys if data.initial_value(key) is not None]
-    if missing and _is_readers_origin(data, given):
+    named = {key for factor in data.factors.values() for key in factor.keys} if missing else set()
+    if missing and _is_readers_origin(data, given) and named.issuperset(data.keys):
         return
     if missing:
         raise GraphError(f"pose {list_keys(missing)} has no initial value to write; initialise, or pass a solution")

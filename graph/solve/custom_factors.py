@@ -15,6 +15,25 @@ from hybridlio.graph.model.user_residual import UserResidual
 _PLANAR = np.array(co.GTSAM_ORDER[2])  # GTSAM's x, y, θ among our heading, x, y
 
 
+class _PythonFactor(gtsam.CustomFactor):
+    """GTSAM's factor of a residual in Python, which it keeps: GTSAM cannot copy such a factor."""
+
+    def __init__(self, model: Any, variables: list[int], residual: Any) -> None:
+        super().__init__(model, variables, residual)
+        self.residual = residual
+
+
+def with_model(factor: Any, model: Any) -> Any:
+    """Return a copy of a factor with another noise model.
+
+    Raises:
+        RuntimeError: GTSAM cannot copy the factor, as a user's own ``CustomFactor``.
+    """
+    if isinstance(factor, _PythonFactor):
+        return _PythonFactor(model, list(factor.keys()), factor.residual)
+    return factor.cloneWithNewNoiseModel(model)
+
+
 def custom_factor(residual: UserResidual, variables: list[int], model: Any) -> Any:
     """Return a residual of poses as GTSAM's factor."""
     planar = residual.dimension == 2
@@ -27,7 +46,7 @@ def custom_factor(residual: UserResidual, variables: list[int], model: Any) -> A
                 jacobians[k] = np.asfortranarray(J[:, _PLANAR] if planar else J)
         return residual(poses)
 
-    return gtsam.CustomFactor(model, variables, error)
+    return _PythonFactor(model, variables, error)
 
 
 def _matrix(values: gtsam.Values, key: int, planar: bool) -> Array:
@@ -49,4 +68,4 @@ def body_velocity_factor(measured: Array, pose: int, velocity: int, model: Any) 
             jacobians[1] = np.asfortranarray(R.T)
         return np.asarray(in_body - measured)
 
-    return gtsam.CustomFactor(model, [pose, velocity], error)
+    return _PythonFactor(model, [pose, velocity], error)

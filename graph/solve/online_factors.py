@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Hashable
 from typing import Any, NamedTuple
 
-import gtsam
-
 from hybridlio.graph.model.connectivity import InertialChain, chains_without_bias
 from hybridlio.graph.solve.builder import Builder
 from hybridlio.graph.solve.changes import Changes
@@ -19,12 +17,12 @@ class NewFactors(NamedTuple):
     ``("bias", key)``.
 
     Attributes:
-        graph: the new factors.
+        factors: the new ones, GTSAM's.
         names: theirs, in the same order.
         replaced: names of factors that no longer hold.
     """
 
-    graph: gtsam.NonlinearFactorGraph
+    factors: list[Any]
     names: list[Hashable]
     replaced: list[Hashable]
 
@@ -53,10 +51,7 @@ def new_factors(
         started, ended = _initial_biases(builder, present, bias_marginalised)
         found += [(("bias", chain.start), builder.initial_bias_prior(chain)) for chain in started]
         replaced += ended
-    graph = gtsam.NonlinearFactorGraph()
-    for _, factor in found:
-        graph.add(factor)
-    return NewFactors(graph, [name for name, _ in found], replaced)
+    return NewFactors([factor for _, factor in found], [name for name, _ in found], replaced)
 
 
 def _initial_biases(

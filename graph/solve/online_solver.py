@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import gtsam
@@ -25,14 +25,14 @@ from hybridlio.graph.solve.initial_values import choose_start
 from hybridlio.graph.solve.landmark_factors import insert_landmarks
 from hybridlio.graph.solve.linear_solver import poses_of
 from hybridlio.graph.solve.nonlinear import NonlinearSolver, biases_of
-from hybridlio.graph.solve.online_factors import NewFactors, new_factors
+from hybridlio.graph.solve.online_factors import new_factors
+from hybridlio.graph.solve.online_held import HeldFactors
 from hybridlio.graph.solve.online_landmarks import OnlineLandmarks
 from hybridlio.graph.solve.online_start import OnlineStart, determines_new_poses
 from hybridlio.graph.solve.settings import ONLINE_SOLVERS, check_choice, check_count, silent
 
 _FIRST_ITERATIONS = 100  # as PoseGraph.optimize by default
 _FIRST_TOLERANCE = 1e-9  # of the error: the first update's result is iSAM2's linearisation point, so solve it exactly
-_REWEIGHTING_ITERATIONS = 5  # after new robust factors; stops earlier where nothing moves any more
 
 
 class OnlineSolver:
@@ -51,7 +51,7 @@ class OnlineSolver:
         self._lag = lag if backend == "fixed-lag" else None
         self._forget = forget and self._lag is not None
         self._engine: Engine = Incremental(data.dimension) if self._lag is None else FixedLag(data.dimension, lag)
-        self._slots: dict[Hashable, int] = {}  # GTSAM's slot of each factor, by its name in NewFactors
+        self._held = HeldFactors(self._engine, data.dimension)
         self._with_velocity: set[int] = set()  # indices of poses in the lag whose velocity is a variable
         self._with_bias: set[int] = set()
         self._bias_marginalised: set[int] = set()  # poses in the lag whose biases a marginal constrains
@@ -79,7 +79,7 @@ class OnlineSolver:
     def _update(self) -> None:
         changes = self._tracker.read()
         if not changes and self._count:
-            self._engine.iterate()
+            self._held.iterate()
             return
         self._check(changes)
         if self._count:
@@ -88,15 +88,13 @@ class OnlineSolver:
             builder, values = start.builder, start.values()
         else:
             builder, values = self._solve_first()
-        factors = new_factors(builder, changes, self._slots.keys(), self._bias_marginalised)
+        factors = new_factors(builder, changes, self._held.names, self._bias_marginalised)
         leaving, latest = self._leaving(changes, values), self._landmarks.latest(changes.other_factors.values())
         leaving_points = self._landmarks.leaving(latest, self._oldest_after(changes), self._engine.solver)
-        self._update_engine(factors, values, changes.removed, latest)
+        self._held.update(factors, values, changes.removed, latest)
         self._accept(changes, values, leaving)
         self._landmarks.accept(latest, leaving_points)
-        new_edges = self._data.edges.robust.keys() & set(factors.names)
-        if new_edges or any(factor.robust for factor in changes.other_factors.values()):
-            self._iterate_weights()
+        self._held.settle(far=bool(changes.removed) or self._closes_loops(changes))
 
     # estimates
 
@@ -165,11 +163,10 @@ class OnlineSolver:
 
     # one update
 
-    def _iterate_weights(self) -> None:
-        """Iterate, because a robust kernel's weight is that of the residual at the last linearisation."""
-        for _ in range(_REWEIGHTING_ITERATIONS):
-            if not self._engine.iterate():
-                return
+    def _closes_loops(self, changes: Changes) -> bool:
+        """Return whether a new edge joins poses that are not neighbours, and may so move those between them."""
+        ends = self._data.edges.ends[changes.edge_rows]
+        return bool((np.abs(ends[:, 0] - ends[:, 1]) > 1).any())
 
     def _solve_first(self) -> tuple[Builder, gtsam.Values]:
         """Solve the whole graph of the first update as a batch."""
@@ -180,7 +177,7 @@ class OnlineSolver:
 
     def _check(self, changes: Changes) -> None:
         """Check that the changed graph is determined, and that no change concerns poses that left the lag."""
-        marginalised = [factor_id for factor_id in changes.removed if factor_id not in self._slots]
+        marginalised = [factor_id for factor_id in changes.removed if factor_id not in self._held.names]
         if marginalised:
             self._tracker.forget(set(marginalised))
             raise GraphError(
@@ -211,21 +208,6 @@ class OnlineSolver:
     def _oldest_after(self, changes: Changes) -> int:
         """Return the index of the oldest pose in the lag once the changes are in."""
         return 0 if self._lag is None else max(changes.poses.stop - 1 - self._lag, self._oldest)
-
-    def _update_engine(
-        self, factors: NewFactors, values: gtsam.Values, removed_ids: list[int], latest: dict[int, int]
-    ) -> None:
-        """Give the factors to GTSAM; restore it where it fails."""
-        outdated = [*removed_ids, *factors.replaced]
-        try:
-            slots = self._engine.update(factors.graph, values, [self._slots[name] for name in outdated], latest)
-        except GraphError:
-            new_slots = self._engine.restore(self._slots.values()) if self._count else {}
-            self._slots = {name: new_slots[slot] for name, slot in self._slots.items()}
-            raise
-        for name in outdated:
-            del self._slots[name]
-        self._slots.update(zip(factors.names, slots, strict=True))
 
     # the lag
 
@@ -260,11 +242,7 @@ class OnlineSolver:
         self._with_bias.difference_update(poses)
         ids = self._data.factor_ids_of(poses)
         self._note_marginalised_biases(ids)
-        for key in self._data.keys_at(poses):
-            self._slots.pop(("fixed", key), None)
-            self._slots.pop(("bias", key), None)
-        for factor_id in ids:
-            self._slots.pop(factor_id, None)
+        self._held.forget([*ids, *((kind, key) for key in self._data.keys_at(poses) for kind in ("fixed", "bias"))])
         if self._forget:
             self._data.forget(ids, poses, leaving)
             self._tracker.forget(ids)

@@ -94,8 +94,9 @@ class Bag:
             for connection in self._reader.connections:
                 self._connections.setdefault(connection.topic, []).append(connection)
                 self._types[connection.topic] = connection.msgtype
-        seconds = max(self._reader.duration, 1) / NS_PER_S
-        counts = {name: sum(c.msgcount for c in found) for name, found in self._connections.items()}
+            # metadata of ROS 2 may hold words in the place of numbers
+            seconds = max(self._reader.duration, 1) / NS_PER_S
+            counts = {name: sum(c.msgcount for c in found) for name, found in self._connections.items()}
         self.topics = {
             name: Topic(name, self._types[name].replace("/msg/", "/"), count, (count - 1) / seconds)
             for name, count in sorted(counts.items())

@@ -1,8 +1,11 @@
 import gtsam
 import numpy as np
+import pytest
 
 from hybridlio.core import se3
+from hybridlio.core.errors import GraphError
 from hybridlio.core.estimates import RelativePose
+from hybridlio.graph import PoseGraph
 from hybridlio.graph.formats.g2o import write_g2o
 
 
@@ -40,3 +43,15 @@ def test_vertex_numbers_may_start_anywhere(rng, tmp_path):
     assert sorted(values.keys()) == [7, 8, 9]
     np.testing.assert_allclose(values.atPose3(7).matrix(), poses[0], atol=1e-9)
     assert list(graph.at(0).keys()) == [7, 8]
+
+
+def test_a_pose_that_no_row_would_name_is_refused(tmp_path):
+    graph = PoseGraph()
+    graph.add_pose(1)
+    graph.add_gps(1, [0, 0, 0], 0.1)
+    graph.add_pose(0)
+    with pytest.raises(GraphError, match="no initial value to write"):
+        graph.save(tmp_path / "graph.g2o")
+    graph.add_between(1, 0, np.eye(4), sigmas=0.1)
+    graph.save(tmp_path / "graph.g2o")
+    assert set(PoseGraph.load(tmp_path / "graph.g2o").keys) == {0, 1}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import pickle
+import re
 import shutil
 import struct
 from collections.abc import Callable
@@ -99,6 +100,14 @@ def test_files_of_ros_2_are_read_without_their_metadata(
     (file,) = (p for p in write(tmp_path, name, drive_with_times).iterdir() if p.suffix != ".yaml")
     alone = shutil.copy(file, tmp_path / f"alone{file.suffix}")
     check_equal(open_sequence(alone), plain)
+
+
+def test_words_in_the_place_of_counts_are_one_clear_error(drive_with_times: Any, tmp_path: Path) -> None:
+    bag = write(tmp_path, "ros2-mcap", drive_with_times)
+    metadata = bag / "metadata.yaml"
+    metadata.write_text(re.sub(r"message_count: \d+", "message_count: abc", metadata.read_text()))
+    with pytest.raises(DataError, match="truncated or damaged"):
+        open_sequence(bag)
 
 
 def halves(folder: Path, name: str, drive: Any) -> list[Path]:
