@@ -87,7 +87,7 @@ class PointFormat:
         points = self._points(columns)
         keep = self._returns(points)
         if not keep.all():
-            points, columns = points[keep], {name: values[keep] for name, values in columns.items()}
+            points, columns = points[keep], _rows(columns, keep)
         offsets = None if self.times is None else self.times.offsets_ns(columns, stamp_ns)
         scan = Scan(stamp_ns, points, _intensity(columns), offsets)
         if not len(scan):
@@ -115,6 +115,10 @@ class PointFormat:
         if self.vehicle is not None:
             keep &= ~self.vehicle.holds(points)
         return keep
+
+
+def _rows(columns: Columns, keep: Mask) -> Columns:
+    return columns if keep.all() else {name: values[keep] for name, values in columns.items()}
 
 
 def coordinates(columns: Columns) -> NDArray[Any]:
@@ -196,8 +200,7 @@ def find_format(
         note_vehicle(seen, notes)
     valid = []
     for (stamp, columns), cloud in zip(samples, clouds, strict=True):
-        keep = found._returns(cloud)
-        valid.append((stamp, {name: values[keep] for name, values in columns.items()}))
+        valid.append((stamp, _rows(columns, found._returns(cloud))))
     return replace(found, times=find_point_times(valid, step_ns, notes, stated.times))
 
 
@@ -271,6 +274,11 @@ def _intensity(columns: Columns) -> Floats | None:
     values = next((columns[name] for name in _INTENSITIES if name in columns), None)
     if values is None:
         return None
-    largest = values[np.isfinite(values)].max(initial=0)
+    scaled = values.astype(np.float32)  # a copy, without the gaps between points
+    largest = scaled.max(initial=0)
+    if not np.isfinite(largest):
+        largest = scaled[np.isfinite(scaled)].max(initial=0)
     full_scale = next((scale for scale in _FULL_SCALES if largest <= scale), _FULL_SCALES[-1])
-    return np.asarray(values, dtype=np.float32) / np.float32(full_scale)
+    if full_scale != 1.0:
+        scaled /= np.float32(full_scale)
+    return scaled

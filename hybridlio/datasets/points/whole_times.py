@@ -30,11 +30,13 @@ def whole_ns(values: NDArray[Any], unit_ns: int, column: str) -> Stamps:
         return np.empty(0, np.int64)
     if values.dtype.kind == "f" and not np.isfinite(values).all():
         raise DataError(f"column '{column}' has times that are not finite")
+    if values.dtype.itemsize < 8:  # nothing is lost, and what follows passes over memory without gaps
+        values = values.astype(np.int64 if values.dtype.kind in "iu" else np.float64)
     largest = max(abs(values.max().item()), abs(values.min().item())) * unit_ns
     if largest > _MAX_NS:
         raise DataError(f"column '{column}' reaches {largest / NS_PER_S:.3g} s, beyond any clock; {HOW_TO_STATE}")
     if values.dtype.kind in "iu":
-        whole_units = values.astype(np.int64)
+        whole_units = values.astype(np.int64, copy=False)
         return whole_units if unit_ns == 1 else whole_units * unit_ns
     exact = values.astype(np.float64)
     if largest < _EXACT:

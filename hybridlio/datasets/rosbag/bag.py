@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from hybridlio.core.errors import DataError, HybridLioError
 from hybridlio.core.sensors import NS_PER_S
+from hybridlio.datasets.rosbag.heads import messages_and_heads
 from hybridlio.datasets.rosbag.recovery import RecoveredFile
 
 if TYPE_CHECKING:
@@ -122,6 +123,16 @@ class Bag:
         with readable(self.path):
             for connection, received_ns, raw in self._reader.messages(connections, start=start_ns):
                 yield connection.topic, received_ns, raw
+
+    def messages_and_heads(self, topics: Collection[str], cut: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
+        """As :meth:`messages`, of the topics ``cut`` at least the first kilobyte of each message.
+
+        Raises:
+            DataError: the bag is damaged.
+        """
+        connections = [c for topic in topics for c in self._connections[topic]]
+        with readable(self.path):
+            yield from messages_and_heads(connections, cut)
 
     def decode(self, topic: str, raw: bytes) -> Any:
         """Return a message as an object whose attributes are the fields of its ROS type.

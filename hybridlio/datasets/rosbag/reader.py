@@ -23,6 +23,7 @@ from hybridlio.datasets.rosbag import measurements
 from hybridlio.datasets.rosbag.bag import METADATA, ROS_1, ROS_2_FILES, Bag, Topic, bag_files, part_number
 from hybridlio.datasets.rosbag.choices import BagTopics
 from hybridlio.datasets.rosbag.extrinsics import Mounting, calibration_file
+from hybridlio.datasets.rosbag.heads import Message
 from hybridlio.datasets.rosbag.known import known_bag
 from hybridlio.datasets.rosbag.measurements import Log
 from hybridlio.datasets.rosbag.scans import BagScans
@@ -148,7 +149,8 @@ def _read(bag: Bag, chosen: dict[str, Topic], notes: Notes) -> _Contents:
     contents = _Contents({kind: Log() for kind in chosen})
     kinds = {topic.name: kind for kind, topic in chosen.items()}
     static = [t.name for t in bag.topics.values() if t.type in TRANSFORM_TYPES and t.name.endswith("_static")]
-    for name, received_ns, raw in _until_damage(bag, [*kinds, *static], contents.logs["lidar"], notes):
+    messages = bag.messages_and_heads([*kinds, *static], [chosen["lidar"].name])
+    for name, received_ns, raw in _until_damage(bag, messages, contents.logs["lidar"], notes):
         if name not in kinds:
             contents.tree.add(bag.decode(name, raw))
             continue
@@ -167,14 +169,14 @@ def _read(bag: Bag, chosen: dict[str, Topic], notes: Notes) -> _Contents:
     return contents
 
 
-def _until_damage(bag: Bag, topics: list[str], scans: Log, notes: Notes) -> Iterator[tuple[str, int, bytes]]:
-    """Yield the bag's messages; where it is damaged behind some scans, note it and end there.
+def _until_damage(bag: Bag, messages: Iterator[Message], scans: Log, notes: Notes) -> Iterator[Message]:
+    """Yield messages of the bag; where it is damaged behind some scans, note it and end there.
 
     Raises:
         DataError: the bag is damaged before its second scan.
     """
     try:
-        yield from bag.messages(topics)
+        yield from messages
     except DataError as error:
         if len(scans) < _MIN_SCANS_OF_DAMAGED:
             raise
