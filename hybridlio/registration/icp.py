@@ -13,27 +13,22 @@ minimum is found under the narrow kernel, which wrong matches hardly influence.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.registration.information import newton_step
+from hybridlio.registration.information import free_directions
 from hybridlio.registration.point_to_point import MixedMatches, MixedNeighbours
 from hybridlio.registration.settings import RegistrationSettings
-from hybridlio.registration.surface import LinearSystem, Neighbours, PlaneMatches, Surface
+from hybridlio.registration.surface import Neighbours, PlaneMatches, Surface
 
-# A step below both has converged: 1 mm at 50 m and 0.3 mm, less than the standard deviation of any registration.
-_ROTATION_CONVERGED_RAD = 2e-5
-_TRANSLATION_CONVERGED_M = 3e-4
-# A pose that has moved by either is matched again: 1 cm at 50 m and 5 mm, a few per cent of the spacing of map points.
-_REMATCH_ROTATION_RAD = 2e-4
-_REMATCH_TRANSLATION_M = 5e-3
+if TYPE_CHECKING:
+    from hybridlio.registration.loops import Followed
+
 _MAX_MATCHINGS = 8  # points midway between two neighbours can make the pose alternate without end; 3 to 5 are usual
-_LONG_STEP = 10.0  # times the way to a rematch: 5 cm or 2 mrad. After such a step most matches are wrong: match at once
 _MATCH_KERNELS = 3  # kernel widths within which neighbours count; the weight of a residual beyond is below 1 %
-_MIN_MATCHES = 6  # as many as unknowns; with fewer the Hessian is singular and the pose stays
 
 
 class Fit(NamedTuple):
@@ -128,58 +123,38 @@ class _Descent:
     ) -> None:
         self.pose, self.kernel_m, self._normal_noise = pose, kernel_m, normal_noise
         self._settings, self._fixed = settings, fixed
-        self._steps, self._converged = 0, False
+        self._steps = 0
         self._matches: PlaneMatches | MixedMatches
-        self._system: LinearSystem
+        self._lever_arms_m: Array
+        self._followed: Followed
 
     def follow(self, matches: PlaneMatches | MixedMatches) -> bool:
         """Step as far as the matches are valid. Return whether new matches could lead farther."""
-        self._matches, way, length = matches, np.zeros(6), np.inf
-        lever_arms_m = matches.lever_arms_m
-        while self._steps < self._settings.max_iterations:
-            self._system = matches.system(self.kernel_m, way)
-            step = np.zeros(6)
-            if len(matches) >= _MIN_MATCHES:
-                hessian, gradient = self._system.hessian, self._system.gradient
-                step = newton_step(hessian, gradient, np.inf, lever_arms_m, self._normal_noise, self._fixed)
-            way, self._steps = way + step, self._steps + 1
-            is_narrow = self.kernel_m == self._settings.kernel_m
-            self.kernel_m = max(self._settings.kernel_m, self.kernel_m / 2)
-            length, self._converged = _rematch_ratio(step), is_narrow and _is_small(step)
-            # the steps have become short, but together they have gone far enough for other neighbours
-            has_settled_far_off = is_narrow and length < 1 < _rematch_ratio(way)
-            if self._converged or length > _LONG_STEP or has_settled_far_off:
-                break
-        self.pose = self.pose @ se3.exp(way)
-        return self._steps < self._settings.max_iterations and _rematch_ratio(way) > 1
+        from hybridlio.registration import loops  # late: compiled
+
+        settings = self._settings
+        self._matches, self._lever_arms_m = matches, matches.lever_arms_m
+        free = free_directions(self._lever_arms_m, self._normal_noise, self._fixed)
+        limits = loops.Limits(settings.kernel_m, settings.max_iterations)
+        self._followed = found = loops.follow(matches.rows, free, limits, self.kernel_m, self._steps)
+        self.kernel_m, self._steps = found.kernel_m, found.steps
+        self.pose = self.pose @ se3.exp(found.way)
+        return found.steps < settings.max_iterations and found.rematch_ratio > 1
 
     def result(self, points: int) -> Registration:
         """Return the registration of a scan with this number of points."""
-        system, matches, settings = self._system, self._matches, self._settings
-        cost = robust_cost(system.distances, points, settings.kernel_m)
-        weight = max(float(system.weights.sum()), 1e-12)
-        sigma_m = float(np.sqrt((system.weights @ system.distances**2) / weight))
-        pose, matched = se3.orthonormalise(self.pose), len(matches) / max(points, 1)
+        found, sums = self._followed, self._followed.sums
+        unmatched = points - len(self._matches)
         return Registration(
-            pose, system.hessian, matches.lever_arms_m, sigma_m, matched, cost, self._steps, self._converged
+            pose=se3.orthonormalise(self.pose),
+            hessian=sums.hessian,
+            lever_arms_m=self._lever_arms_m,
+            sigma_m=float(np.sqrt(sums.squares / max(sums.weight, 1e-12))),
+            matched=len(self._matches) / max(points, 1),
+            cost=float(sums.cost + unmatched) / max(points, 1),
+            iterations=found.steps,
+            converged=found.converged,
         )
-
-
-def _rematch_ratio(xi: Array) -> float:
-    """Return the size of a tangent vector over that at which matches have to be made again."""
-    turn_rad, shift_m = _largest(xi)
-    return max(turn_rad / _REMATCH_ROTATION_RAD, shift_m / _REMATCH_TRANSLATION_M)
-
-
-def _is_small(step: Array) -> bool:
-    turn_rad, shift_m = _largest(step)
-    return turn_rad < _ROTATION_CONVERGED_RAD and shift_m < _TRANSLATION_CONVERGED_M
-
-
-def _largest(xi: Array) -> tuple[float, float]:
-    """Return the largest component of the rotation and of the translation."""
-    sizes: list[float] = [abs(part) for part in xi.tolist()]  # faster than array operations on six numbers
-    return max(sizes[:3]), max(sizes[3:])
 
 
 def fit_at(
@@ -192,7 +167,7 @@ def fit_at(
     if max_distance_m is None:
         max_distance_m = _MATCH_KERNELS * kernel_m
     matches = Neighbours(surface, source, threads).matches(pose, max_distance_m)
-    return Fit(robust_cost(matches.rows[6], len(source), kernel_m), len(matches) / max(len(source), 1))
+    return Fit(robust_cost(matches.distances, len(source), kernel_m), len(matches) / max(len(source), 1))
 
 
 def robust_cost(distances: Array, points: int, kernel_m: float) -> float:

@@ -24,13 +24,16 @@ reference.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.motion_limits import MEASUREMENT_FLOOR_SIGMAS
+
+if TYPE_CHECKING:
+    from hybridlio.registration.loops import Free
 
 
 class NormalNoise(NamedTuple):
@@ -77,19 +80,16 @@ def scaled_spectrum(hessian: Array, lever_arms_m: Array | None = None) -> tuple[
         eigenvalues ``(6,)`` in ascending order, eigenvectors as columns ``(6, 6)``, and the scale ``(6,)`` by which a
         vector in these units is multiplied to become a tangent vector (rad, m).
     """
-    scale = _units(hessian, lever_arms_m)
+    scale = np.ones(6)
+    scale[:3] /= _mean_lever(hessian) if lever_arms_m is None else lever_arms_m
     values, vectors = np.linalg.eigh(hessian * (scale[:, None] * scale))
     return values, vectors, scale
 
 
-def _units(hessian: Array, lever_arms_m: Array | None) -> Array:
-    """Return the scale ``(6,)`` of :func:`scaled_spectrum`."""
-    if lever_arms_m is None:
-        mean = np.sqrt(max(np.trace(hessian[:3, :3]), 1e-12) / max(np.trace(hessian[3:, 3:]), 1e-12))
-        lever_arms_m = np.full(3, mean)
-    scale = np.ones(6)
-    scale[:3] /= lever_arms_m
-    return scale
+def _mean_lever(hessian: Array) -> Array:
+    """Return the same lever arm for all axes ``(3,)``, from the ratio of the traces."""
+    mean = np.sqrt(max(np.trace(hessian[:3, :3]), 1e-12) / max(np.trace(hessian[3:, 3:]), 1e-12))
+    return np.full(3, mean)
 
 
 def strong_directions(hessian: Array, values: Array, normal_noise: float = NORMAL_NOISE.mean) -> NDArray[np.bool_]:
@@ -169,15 +169,24 @@ def newton_step(
         fixed: ``(6, D)`` orthonormal directions, in the units of :func:`scaled_spectrum`, that are left out instead of
             the weak ones; D may be 0.
     """
+    from hybridlio.registration import loops  # late: compiled
+
+    free = free_directions(lever_arms_m if lever_arms_m is not None else _mean_lever(hessian), normal_noise, fixed)
+    reduced = loops.newton_step(np.ascontiguousarray(hessian), np.ascontiguousarray(gradient), free)
+    return np.asarray(free.scale * reduced * min(1.0, limit_m / max(float(np.linalg.norm(reduced)), 1e-12)))
+
+
+def free_directions(lever_arms_m: Array, normal_noise: float, fixed: Array | None) -> Free:
+    """Return the directions of a step for compiled loops; the arguments are those of :func:`newton_step`."""
+    from hybridlio.registration import loops  # late: compiled
+
+    scale = np.ones(6)
+    scale[:3] /= lever_arms_m
     if fixed is None:
-        values, vectors, scale = scaled_spectrum(hessian, lever_arms_m)
-        strong = strong_directions(hessian, values, normal_noise)
-    else:
-        scale = _units(hessian, lever_arms_m)
-        values, vectors, strong = _without(fixed, hessian, scale)
-    inverse = np.where(strong, 1 / np.maximum(values, 1e-12), 0.0)
-    reduced = -(vectors @ (inverse * (vectors.T @ (scale * gradient))))
-    return np.asarray(scale * reduced * min(1.0, limit_m / max(float(np.linalg.norm(reduced)), 1e-12)))
+        return loops.Free(scale, np.eye(6), _STRONG_RATIO * normal_noise)
+    count = fixed.shape[1]
+    basis = np.linalg.svd(fixed)[0][:, count:] if count else np.eye(6)
+    return loops.Free(scale, np.ascontiguousarray(basis), -np.inf)
 
 
 def _without(fixed: Array, hessian: Array, to_tangent: Array) -> tuple[Array, Array, NDArray[np.bool_]]:

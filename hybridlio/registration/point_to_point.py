@@ -14,12 +14,16 @@ in one direction and far in another.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hybridlio.core.arrays import Array
 from hybridlio.registration.information import lever_arms
-from hybridlio.registration.surface import THIN_PLANE_WEIGHT, LinearSystem, Neighbours, PlaneMatches
+from hybridlio.registration.surface import Neighbours, PlaneMatches
+
+if TYPE_CHECKING:
+    from hybridlio.registration.loops import Rows, Sums
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,14 +33,12 @@ class MixedMatches:
     Attributes:
         planes: matches with planes.
         source: ``(M, 3)`` the points that are matched with points, scan frame.
-        rows: ``(7, 3, M)`` the six derivatives of each difference, and the difference, metres, scan frame.
-        weights: ``(M,)`` of the points' neighbours.
+        rows: derivatives and distances of both; differences of points are in the scan frame.
     """
 
     planes: PlaneMatches
     source: Array
-    rows: Array
-    weights: Array
+    rows: Rows
 
     @classmethod
     def linearised(cls, planes: PlaneMatches, source: Array, targets: Array, weights: Array) -> MixedMatches:
@@ -48,7 +50,7 @@ class MixedMatches:
         rows[2, 0], rows[2, 1] = -y, x
         rows[3, 0] = rows[4, 1] = rows[5, 2] = 1.0
         rows[6] = (source + (planes.pose[:3, 3] - targets) @ planes.pose[:3, :3]).T
-        return cls(planes, source, rows, weights)
+        return cls(planes, source, planes.rows._replace(points=rows, point_weights=weights))
 
     def __len__(self) -> int:
         return len(self.planes) + len(self.source)
@@ -58,24 +60,15 @@ class MixedMatches:
         """``(3,)`` of all points about the scan's axes, see :func:`hybridlio.registration.information.lever_arms`."""
         return lever_arms(np.concatenate([self.planes.source, self.source]))
 
-    def system(self, kernel_m: float, xi: Array | None = None) -> LinearSystem:
-        """Return the step's system, like :meth:`hybridlio.registration.surface.PlaneMatches.system`.
+    def system(self, kernel_m: float, xi: Array | None = None) -> Sums:
+        """Return the step's least squares, like :meth:`hybridlio.registration.surface.PlaneMatches.system`.
 
         The kernel takes the weighted squared difference, so it is wider for a thick neighbourhood, whose points
         scatter.
         """
-        flat = self.planes.system(kernel_m, xi)
-        differences = self.rows[6] if xi is None else self.rows[6] + np.tensordot(xi, self.rows[:6], 1)
-        squares = np.einsum("ij,ij->j", differences, differences)
-        weights = self.weights * (kernel_m**2 / (kernel_m**2 + self.weights * squares)) ** 2
-        derivatives = self.rows[:6].reshape(6, -1)
-        weighted = derivatives * np.tile(weights, 3)
-        return LinearSystem(
-            flat.hessian + weighted @ derivatives.T,
-            flat.gradient + weighted @ differences.ravel(),
-            np.concatenate([flat.distances, np.sqrt(squares)]),
-            np.concatenate([flat.weights, weights]),
-        )
+        from hybridlio.registration import loops  # late: compiled
+
+        return loops.system(self.rows, np.zeros(6) if xi is None else xi, kernel_m, kernel_m)
 
 
 class MixedNeighbours(Neighbours):
@@ -83,6 +76,8 @@ class MixedNeighbours(Neighbours):
 
     def mixed(self, pose: Array, max_distance_m: float) -> MixedMatches:
         """Match the points at a pose; points without a neighbour within ``max_distance_m`` are left out."""
+        from hybridlio.registration.loops import THIN_PLANE_WEIGHT  # late: compiled
+
         index, source = self.within(pose, max_distance_m)
         planes = self._surface.planes(index)
         flat = planes[:, 4] >= THIN_PLANE_WEIGHT

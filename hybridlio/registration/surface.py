@@ -18,6 +18,7 @@ a step, and the normals' derivatives are zero because the planes belong to the s
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,28 +27,10 @@ from hybridlio.cloud.kd_tree import GrowingKdTree
 from hybridlio.core.arrays import Array
 from hybridlio.registration.information import NORMAL_NOISE, NORMAL_NOISE_WEIGHTED, lever_arms
 
-# Planes of this weight or more are thin: their thickness is below 5 cm, about twice the noise of a range (see the
-# weight in hybridlio/cloud/plane_fitting.py). The others are bushes and the like, which have no front.
-THIN_PLANE_WEIGHT = 0.9
-# Sine of the angle under which the lidar may seem to be behind a plane that it sees: twice the usual tilt of normals,
-# 0.045 rad (hybridlio/registration/information.py).
-_LARGEST_FROM_BEHIND = 0.1
+if TYPE_CHECKING:
+    from hybridlio.registration.loops import Rows, Sums
 
-
-@dataclass(frozen=True, eq=False)
-class LinearSystem:
-    """The weighted least squares of one Gauss-Newton step, for a right perturbation.
-
-    Attributes:
-        hessian, gradient: ``(6, 6)`` and ``(6,)`` of half the weighted squared distances.
-        distances: ``(N,)`` of the points from their planes, metres, with sign.
-        weights: ``(N,)``, between 0 and 1.
-    """
-
-    hessian: Array
-    gradient: Array
-    distances: Array
-    weights: Array
+NO_POINTS = (np.empty((7, 3, 0)), np.empty(0))  # of matches with planes alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,57 +40,45 @@ class PlaneMatches:
     Attributes:
         pose: ``(4, 4)`` that pose.
         source: ``(N, 3)`` the points, scan frame.
-        planes: ``(N, 5)`` normal n, offset n·v and weight, as :meth:`Surface.planes` returns them.
-        rows: ``(7, N)`` the six derivatives of each distance, and the distance, metres.
+        planes: ``(N, 5)`` normals n, offsets n·v and weights, as :meth:`Surface.planes` returns them.
+        rows: derivatives and distances, metres.
     """
 
     pose: Array
     source: Array
     planes: Array
-    rows: Array
+    rows: Rows
 
     @classmethod
     def linearised(cls, pose: Array, source: Array, planes: Array) -> PlaneMatches:
         """Compute distances and derivatives at ``pose``."""
-        normals = planes[:, :3]
-        x, y, z = source.T
-        a, b, c = (normals @ pose[:3, :3]).T  # the normals in the scan's frame
-        rows = np.empty((7, len(source)))
-        rows[0], rows[1], rows[2] = y * c - z * b, z * a - x * c, x * b - y * a
-        rows[3], rows[4], rows[5] = a, b, c
-        rows[6] = x * a + y * b + z * c + normals @ pose[:3, 3] - planes[:, 3]
-        return cls(pose, source, planes, rows)
+        from hybridlio.registration import loops  # late: compiled
+
+        source, planes = np.ascontiguousarray(source), np.ascontiguousarray(planes)
+        rows = loops.linearise(np.ascontiguousarray(pose), source, planes)
+        return cls(pose, source, planes, loops.Rows(rows, planes[:, 4].copy(), *NO_POINTS))
 
     def __len__(self) -> int:
         return len(self.source)
 
-    def facing(self) -> PlaneMatches:
-        """Return the matches without those of thin planes that the lidar would have to see from behind.
-
-        Normals must point to where the planes were seen from.
-        """
-        x, y, z = self.source.T
-        away_m = x * self.rows[3] + y * self.rows[4] + z * self.rows[5]
-        ranges_m = np.sqrt(x * x + y * y + z * z)
-        kept = (away_m < _LARGEST_FROM_BEHIND * ranges_m) | (self.planes[:, 4] < THIN_PLANE_WEIGHT)
-        if kept.all():
-            return self
-        return PlaneMatches(self.pose, self.source[kept], self.planes[kept], self.rows[:, kept])
+    @property
+    def distances(self) -> Array:
+        """``(N,)`` of the points from their planes, metres, with sign."""
+        return np.asarray(self.rows.planes[6])
 
     @property
     def lever_arms_m(self) -> Array:
         """``(3,)`` of the points about the scan's axes, see :func:`hybridlio.registration.information.lever_arms`."""
         return lever_arms(self.source)
 
-    def system(self, kernel_m: float, xi: Array | None = None) -> LinearSystem:
-        """Return the step's system at the pose, or at ``pose·Exp(xi)`` for a small tangent vector ``xi`` ``(6,)``.
+    def system(self, kernel_m: float, xi: Array | None = None) -> Sums:
+        """Return the step's least squares at the pose, or at ``pose·Exp(xi)`` for a small vector ``xi`` ``(6,)``.
 
         Distances are extrapolated linearly to ``xi``: 1 mrad at 50 m is then wrong by 25 µm, far below the noise.
         """
-        distances = self.rows[6] if xi is None else self.rows[6] + xi @ self.rows[:6]
-        weights = self.planes[:, 4] * (kernel_m**2 / (kernel_m**2 + distances * distances)) ** 2
-        weighted = self.rows[:6] * weights
-        return LinearSystem(weighted @ self.rows[:6].T, weighted @ distances, distances, weights)
+        from hybridlio.registration import loops  # late: compiled
+
+        return loops.system(self.rows, np.zeros(6) if xi is None else xi, kernel_m, kernel_m)
 
 
 class Surface:
@@ -124,6 +95,7 @@ class Surface:
 
     Attributes:
         points: ``(M, 3)`` all points, those of ``base`` first.
+        all_planes: ``(M, 5)`` of all points: normal n, offset n·v, and weight.
         one_sided: as given, or that of ``base``.
         normal_noise: spurious share of the information that its normals give.
     """
@@ -139,12 +111,12 @@ class Surface:
     ) -> None:
         planes = _planes(points, normals, weights)
         if base is None:
-            self.points, self._planes, self._tree = points, planes, GrowingKdTree(points, threads)
+            self.points, self.all_planes, self._tree = points, planes, GrowingKdTree(points, threads)
             self.normal_noise = NORMAL_NOISE if weights is None else NORMAL_NOISE_WEIGHTED
             self.one_sided = one_sided
         else:
             self.points = np.concatenate([base.points, points])
-            self._planes = np.concatenate([base._planes, planes])
+            self.all_planes = np.concatenate([base.all_planes, planes])
             self._tree = base._tree.extended(self.points, threads)
             self.normal_noise, self.one_sided = base.normal_noise, base.one_sided
 
@@ -155,7 +127,7 @@ class Surface:
     @property
     def normals(self) -> Array:
         """``(M, 3)`` unit vectors."""
-        return self._planes[:, :3]
+        return self.all_planes[:, :3]
 
     @property
     def appended_ratio(self) -> float:
@@ -177,7 +149,7 @@ class Surface:
 
     def planes(self, index: NDArray[np.int64]) -> Array:
         """Return ``(N, 5)`` for the given points: normal n, offset n·v, and weight."""
-        return self._planes.take(index, axis=0)  # several times faster than indexing with brackets
+        return self.all_planes.take(index, axis=0)  # several times faster than indexing with brackets
 
 
 def _planes(points: Array, normals: Array, weights: Array | None) -> Array:
@@ -199,39 +171,37 @@ class Neighbours:
     """
 
     def __init__(self, surface: Surface, source: Array, threads: int) -> None:
-        self._surface, self._source, self._threads = surface, source, threads
+        self._surface, self._source, self._threads = surface, np.ascontiguousarray(source), threads
         self._searched: Array | None = None  # (N, 3) where each point was when its neighbour was last searched
         self._margin_m = np.empty(0)
         self._index = np.empty(0, np.int64)
 
     def matches(self, pose: Array, max_distance_m: float) -> PlaneMatches:
         """Match the points at a pose with planes; points without a neighbour within ``max_distance_m`` are left out."""
-        index, source = self.within(pose, max_distance_m)
-        return self._linearised(pose, source, self._surface.planes(index))
-
-    def _linearised(self, pose: Array, source: Array, planes: Array) -> PlaneMatches:
-        matches = PlaneMatches.linearised(pose, source, planes)
-        return matches.facing() if self._surface.one_sided else matches
+        index, source = self._near(pose, max_distance_m, self._surface.one_sided)
+        return PlaneMatches.linearised(pose, source, self._surface.planes(index))
 
     def within(self, pose: Array, max_distance_m: float) -> tuple[NDArray[np.int64], Array]:
         """Return indices ``(M,)`` of the neighbours within a distance, and the scan points ``(M, 3)`` that have one."""
-        moved = self._source @ pose[:3, :3].T + pose[:3, 3]
-        self._update(moved)
-        difference = moved - self._surface.points.take(self._index, axis=0)
-        near = np.flatnonzero(np.einsum("ij,ij->i", difference, difference) < max_distance_m**2)
-        index, source = self._index, self._source
-        if len(near) < len(source):
-            index, source = index[near], source.take(near, axis=0)
-        return index, source
+        return self._near(pose, max_distance_m, one_sided=False)
 
-    def _update(self, moved: Array) -> None:
+    def _near(self, pose: Array, max_distance_m: float, one_sided: bool) -> tuple[NDArray[np.int64], Array]:
+        from hybridlio.registration import loops  # late: compiled
+
+        pose = np.ascontiguousarray(pose)
+        self._update(pose)
+        surface, index, source = self._surface, self._index, self._source
+        kept = loops.near(pose, source, index, surface.points, surface.all_planes, max_distance_m, one_sided)
+        return (index, source) if len(kept) == len(source) else (index.take(kept), source.take(kept, axis=0))
+
+    def _update(self, pose: Array) -> None:
         """Search again for the points that have moved by their margin or more."""
+        from hybridlio.registration import loops  # late: compiled
+
         if self._searched is None:
-            self._searched = moved
-            self._index, self._margin_m = self._surface.nearest_with_margin(moved, self._threads)
+            self._searched = self._source @ pose[:3, :3].T + pose[:3, 3]
+            self._index, self._margin_m = self._surface.nearest_with_margin(self._searched, self._threads)
             return
-        displacement = moved - self._searched
-        stale = np.flatnonzero(np.einsum("ij,ij->i", displacement, displacement) >= self._margin_m**2)
-        if len(stale):
-            self._searched[stale] = moved[stale]
-            self._index[stale], self._margin_m[stale] = self._surface.nearest_with_margin(moved[stale], self._threads)
+        which, queries = loops.stale(pose, self._source, self._searched, self._margin_m)
+        if len(which):
+            self._index[which], self._margin_m[which] = self._surface.nearest_with_margin(queries, self._threads)

@@ -16,7 +16,6 @@ from hybridlio.cloud.voxel import voxel_average
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.learned.source_settings import NetworkResidualSettings
-from hybridlio.registration.icp import robust_cost
 from hybridlio.registration.information import (
     covariance_of,
     degenerate_directions,
@@ -155,8 +154,8 @@ class LossEvaluator:
         kernel_m, count = self._settings.kernel_m, len(self._points)
         matches = self._neighbours.matches(pose, self._settings.max_distance_m)
         system = matches.system(kernel_m)
-        cost_m = kernel_m * robust_cost(system.distances, count, kernel_m)
-        sigma_m = float(np.sqrt(system.weights @ system.distances**2 / max(float(system.weights.sum()), 1e-12)))
+        cost_m = kernel_m * (system.cost + count - len(matches)) / count
+        sigma_m = float(np.sqrt(system.squares / max(system.weight, 1e-12)))
         step = newton_step(system.hessian, system.gradient, _LONGEST_STEP_M, self._levers_m, _NORMAL_NOISE)
         return EvaluatedPose(pose, cost_m, len(matches) / count, system.hessian, self._levers_m, step, sigma_m)
 

@@ -1,0 +1,286 @@
+"""The loops of a registration over its matches, compiled: derivatives, least squares and Gauss-Newton steps.
+
+Formulas are in :mod:`hybridlio.registration.surface`, :mod:`hybridlio.registration.point_to_point` and
+:mod:`hybridlio.registration.information`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hybridlio.cloud.compiled import compiled
+from hybridlio.core.arrays import Array, Index
+
+# A step below both has converged: 1 mm at 50 m and 0.3 mm, less than the standard deviation of any registration.
+_ROTATION_CONVERGED_RAD = 2e-5
+_TRANSLATION_CONVERGED_M = 3e-4
+# A pose that has moved by either is matched again: 1 cm at 50 m and 5 mm, a few per cent of the spacing of map points.
+_REMATCH_ROTATION_RAD = 2e-4
+_REMATCH_TRANSLATION_M = 5e-3
+_LONG_STEP = 10.0  # times the way to a rematch: 5 cm or 2 mrad. After such a step most matches are wrong: match at once
+_MIN_MATCHES = 6  # as many as unknowns; with fewer the Hessian is singular and the pose stays
+# Planes of this weight or more are thin: their thickness is below 5 cm, about twice the noise of a range (see the
+# weight in hybridlio/cloud/plane_fitting.py). The others are bushes and the like, which have no front.
+THIN_PLANE_WEIGHT = 0.9
+# Sine of the angle under which the lidar may seem to be behind a plane that it sees: twice the usual tilt of normals,
+# 0.045 rad (hybridlio/registration/information.py).
+_LARGEST_FROM_BEHIND = 0.1
+
+
+class Rows(NamedTuple):
+    """Matches linearised at a pose: six derivatives and the distance, in this order.
+
+    Attributes:
+        planes: ``(7, N)`` of points matched with planes.
+        plane_weights: ``(N,)`` of the planes.
+        points: ``(7, 3, M)`` of points matched with points.
+        point_weights: ``(M,)`` of their neighbours.
+    """
+
+    planes: Array
+    plane_weights: Array
+    points: Array
+    point_weights: Array
+
+
+class Free(NamedTuple):
+    """The directions in which a pose may move, in the units of
+    :func:`hybridlio.registration.information.scaled_spectrum`.
+
+    Attributes:
+        scale: ``(6,)`` by which a vector in these units is multiplied to become a tangent vector (rad, m).
+        basis: ``(6, K)`` orthonormal.
+        least_share: directions with a smaller share of the information than this are left out.
+    """
+
+    scale: Array
+    basis: Array
+    least_share: float
+
+
+class Sums(NamedTuple):
+    """Sums over the matches at one pose.
+
+    Attributes:
+        hessian, gradient: ``(6, 6)`` and ``(6,)`` of half the weighted squared distances.
+        weight, squares: of the weights, and of the weighted squared distances.
+        cost: of the robust costs under the narrow kernel.
+    """
+
+    hessian: Array
+    gradient: Array
+    weight: float
+    squares: float
+    cost: float
+
+
+@compiled
+def near(
+    pose: Array, source: Array, index: Index, points: Array, planes: Array, max_distance_m: float, one_sided: bool
+) -> Index:
+    """Return which of the points ``(N, 3)`` are within a distance of their neighbours, ascending.
+
+    Args:
+        pose: ``(4, 4)`` of the scan.
+        source: scan frame.
+        index: ``(N,)`` of the neighbours.
+        points: ``(M, 3)`` of the surface.
+        planes: ``(M, 5)`` of the surface.
+        max_distance_m: largest distance.
+        one_sided: leave out points of thin planes that the lidar would have to see from behind.
+    """
+    kept, count = np.empty(len(source), np.int64), 0
+    for i in range(len(source)):
+        away_m, distance2, range2, k = 0.0, 0.0, 0.0, index[i]
+        for row in range(3):
+            turned = pose[row, 0] * source[i, 0] + pose[row, 1] * source[i, 1] + pose[row, 2] * source[i, 2]
+            distance2 += (turned + pose[row, 3] - points[k, row]) ** 2
+            away_m += planes[k, row] * turned
+            range2 += source[i, row] ** 2
+        if distance2 >= max_distance_m * max_distance_m:
+            continue
+        is_behind = one_sided and away_m >= _LARGEST_FROM_BEHIND * np.sqrt(range2)
+        if is_behind and planes[k, 4] >= THIN_PLANE_WEIGHT:
+            continue
+        kept[count] = i
+        count += 1
+    return kept[:count].copy()
+
+
+@compiled
+def stale(pose: Array, source: Array, searched: Array, margin_m: Array) -> tuple[Index, Array]:
+    """Return the points ``(K,)`` that have moved by their margin or more, and where they are now ``(K, 3)``.
+
+    Args:
+        pose: ``(4, 4)``.
+        source: ``(N, 3)`` scan frame.
+        searched: ``(N, 3)`` where each point was when its neighbour was searched; for the returned ones it is updated.
+        margin_m: ``(N,)``.
+    """
+    which, queries, count = np.empty(len(source), np.int64), np.empty(source.shape), 0
+    for i in range(len(source)):
+        squared = 0.0
+        for row in range(3):
+            moved = pose[row, 0] * source[i, 0] + pose[row, 1] * source[i, 1] + pose[row, 2] * source[i, 2]
+            queries[count, row] = moved + pose[row, 3]
+            squared += (queries[count, row] - searched[i, row]) ** 2
+        if squared >= margin_m[i] ** 2:
+            which[count], searched[i] = i, queries[count]
+            count += 1
+    return which[:count].copy(), queries[:count].copy()
+
+
+@compiled
+def linearise(pose: Array, source: Array, planes: Array) -> Array:
+    """Return the rows ``(7, N)`` of points ``(N, 3)`` matched with planes ``(N, 5)`` at a pose ``(4, 4)``."""
+    rows = np.empty((7, len(source)))
+    for i in range(len(source)):
+        nx, ny, nz = planes[i, 0], planes[i, 1], planes[i, 2]
+        x, y, z = source[i, 0], source[i, 1], source[i, 2]
+        a = nx * pose[0, 0] + ny * pose[1, 0] + nz * pose[2, 0]  # the normal in the scan's frame
+        b = nx * pose[0, 1] + ny * pose[1, 1] + nz * pose[2, 1]
+        c = nx * pose[0, 2] + ny * pose[1, 2] + nz * pose[2, 2]
+        rows[0, i], rows[1, i], rows[2, i] = y * c - z * b, z * a - x * c, x * b - y * a
+        rows[3, i], rows[4, i], rows[5, i] = a, b, c
+        along = nx * pose[0, 3] + ny * pose[1, 3] + nz * pose[2, 3]
+        rows[6, i] = x * a + y * b + z * c + along - planes[i, 3]
+    return rows
+
+
+@compiled
+def system(rows: Rows, xi: Array, kernel_m: float, narrow_m: float) -> Sums:
+    """Return the least squares of one step at the rows' pose moved by ``xi`` ``(6,)``.
+
+    Args:
+        rows: the matches.
+        xi: small tangent vector.
+        kernel_m: of the weights.
+        narrow_m: kernel of the cost.
+    """
+    hessian, gradient = np.zeros((6, 6)), np.zeros(6)
+    total_weight, total_squares, cost = 0.0, 0.0, 0.0
+    one, difference = np.empty(6), np.empty(3)
+    for i in range(rows.planes.shape[1]):
+        distance = rows.planes[6, i]
+        for j in range(6):
+            one[j] = rows.planes[j, i]
+            distance += xi[j] * one[j]
+        squared = distance * distance
+        weight = rows.plane_weights[i] * (kernel_m**2 / (kernel_m**2 + squared)) ** 2
+        _add(hessian, gradient, one, weight, distance)
+        total_weight += weight
+        total_squares += weight * squared
+        cost += squared / (narrow_m**2 + squared)
+    for i in range(rows.points.shape[2]):
+        squared = 0.0
+        for row in range(3):
+            difference[row] = rows.points[6, row, i]
+            for j in range(6):
+                difference[row] += xi[j] * rows.points[j, row, i]
+            squared += difference[row] ** 2
+        own = rows.point_weights[i]
+        weight = own * (kernel_m**2 / (kernel_m**2 + own * squared)) ** 2
+        for row in range(3):
+            for j in range(6):
+                one[j] = rows.points[j, row, i]
+            _add(hessian, gradient, one, weight, difference[row])
+        total_weight += weight
+        total_squares += weight * squared
+        cost += squared / (narrow_m**2 + squared)
+    for j in range(6):
+        for k in range(j):
+            hessian[j, k] = hessian[k, j]
+    return Sums(hessian, gradient, total_weight, total_squares, cost)
+
+
+@compiled
+def _add(hessian: Array, gradient: Array, row: Array, weight: float, distance: float) -> None:
+    """Add one residual to the upper triangle of the Hessian, and to the gradient."""
+    for j in range(6):
+        weighted = weight * row[j]
+        gradient[j] += weighted * distance
+        for k in range(j, 6):
+            hessian[j, k] += weighted * row[k]
+
+
+@compiled
+def newton_step(hessian: Array, gradient: Array, free: Free) -> Array:
+    """Return the step ``(6,)`` within the strong ones of the free directions, in scaled units."""
+    scaled = hessian * free.scale.reshape(6, 1) * free.scale
+    values, vectors = np.linalg.eigh(free.basis.T @ scaled @ free.basis)
+    least = free.least_share * (hessian[3, 3] + hessian[4, 4] + hessian[5, 5])
+    along = vectors.T @ (free.basis.T @ (free.scale * gradient))
+    for k in range(len(values)):
+        along[k] = along[k] / max(values[k], 1e-12) if values[k] >= least else 0.0
+    return -(free.basis @ (vectors @ along))
+
+
+class Limits(NamedTuple):
+    """When a descent ends: the narrow kernel, and the largest number of steps in all."""
+
+    kernel_m: float
+    max_iterations: int
+
+
+class Followed(NamedTuple):
+    """Where a descent along one set of matches has led.
+
+    Attributes:
+        way: ``(6,)`` sum of its steps.
+        kernel_m, steps: for the next set of matches.
+        converged: whether the last step was below the convergence limits.
+        rematch_ratio: size of the way over that at which matches have to be made again.
+        sums: where the last step began.
+    """
+
+    way: Array
+    kernel_m: float
+    steps: int
+    converged: bool
+    rematch_ratio: float
+    sums: Sums
+
+
+@compiled
+def follow(rows: Rows, free: Free, limits: Limits, kernel_m: float, steps: int) -> Followed:
+    """Step as far as the matches are valid.
+
+    Args:
+        rows: the matches.
+        free: directions of the steps.
+        limits: end of the descent.
+        kernel_m: to begin with; halved at every step.
+        steps: number of those before.
+    """
+    way, converged = np.zeros(6), False
+    sums = system(rows, way, kernel_m, limits.kernel_m)
+    enough = rows.planes.shape[1] + rows.points.shape[2] >= _MIN_MATCHES
+    while True:
+        step = np.zeros(6)
+        if enough:
+            step = free.scale * newton_step(sums.hessian, sums.gradient, free)
+        way += step
+        steps += 1
+        is_narrow = kernel_m == limits.kernel_m
+        kernel_m = max(limits.kernel_m, kernel_m / 2)
+        length, far = _rematch_ratio(step), _rematch_ratio(way)
+        converged = is_narrow and _is_small(step)
+        # the steps have become short, but together they have gone far enough for other neighbours
+        has_settled_far_off = is_narrow and length < 1 < far
+        if converged or length > _LONG_STEP or has_settled_far_off or steps >= limits.max_iterations:
+            return Followed(way, kernel_m, steps, converged, far, sums)
+        sums = system(rows, way, kernel_m, limits.kernel_m)
+
+
+@compiled
+def _rematch_ratio(xi: Array) -> float:
+    turn, shift = np.abs(xi[:3]).max() / _REMATCH_ROTATION_RAD, np.abs(xi[3:]).max() / _REMATCH_TRANSLATION_M
+    return float(max(turn, shift))
+
+
+@compiled
+def _is_small(step: Array) -> bool:
+    turn, shift = np.abs(step[:3]).max(), np.abs(step[3:]).max()
+    return bool(turn < _ROTATION_CONVERGED_RAD and shift < _TRANSLATION_CONVERGED_M)
