@@ -90,6 +90,9 @@ def simulate(
     gps: Annotated[bool, typer.Option("--gps", help="Also write GPS fixes.")] = False,
     loops: Annotated[bool, typer.Option("--loops", help="Drive through the same streets again.")] = False,
     start_at_rest: Annotated[bool, typer.Option("--start-at-rest", help="Stand still for the first 2 s.")] = False,
+    rain: Annotated[float, typer.Option(metavar="MM_H", help="On roads: rate of the rain, up to 300 mm/h.")] = 0.0,
+    dust: Annotated[float, typer.Option(metavar="PER_KM", help="On roads: clouds of dust per kilometre.")] = 0.0,
+    people: Annotated[int | None, typer.Option(help="In those scenes: people who walk around the sensor.")] = None,
     poses: Poses = None,
     poses_frame: PosesFrame = "camera",
     _verbosity: Verbose = 0,
@@ -107,8 +110,9 @@ def simulate(
     road = {
         "length_m": length_m, "speed_m_s": speed, "driving": driving, "gps": gps, "loops": loops, "poses": poses,
         "poses_frame": poses_frame, "motion_distortion": distortion, "drive_seed": drive_seed,
+        "rain_mm_h": rain, "dust_per_km": dust,
     }  # fmt: skip
-    body = {"platform": platform, "imu": imu}
+    body = {"platform": platform, "imu": imu, "people": people}
     is_road = scene in get_args(Scene)
     config, write = _road_drive(common | road, body) if is_road else _platform(common | body, road)
     _write(out, config, write)
@@ -180,4 +184,4 @@ def _describe(place: tuple[int | str, ...], message: str) -> str:
 
 
 def _option(name: str) -> str:
-    return "--" + {"speed_m_s": "speed"}.get(name, name).replace("_", "-")
+    return "--" + {"speed_m_s": "speed", "rain_mm_h": "rain", "dust_per_km": "dust"}.get(name, name).replace("_", "-")

@@ -34,6 +34,8 @@ class SimulationConfig(BaseModel):
         loops: let the route return to streets it has passed.
         traffic_per_km: moving cars per kilometre of road.
         parked: share of parking places that are taken.
+        rain_mm_h: rate of rain, 2.5 mm/h in light and 50 mm/h in violent rain; drops return light and weaken the rest.
+        dust_per_km: clouds of dust per kilometre of the drive.
         gps: also write GPS fixes.
         gps_rate_hz, gps_sigma_m: rate of the fixes, and their standard deviation on each axis.
         imu_noise: noise densities of the IMU; may be 0.
@@ -57,6 +59,8 @@ class SimulationConfig(BaseModel):
     loops: bool = False
     traffic_per_km: float = Field(default=12.0, ge=0.0, le=100.0)
     parked: float = Field(default=0.5, ge=0.0, le=1.0)
+    rain_mm_h: float = Field(default=0.0, ge=0.0, le=300.0)
+    dust_per_km: float = Field(default=0.0, ge=0.0, le=1000.0)
     gps: bool = False
     gps_rate_hz: float = Field(default=1.0, gt=0.0, le=10.0)
     gps_sigma_m: float = Field(default=1.0, ge=0.0)

@@ -12,6 +12,7 @@ from hybridlio.simulation.kitti_writer import START_NS
 from hybridlio.simulation.plan import Drive
 from hybridlio.simulation.random_streams import RandomStream
 from hybridlio.simulation.rig import IMU_RATE_HZ, SCAN_RATE_HZ, T_IMU_LIDAR
+from hybridlio.simulation.sensors.air import look_through
 from hybridlio.simulation.sensors.imu import add_noise, ideal_imu
 from hybridlio.simulation.sensors.lidar import RayPattern, first_hits, measure
 
@@ -60,7 +61,11 @@ def scan_at(
         offsets_s = pattern.column_offset_ns / NS_PER_S
     poses = drive.path.poses(stamp_s + offsets_s) @ T_IMU_LIDAR
     scene = drive.world.scene_around(drive.path.poses(stamp_s)[0, :3, 3])
+    model = lidar or config.lidar_model
     hits = first_hits(scene, drive.cars, pattern, poses, stamp_s + offsets_s)
+    if not drive.air.is_clear:
+        rng = np.random.default_rng([config.own_seed, RandomStream.AIR, index])
+        look_through(drive.air, hits, pattern, poses, stamp_s, model, rng)
     rng = np.random.default_rng([config.own_seed, RandomStream.SCAN, index])
     stamp_ns = START_NS + round(stamp_s * NS_PER_S)
-    return measure(hits, pattern, lidar or config.lidar_model, stamp_ns, config.motion_distortion, rng)
+    return measure(hits, pattern, model, stamp_ns, config.motion_distortion, rng)

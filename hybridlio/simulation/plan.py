@@ -10,16 +10,19 @@ from scipy.spatial import cKDTree
 
 from hybridlio.core.arrays import Array
 from hybridlio.simulation.config import SimulationConfig
+from hybridlio.simulation.drive.dust import dust_clouds
 from hybridlio.simulation.drive.path import SmoothPath
 from hybridlio.simulation.drive.pose_files import path_along, read_lidar_poses
 from hybridlio.simulation.drive.revisits import level_revisits
 from hybridlio.simulation.drive.rises import without_false_rises
-from hybridlio.simulation.drive.traffic import EgoDrive, MovingCar, traffic
+from hybridlio.simulation.drive.traffic import EgoDrive, traffic
 from hybridlio.simulation.drive.vehicle import FINE_S, drive_path, lane_of
 from hybridlio.simulation.random_streams import RandomStream
 from hybridlio.simulation.rig import LIDAR_HEIGHT_M, SCAN_RATE_HZ, T_IMU_LIDAR
+from hybridlio.simulation.sensors.air import CLEAR, Air
 from hybridlio.simulation.world.ground import CAMBER, Ground, Height, land_along, waves
 from hybridlio.simulation.world.layout import lay_out
+from hybridlio.simulation.world.moving import MovingObject
 from hybridlio.simulation.world.roads import LANE_OFFSET_M, MANNERS, STEP_M, Road, drive, generate_centreline
 from hybridlio.simulation.world.world import World
 
@@ -49,12 +52,14 @@ class Drive:
         scan_times_s: ``(N,)`` times of the scans' stamps, from zero.
         world: everything that stands still.
         cars: everything that moves, except the recording car.
+        air: rain and dust.
     """
 
     path: SmoothPath
     scan_times_s: Array
     world: World
-    cars: list[MovingCar]
+    cars: list[MovingObject]
+    air: Air = CLEAR
 
 
 def plan(config: SimulationConfig) -> Drive:
@@ -171,7 +176,8 @@ def _with_world(
     ego_xy = path.poses(times)[:, :2, 3]
     ego = EgoDrive(lane, times, _arc_length_of(lane, ego_xy), ego_xy)
     cars = traffic(centreline, ego, ground, config.traffic_per_km, config.own_seed)
-    return Drive(path, scans, World(ground, items, config.seed), cars)
+    dust = dust_clouds(ego, ground, config.dust_per_km, config.own_seed) if config.dust_per_km else None
+    return Drive(path, scans, World(ground, items, config.seed), cars, Air(config.rain_mm_h, dust))
 
 
 def _arc_length_of(lane: Road, xy: Array) -> Array:

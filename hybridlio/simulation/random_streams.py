@@ -26,3 +26,6 @@ class RandomStream(IntEnum):
     SCENE = 13
     MOTION = 14
     MOUNT = 15
+    AIR = 16  # and the scan's number
+    DUST = 17
+    PEOPLE = 18  # and the person's number

@@ -58,6 +58,8 @@ SCENARIOS: dict[str, Scenario] = {
         "braking at 7 m/s² and bends at 6 m/s², from 16 m/s", {"driving": "hard", "speed_m_s": _HARD_SPEED_M_S}
     ),
     "heavy-traffic": Scenario("eight times as many moving cars", {"traffic_per_km": 96.0}),
+    "rain": Scenario("violent rain, 50 mm/h, whose drops return light", {"rain_mm_h": 50.0}),
+    "dust": Scenario("a drifting cloud of dust every 10 m", {"dust_per_km": 100.0}),
     "16-beam": Scenario("a lidar with 16 beams", {"lidar": "16-beam"}),
     "distortion": Scenario("the car moves during a sweep, and points have times", {"motion_distortion": True}),
     "dropped-scans": Scenario(

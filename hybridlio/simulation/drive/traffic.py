@@ -2,66 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.simulation.random_streams import RandomStream
 from hybridlio.simulation.world import street
 from hybridlio.simulation.world.ground import Ground
-from hybridlio.simulation.world.rays import RayScene
+from hybridlio.simulation.world.moving import MovingObject
 from hybridlio.simulation.world.roads import LANE_OFFSET_M, Road
-from hybridlio.simulation.world.shapes import Mesh
 
-CAR_RADIUS_M = 5.5  # of a sphere about a car's middle that contains the longest, a lorry of 9 m
+_CAR_RADIUS_M = 5.5  # of a sphere about a car's middle that contains the longest, a lorry of 9 m
+_CAR_MIDDLE_M = 1.0
 _CLEARANCE_M = 3.0  # between the middles of two cars that pass, at least: lanes are 3.5 m apart
 _SENSORS_M = 0.5  # the ego car's sensors are within this of its IMU
-_REACH_M = 90.0  # farther, a dark car returns almost nothing
 # Plausible for a town; this is not a traffic model.
 _ONCOMING_SHARE = 0.7  # these meet the ego car, the others keep their distance to it
 _MIN_MEAN_SPEED_M_S = 4.0  # of others, also where the ego car creeps
 _MIN_SAMPLES = 10  # a car that is on the road for less than a second (10 Hz) is left out
 
 
-@dataclass(eq=False)
-class MovingCar:
-    """A moving car.
-
-    Attributes:
-        motion: ``(x, y, z, heading)`` in world over the seconds that the car is on the road.
-        shape_seed: decides its shape.
-    """
-
-    motion: CubicSpline
-    shape_seed: tuple[int, int]
-    _scene: RayScene | None = None
-
-    def present(self, time_s: float) -> bool:
-        """Return whether the car is on the road at ``time_s``."""
-        return bool(self.motion.x[0] <= time_s <= self.motion.x[-1])
-
-    def poses(self, times_s: Array) -> Array:
-        """Return ``T_world_car`` ``(N, 4, 4)``, constant before and after its time on the road."""
-        x, y, z, heading = self.motion(np.clip(times_s, self.motion.x[0], self.motion.x[-1])).T
-        c, s, zero, one = np.cos(heading), np.sin(heading), np.zeros_like(x), np.ones_like(x)
-        R = np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(-1, 3, 3)
-        return se3.make(R, np.stack([x, y, z], axis=-1))
-
-    @property
-    def mesh(self) -> Mesh:
-        """The car's shape, in its own frame."""
-        return street.car(np.random.default_rng(self.shape_seed))
-
-    @property
-    def scene(self) -> RayScene:
-        """The car's shape, ready for ray casting."""
-        if self._scene is None:
-            self._scene = RayScene.of(self.mesh, np.zeros(3))
-        return self._scene
+def moving_car(motion: CubicSpline, shape_seed: tuple[int, int]) -> MovingObject:
+    """Return a car or lorry with a motion ``(x, y, z, heading)``."""
+    return MovingObject(motion, shape_seed, street.car, _CAR_MIDDLE_M, _CAR_RADIUS_M)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +46,7 @@ class EgoDrive:
     xy: Array
 
 
-def traffic(centreline: Road, ego: EgoDrive, ground: Ground, per_km: float, seed: int) -> list[MovingCar]:
+def traffic(centreline: Road, ego: EgoDrive, ground: Ground, per_km: float, seed: int) -> list[MovingObject]:
     """Draw the moving cars of a drive.
 
     Seven in ten are oncoming, the others stay some seconds ahead or behind. Cars that would come too near to the ego
@@ -108,7 +73,7 @@ def traffic(centreline: Road, ego: EgoDrive, ground: Ground, per_km: float, seed
             shifted = times_s + rng.choice([-1, 1]) * rng.uniform(2.0, 6.0)
             s = np.where((shifted > times_s[0]) & (shifted < times_s[-1]), np.interp(shifted, times_s, ego.s), -1.0)
             motion = _motion(ego.lane, s, 0.0, times_s, ground)
-        car = None if motion is None else MovingCar(motion, (seed, 1000 + number))
+        car = None if motion is None else moving_car(motion, (seed, 1000 + number))
         if car is not None and _keeps_clear(car, ego):
             cars.append(car)
     return cars
@@ -128,7 +93,7 @@ def _motion(road: Road, s: Array, left_m: float, times_s: Array, ground: Ground)
     return CubicSpline(times_s, np.column_stack([xy, ground.height(xy), heading]))
 
 
-def _keeps_clear(car: MovingCar, ego: EgoDrive) -> bool:
+def _keeps_clear(car: MovingObject, ego: EgoDrive) -> bool:
     """Return whether the ego car keeps its distance from the other's middle, and its sensors out of the outline."""
     together = (ego.times_s >= car.motion.x[0]) & (ego.times_s <= car.motion.x[-1])
     x, y, _, heading = car.motion(ego.times_s[together]).T
@@ -138,14 +103,3 @@ def _keeps_clear(car: MovingCar, ego: EgoDrive) -> bool:
     half_length, half_width = np.abs(car.mesh.vertices[:, :2]).max(axis=0) + _SENSORS_M
     inside = (np.abs(along) < half_length) & (np.abs(aside) < half_width)
     return bool(np.hypot(along, aside).min() > _CLEARANCE_M and not inside.any())
-
-
-def in_reach(cars: Sequence[MovingCar], position: Array, time_s: float) -> list[MovingCar]:
-    """Return the cars that can be seen from ``position`` ``(3,)``, world frame, at ``time_s``."""
-    near = []
-    for car in cars:
-        if car.present(time_s):
-            at = car.poses(np.array([time_s]))[0, :3, 3]
-            if np.linalg.norm(at - position) < _REACH_M:
-                near.append(car)
-    return near

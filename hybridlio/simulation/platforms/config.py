@@ -24,6 +24,7 @@ class PlatformConfig(BaseModel):
         imu: a name of :data:`hybridlio.simulation.platforms.imu_grades.IMU_GRADES`.
         seconds: duration.
         seed: of scene, motion, mounts and noise.
+        people: number of people who walk around the sensor.
         start_moving: start in motion instead of standing for the first second.
     """
 
@@ -35,6 +36,7 @@ class PlatformConfig(BaseModel):
     imu: str = "consumer-mems"
     seconds: float = Field(default=DEFAULT_SECONDS, ge=0.5, le=3600.0, allow_inf_nan=False)
     seed: int = Field(default=1, ge=0)
+    people: int = Field(default=0, ge=0, le=1000)
     start_moving: bool = True
 
     @model_validator(mode="before")

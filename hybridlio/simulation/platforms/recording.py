@@ -18,11 +18,13 @@ from hybridlio.simulation.platforms.config import PlatformConfig
 from hybridlio.simulation.platforms.imu_grades import IMU_GRADES
 from hybridlio.simulation.platforms.lidars import SCANNERS
 from hybridlio.simulation.platforms.motion import body_poses, times_of
+from hybridlio.simulation.platforms.people import people_around
 from hybridlio.simulation.platforms.scenes.scene import Scene
 from hybridlio.simulation.platforms.scenes.table import SCENES
 from hybridlio.simulation.random_streams import RandomStream
 from hybridlio.simulation.sensors.imu import add_noise, ideal_imu
 from hybridlio.simulation.sensors.lidar import first_hits, measure
+from hybridlio.simulation.world.moving import MovingObject
 from hybridlio.simulation.world.rays import RayScene
 
 IMU_RATE_HZ = 200  # of the built-in IMUs of Livox; Ouster's run at 100 or 128
@@ -40,6 +42,8 @@ class PlatformRecording:
         path: of the IMU.
         T_imu_lidar: ``(4, 4)`` the extrinsics: any rotation, and a lever arm.
         scan_times_s: ``(N,)`` starts of the sweeps, from zero.
+        rays: the scene, ready for ray casting.
+        people: who walk through it.
     """
 
     config: PlatformConfig
@@ -48,6 +52,7 @@ class PlatformRecording:
     T_imu_lidar: Array
     scan_times_s: Array
     rays: RayScene
+    people: list[MovingObject]
 
     @property
     def scan_stamps_ns(self) -> Stamps:
@@ -76,7 +81,7 @@ class PlatformRecording:
         scanner, start_s = SCANNERS[self.config.lidar], float(self.scan_times_s[index])
         pattern = scanner.sweep(start_s)
         times = start_s + pattern.column_offset_ns / NS_PER_S
-        hits = first_hits(self.rays, [], pattern, self.lidar_poses(times), times)
+        hits = first_hits(self.rays, self.people, pattern, self.lidar_poses(times), times)
         rng = np.random.default_rng([self.config.seed, RandomStream.SCAN, index])
         return measure(hits, pattern, scanner.model, int(self.scan_stamps_ns[index]), True, rng)
 
@@ -93,9 +98,9 @@ def plan(config: PlatformConfig) -> PlatformRecording:
     rate_hz = SCANNERS[config.lidar].model.rate_hz
     scans = np.arange(max(round(config.seconds * rate_hz), 2)) / rate_hz
     T_imu_lidar = se3.between(T_mount_imu, T_mount_lidar)
-    return PlatformRecording(
-        config, scene, SmoothPath.through(times, mount @ T_mount_imu), T_imu_lidar, scans, scene.rays()
-    )
+    path, rays = SmoothPath.through(times, mount @ T_mount_imu), scene.rays()
+    people = people_around(rays, path, config.seconds, config.people, config.seed)
+    return PlatformRecording(config, scene, path, T_imu_lidar, scans, rays, people)
 
 
 def _mounts(body: Body, rng: np.random.Generator) -> tuple[Array, Array]:

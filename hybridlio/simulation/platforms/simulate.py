@@ -75,8 +75,15 @@ def _require_same(done: Path, description: dict[str, Any]) -> None:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         raise DataError(f"{done} exists and is no simulated recording; choose another folder") from None
-    if found != description:
+    if _completed(found) != description:
         raise DataError(f"{path} describes a recording with other settings; choose another folder or seed")
+
+
+def _completed(found: Any) -> Any:
+    """Return the description with defaults for settings that did not exist when it was written."""
+    if not isinstance(found, dict) or not isinstance(found.get("platform"), dict):
+        return found
+    return {**found, "platform": json.loads(PlatformConfig().model_dump_json()) | found["platform"]}
 
 
 def _write(folder: Path, recording: PlatformRecording, progress: Progress | None) -> None:

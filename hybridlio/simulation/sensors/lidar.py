@@ -12,7 +12,7 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Index, Stamps
 from hybridlio.core.lidar_models import LidarModel
 from hybridlio.core.sensors import NS_PER_S, Scan
-from hybridlio.simulation.drive.traffic import CAR_RADIUS_M, MovingCar, in_reach
+from hybridlio.simulation.world.moving import MovingObject, in_reach
 from hybridlio.simulation.world.rays import Hits, RayScene
 
 # A return is detected if the received power, reflectance · cos(incidence) / range² (lidar equation of an extended,
@@ -20,6 +20,8 @@ from hybridlio.simulation.world.rays import Hits, RayScene
 # 90 m, which is plausible for an HDL-64E. The standard deviation of its logarithm blurs these limits.
 _THRESHOLD_1_M2 = 1.6e-6
 _THRESHOLD_LOG_SIGMA = 0.35
+FAINTEST_1_M2 = _THRESHOLD_1_M2 * float(np.exp(-3 * _THRESHOLD_LOG_SIGMA))
+"""Received power below which a return is practically never detected."""
 _MIN_RANGE_M = 1e-3  # keeps the power finite
 _SHINE = (0.55, 0.45)  # share of the reported reflectance that is independent of incidence, and its cosine's share
 _REFLECTANCE_SIGMA = 0.03  # of the reported reflectance: three of its hundredths
@@ -44,6 +46,9 @@ class RayPattern:
     def rays_near(self, centre: Array, radius_m: float) -> NDArray[np.intp]:
         """Return the rays that may hit a sphere about ``centre`` ``(3,)``, lidar frame, while it moves in a sweep."""
         columns, distance = len(self.column_offset_ns), float(np.hypot(centre[0], centre[1]))
+        if columns == len(self.column):  # rays in no order of azimuth
+            along, reach = self.directions @ centre, radius_m + _MARGIN_RAD * float(np.linalg.norm(centre))
+            return np.flatnonzero((along > -reach) & (centre @ centre - along**2 < reach**2))
         if distance <= radius_m:
             return np.arange(len(self.column))
         middle = (np.arctan2(centre[1], centre[0]) / (2 * np.pi) + 0.5) * columns
@@ -66,35 +71,43 @@ def ray_pattern(model: LidarModel) -> RayPattern:
     return RayPattern(np.stack(parts, axis=-1).reshape(-1, 3), column, offsets)
 
 
-def first_hits(scene: RayScene, cars: Sequence[MovingCar], pattern: RayPattern, poses: Array, times_s: Array) -> Hits:
+def world_rays(pattern: RayPattern, poses: Array) -> tuple[Array, Array]:
+    """Return origins and directions ``(R, 3)`` of a sweep's rays in world; poses as :func:`first_hits` takes them."""
+    if len(poses) == 1:
+        # einsum, because a matrix product starts threads, which cost more than so small a product
+        directions = np.einsum("ij,rj->ri", poses[0, :3, :3], pattern.directions)
+        return np.broadcast_to(poses[0, :3, 3], directions.shape), directions
+    shape = (-1, len(poses), 3)
+    directions = np.einsum("cij,bcj->bci", poses[:, :3, :3], pattern.directions.reshape(shape)).reshape(-1, 3)
+    return np.tile(poses[:, :3, 3], (len(directions) // len(poses), 1)), directions
+
+
+def first_hits(
+    scene: RayScene, moving: Sequence[MovingObject], pattern: RayPattern, poses: Array, times_s: Array
+) -> Hits:
     """Return the exact first hits of a sweep.
 
     Args:
         scene: everything that stands still, world frame.
-        cars: everything that moves.
+        moving: everything that moves.
         pattern: the rays.
         poses: ``(columns, 4, 4)`` ``T_world_lidar`` at each azimuth step, or ``(1, 4, 4)`` for an instantaneous scan.
         times_s: ``(columns,)`` or ``(1,)``, the times of these poses.
     """
     instant = len(poses) == 1
-    if instant:
-        # einsum, because a matrix product starts threads, which cost more than so small a product
-        directions = np.einsum("ij,rj->ri", poses[0, :3, :3], pattern.directions)
-        origins = np.broadcast_to(poses[0, :3, 3], directions.shape)
-    else:
-        shape = (-1, len(poses), 3)
-        directions = np.einsum("cij,bcj->bci", poses[:, :3, :3], pattern.directions.reshape(shape)).reshape(-1, 3)
-        origins = np.tile(poses[:, :3, 3], (len(directions) // len(poses), 1))
+    origins, directions = world_rays(pattern, poses)
     hits = scene.cast(origins, directions)
     middle = len(times_s) // 2
-    for car in in_reach(cars, poses[middle, :3, 3], float(times_s[middle])):
-        T_world_car = car.poses(times_s)
-        centre = se3.between(poses[middle], T_world_car[middle])[:3, 3] + [0.0, 0.0, 1.0]
-        rows = pattern.rays_near(centre, CAR_RADIUS_M)
+    for thing in in_reach(moving, poses[middle, :3, 3], float(times_s[middle])):
+        T_world_thing = thing.poses(times_s)
+        centre = se3.between(
+            poses[middle], T_world_thing[middle] @ se3.make(np.eye(3), np.array([0, 0, thing.middle_m]))
+        )
+        rows = pattern.rays_near(centre[:3, 3], thing.radius_m)
         at = np.zeros(len(rows), np.int64) if instant else pattern.column[rows]
-        R, t = T_world_car[at, :3, :3], T_world_car[at, :3, 3]
+        R, t = T_world_thing[at, :3, :3], T_world_thing[at, :3, 3]
         local_origins = np.einsum("nji,nj->ni", R, origins[rows] - t)
-        hits.take_nearer(rows, car.scene.cast(local_origins, np.einsum("nji,nj->ni", R, directions[rows])))
+        hits.take_nearer(rows, thing.scene.cast(local_origins, np.einsum("nji,nj->ni", R, directions[rows])))
     return hits
 
 

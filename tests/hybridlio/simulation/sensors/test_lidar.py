@@ -9,8 +9,9 @@ from scipy.interpolate import CubicSpline
 from hybridlio.core import se3
 from hybridlio.core.lidar_models import LIDAR_MODELS
 from hybridlio.core.sensors import NS_PER_S
-from hybridlio.simulation.drive.traffic import MovingCar
+from hybridlio.simulation.drive.traffic import moving_car
 from hybridlio.simulation.sensors.lidar import first_hits, measure, ray_pattern
+from hybridlio.simulation.world.moving import MovingObject
 from hybridlio.simulation.world.rays import Hits, RayScene
 from hybridlio.simulation.world.shapes import boxes
 
@@ -129,12 +130,12 @@ def test_no_hits_give_an_empty_scan(rng: np.random.Generator):
     assert len(measure(sky, pattern, MODEL, 0, False, rng)) == 0
 
 
-def straight_car(speed: float) -> MovingCar:
+def straight_car(speed: float) -> MovingObject:
     times = np.linspace(-5.0, 5.0, 21)
-    return MovingCar(CubicSpline(times, np.outer(times, [speed, 0, 0, 0]) + np.array([0.0, 3.5, -1.7, 0.0])), (1, 2))
+    return moving_car(CubicSpline(times, np.outer(times, [speed, 0, 0, 0]) + np.array([0.0, 3.5, -1.7, 0.0])), (1, 2))
 
 
-def rays_on(car: MovingCar, times: np.ndarray) -> Hits:
+def rays_on(car: MovingObject, times: np.ndarray) -> Hits:
     empty = RayScene.of(boxes((400, 400, 400), (401, 401, 401), 0.5), np.zeros(3))
     poses = np.broadcast_to(np.eye(4), (len(times), 4, 4))
     return first_hits(empty, [car], ray_pattern(MODEL), poses, times)
