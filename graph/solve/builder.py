@@ -37,8 +37,7 @@ BiasAt: TypeAlias = Callable[[int], gtsam.imuBias.ConstantBias]
 FIXED_SIGMA = 1e-6
 _X0 = X(0)
 _GRAVITY = np.array([0.0, 0.0, -GRAVITY_M_S2])
-_PLANAR_SIGMAS = np.array(co.GTSAM_ORDER[2])
-_PLANAR_MATRIX = np.arange(9).reshape(3, 3)[np.ix_(_PLANAR_SIGMAS, _PLANAR_SIGMAS)].ravel()
+_PLANAR_ORDER = np.array(co.GTSAM_ORDER[2])
 _GAUSSIAN: dict[str, Callable[[Array], gtsam.noiseModel.Base]] = {
     "sigmas": gtsam.noiseModel.Diagonal.Sigmas,
     "information": gtsam.noiseModel.Gaussian.Information,
@@ -58,7 +57,7 @@ class Builder:
     def __init__(self, data: GraphData, bias_at: BiasAt | None = None) -> None:
         self.data = data
         self._bias_at = bias_at or _measured_biases(data)
-        self._models: dict[tuple[str, bytes, Robust | None], gtsam.noiseModel.Base] = {}
+        self._models: dict[tuple[int, bytes, Robust | None], gtsam.noiseModel.Base] = {}
 
     def graph(self, robust: bool = True) -> gtsam.NonlinearFactorGraph:
         """Return all factors in the order of :meth:`factor_ids`, then the priors of fixed poses and of initial biases.
@@ -121,10 +120,8 @@ class Builder:
         if factor.noise is not None:
             noise = factor.noise
             kernel = factor.robust if robust else None
-            if factor.kind in IN_OWN_ORDER:
-                model = noise_model(noise.form, noise.values, kernel, 3)
-            else:
-                model = self._model(noise.form, noise.values.tobytes(), noise.values, kernel)
+            own_order = factor.kind in IN_OWN_ORDER
+            model = noise_model(noise.form, noise.values, kernel, 3 if own_order else self.data.dimension)
         return getattr(self, f"_{factor.kind.replace('-', '_')}")(
             factor, [self.data.index[key] for key in factor.keys], model
         )
@@ -150,22 +147,18 @@ class Builder:
 
     def _edge_models(self, rows: slice, robust: bool) -> list[gtsam.noiseModel.Base]:
         """Return one noise model per row; rows of equal noise share one."""
-        table = self.data.edges
-        values = table.noise_values[rows]
+        table, models = self.data.edges, self._models
+        values = _in_gtsams_order(table.noise_values[rows], self.data.dimension)
         kernels = table.robust if robust else {}
         forms, ids = table.form[rows].tolist(), table.ids[rows].tolist()
-        return [
-            self._model(FORMS[form], value.tobytes(), value, kernels.get(factor_id))
-            for factor_id, form, value in zip(ids, forms, values, strict=True)
-        ]
-
-    def _model(self, form: str, value_bytes: bytes, values: Array, kernel: Robust | None) -> gtsam.noiseModel.Base:
-        model = self._models.get((form, value_bytes, kernel))
-        if model is None:
-            if form == "sigmas" and values.ndim == 2:
-                values = np.diagonal(values)
-            model = self._models[form, value_bytes, kernel] = noise_model(form, values, kernel, self.data.dimension)
-        return model
+        found = []
+        for factor_id, form, value in zip(ids, forms, values, strict=True):
+            name = form, value.tobytes(), kernels.get(factor_id)
+            if (model := models.get(name)) is None:
+                own = np.diagonal(value) if FORMS[form] == "sigmas" else value
+                model = models[name] = _model(FORMS[form], own, kernels.get(factor_id))
+            found.append(model)
+        return found
 
     def _prior(self, factor: Factor, indices: list[int], model: Any) -> Any:
         return self._pose_prior(indices[0], factor.measured, model)
@@ -216,8 +209,17 @@ class Builder:
 
 def noise_model(form: str, values: Array, kernel: Robust | None, dimension: int) -> gtsam.noiseModel.Base:
     """Return GTSAM's noise model, in the order of GTSAM's tangent vectors."""
-    if dimension == 2:
-        values = values[_PLANAR_SIGMAS] if form == "sigmas" else values.ravel()[_PLANAR_MATRIX].reshape(3, 3)
+    return _model(form, _in_gtsams_order(values[None], dimension)[0], kernel)
+
+
+def _in_gtsams_order(values: Array, dimension: int) -> Array:
+    """Return sigmas ``(M, d)`` or matrices ``(M, d, d)`` in the order of GTSAM's tangent vectors."""
+    if dimension == 3:
+        return values
+    return values[:, _PLANAR_ORDER] if values.ndim == 2 else values[:, _PLANAR_ORDER][:, :, _PLANAR_ORDER]
+
+
+def _model(form: str, values: Array, kernel: Robust | None) -> gtsam.noiseModel.Base:
     model = _GAUSSIAN[form](values)
     return model if kernel is None else with_kernel(model, kernel.kernel, kernel.width)
 
