@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Iterable
 from itertools import chain
 from operator import itemgetter
 from pathlib import Path
@@ -82,13 +83,9 @@ def _add_landmarks(data: GraphData, path: Path, parts: list[ParsedRows]) -> None
 
 def _add_factors(data: GraphData, path: Path, parts: list[ParsedRows], offsets: dict[int, Array]) -> None:
     """Add all edges and priors, with ids in the file's order."""
-    poses = {part.tag: 1 if ROW_FORMATS[part.tag].kind in OBSERVATIONS else 2 for part in parts}
-    rows = sorted(
-        ((line, keys[: poses[part.tag]]) for part in parts for line, keys in zip(part.lines, part.keys, strict=True)),
-        key=itemgetter(0),
-    )
-    ids = {line: factor_id for factor_id, (line, _) in enumerate(rows)}
-    _check_keys(data, path, rows)
+    lines = sorted(chain.from_iterable(part.lines for part in parts))
+    ids = dict(zip(lines, range(len(lines)), strict=True))
+    _check_keys(data, path, parts)
     edges = [part for part in parts if ROW_FORMATS[part.tag].kind == "edge"]
     if edges:
         _add_edges(data, edges, ids)
@@ -100,7 +97,7 @@ def _add_factors(data: GraphData, path: Path, parts: list[ParsedRows], offsets: 
 
 
 def _add_edges(data: GraphData, parts: list[ParsedRows], ids: dict[int, int]) -> None:
-    numbers = np.array([ids[line] for part in parts for line in part.lines])
+    numbers = np.array([*map(ids.__getitem__, chain.from_iterable(part.lines for part in parts))])
     keys = chain.from_iterable(pair for part in parts for pair in part.keys)
     ends = np.fromiter(map(data.index.__getitem__, keys), np.int64).reshape(-1, 2)
     measured = np.concatenate([part.coordinates for part in parts])
@@ -134,18 +131,30 @@ def _prior_of_body(sensor: Array, information: Array, offset: Array) -> tuple[Ar
     return co.from_matrices((T_world_sensor @ T_sensor_body)[None], 3)[0], J.T @ information @ J
 
 
-def _check_keys(data: GraphData, path: Path, rows: list[tuple[int, tuple[Key, ...]]]) -> None:
+def _check_keys(data: GraphData, path: Path, parts: list[ParsedRows]) -> None:
     """Check that edges join two vertices; in a file without vertices, add the poses that the factors name."""
-    for line, keys in rows:
-        if len(keys) == 2 and keys[0] == keys[1]:
-            raise DataError(f"{path}, row {line}: joins pose {keys[0]} to itself")
-    named = dict.fromkeys(chain.from_iterable(keys for _, keys in rows))
+    named = dict.fromkeys(chain.from_iterable(keys for _, keys in _named_poses(parts)))
+    for part in parts:
+        joined = part.keys if ROW_FORMATS[part.tag].kind == "edge" else []
+        alone = next((k for k, (i, j) in enumerate(joined) if i == j), None)
+        if alone is not None:
+            raise DataError(f"{path}, row {part.lines[alone]}: joins pose {joined[alone][0]} to itself")
     unknown = named.keys() - data.index.keys()
     if not len(data):
         data.add_poses(list(named), np.full((len(named), len(co.IDENTITY[data.dimension])), np.nan))
     elif unknown:
-        line, key = next((line, key) for line, keys in rows for key in keys if key in unknown)
+        line, key = next((line, key) for line, keys in _named_poses(parts) for key in keys if key in unknown)
         raise DataError(f"{path}, row {line}: no vertex has id {key}")
+
+
+def _named_poses(parts: list[ParsedRows]) -> Iterable[tuple[int, tuple[Key, ...]]]:
+    """Return the line of each factor and the poses that it names, in the file's order."""
+    columns = []
+    for part in parts:
+        observation = ROW_FORMATS[part.tag].kind in OBSERVATIONS
+        poses = [keys[:1] for keys in part.keys] if observation else part.keys
+        columns.append(zip(part.lines, poses, strict=True))
+    return columns[0] if len(columns) == 1 else sorted(chain.from_iterable(columns), key=itemgetter(0))
 
 
 def _fix(data: GraphData, fixed: list[int]) -> None:

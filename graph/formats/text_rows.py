@@ -81,7 +81,7 @@ def parse_rows(path: Path, tag: str, table: TextTable, repair: bool) -> ParsedRo
         # Poses differ from row to row, information matrices seldom do: each distinct matrix is parsed once.
         head = row_format.head
         split = [rest.split(None, head) for rest in table.rests]
-        if any(len(words) <= head for words in split):
+        if min(map(len, split)) <= head:
             _raise_for_first_bad_row(path, tag, table)
         heads = _parse_numbers(path, tag, table, [" ".join(words[:-1]) for words in split])
         last_row = {words[-1]: k for k, words in enumerate(split)}  # by the matrix's text
@@ -92,8 +92,8 @@ def parse_rows(path: Path, tag: str, table: TextTable, repair: bool) -> ParsedRo
         rows = [number[words[-1]] for words in split]
         information, repaired = distinct[rows], int(wrong[rows].sum())
     ids = _ids(path, tag, table, heads)
-    keys = _keys(path, table.lines, [row[: row_format.keys] for row in ids])
-    offsets = [row[-1] for row in ids] if row_format.ids > row_format.keys else []
+    keys = _keys(path, table.lines, ids[: row_format.keys])
+    offsets = ids[-1] if row_format.ids > row_format.keys else []
     if row_format.letter:  # landmarks have a numbering of their own
         keys = [(pose, lettered(row_format.letter, mark) if isinstance(mark, int) else mark) for pose, mark in keys]
     coordinates = _coordinates(path, table.lines, row_format, heads[:, row_format.ids :])
@@ -104,7 +104,7 @@ def _parse_numbers(path: Path, tag: str, table: TextTable, rows: list[str], skip
     """Return the numbers ``(M, n)`` of rows of text, of which each lacks the first ``skipped``."""
     row_format = ROW_FORMATS[tag]
     length = row_format.length - skipped if skipped else row_format.head
-    if any(not row for row in rows):  # NumPy leaves empty rows out
+    if not all(rows):  # NumPy leaves empty rows out
         _raise_for_first_bad_row(path, tag, table)
     try:
         values = np.loadtxt(rows, comments=None, ndmin=2)
@@ -150,21 +150,24 @@ def check_ids(path: Path, line: int, words: list[str]) -> list[str]:
 
 
 def _ids(path: Path, tag: str, table: TextTable, numbers: Array) -> list[list[int]]:
-    """Return the integers of each row; those too large for a double are parsed again."""
+    """Return the columns of integers; those too large for a double are parsed again."""
     count = ROW_FORMATS[tag].ids
     ids = numbers[:, :count]
     if (ids == np.floor(ids)).all() and ids.min() >= 0 and ids.max() < _EXACT_INTEGERS:
-        exact: list[list[int]] = ids.astype(np.int64).tolist()
+        exact: list[list[int]] = ids.T.astype(np.int64).tolist()
         return exact
     _raise_for_first_bad_row(path, tag, table)
-    return [[int(word) for word in rest.split(None, count)[:count]] for rest in table.rests]
+    rows = [[int(word) for word in rest.split(None, count)[:count]] for rest in table.rests]
+    return [list(column) for column in zip(*rows, strict=True)]
 
 
 def _keys(path: Path, lines: list[int], ids: list[list[int]]) -> list[tuple[Key, ...]]:
+    """Return the keys that each row names, from columns of integers."""
+    rows = list(zip(*ids, strict=True))
     if max(map(max, ids)) < PLAIN_KEYS:
-        return [tuple(row) for row in ids]
+        return rows
     keys: list[tuple[Key, ...]] = []
-    for line, row in zip(lines, ids, strict=True):
+    for line, row in zip(lines, rows, strict=True):
         try:
             keys.append(tuple(from_integer(value) for value in row))
         except GraphError as error:

@@ -59,7 +59,14 @@ def split_by_tag(path: Path, lines: list[str], options: LoadOptions) -> FileCont
         DataError: a row has an unknown tag, or one that the options refuse; names it.
     """
     content, kernel = FileContent(), None
+    usual: dict[str, TextTable] = {}  # of the tags whose rows need no look at their text
     for number, line in enumerate(lines, 1):
+        tag, _, rest = line.partition(" ")
+        table = usual.get(tag)
+        if table is not None and kernel is None:
+            table.lines.append(number)
+            table.rests.append(rest)
+            continue
         tag, rest = (*line.split(None, 1), "", "")[:2]
         if tag in options.drop or (tag in LEFT_OUT_TAGS and not options.strict):
             content.left_out[tag] += 1
@@ -69,6 +76,8 @@ def split_by_tag(path: Path, lines: list[str], options: LoadOptions) -> FileCont
                 table.kernels[len(table.lines)], kernel = kernel, None
             table.lines.append(number)
             table.rests.append(_complete(path, number, content, tag, rest, options))
+            if not ROW_FORMATS[tag].optional_information:
+                usual[tag] = table
         elif tag:
             kernel = _read_other_row(path, number, content, tag, rest.split()) or kernel
     return content
