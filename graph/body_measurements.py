@@ -8,10 +8,11 @@ from numpy.typing import ArrayLike
 from hybridlio.core.geodesy import GeodeticPoint, check_geodetic, enu_from_geodetic
 from hybridlio.core.sensors import ImuNoise, ImuSamples
 from hybridlio.graph.model import coordinates as co
+from hybridlio.graph.model.calibrations import CalibrationNames
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key
 from hybridlio.graph.model.measurements import Kind, factor_label
-from hybridlio.graph.model.new_factors import check_direction, imu_factor, vector_factor
+from hybridlio.graph.model.new_factors import check_direction, gps_factor, imu_factor, vector_factor
 from hybridlio.graph.model.noise import NoiseInput, RobustLike
 
 _STANDING_SIGMA_M_S = 0.01  # of a standing vehicle: it sways on its springs by millimetres in a second
@@ -33,16 +34,27 @@ class BodyMeasurements:
         self._data.set_origin(check_geodetic(latitude_deg, longitude_deg, altitude_m, "origin"))
 
     def add_gps(
-        self, key: Key, position_m: ArrayLike, sigmas: ArrayLike | None = None, lever_arm_m: ArrayLike = (0, 0, 0), *,
-        covariance: ArrayLike | None = None, robust: RobustLike = None,
+        self, key: Key, position_m: ArrayLike, sigmas: ArrayLike | None = None, lever_arm_m: ArrayLike | None = None, *,
+        covariance: ArrayLike | None = None, robust: RobustLike = None, calibration: CalibrationNames = (),
     ) -> int:  # fmt: skip
-        """Add the antenna's position ``(3,)`` in world; ``lever_arm_m`` is the antenna's position in the body frame."""
-        vectors, noise = (position_m, lever_arm_m), NoiseInput(covariance, sigmas=sigmas)
-        return self._add_vectors("gps", key, vectors, noise, robust)
+        """Add the antenna's position in world.
+
+        Args:
+            key: of a pose that the graph has.
+            position_m: ``(3,)``, in a planar graph ``(2,)``.
+            sigmas, covariance: exactly one of them.
+            lever_arm_m: the antenna in the body frame, ``(3,)`` or ``(2,)``; zero by default.
+            robust: as in :meth:`~hybridlio.graph.PoseGraph.add_between`.
+            calibration: names of variables ``lever_arm`` and ``time_offset`` (:meth:`add_calibration`), which take the
+                place of ``lever_arm_m`` and of equal clocks. The offset moves the antenna by the pose's velocity.
+        """
+        noise = NoiseInput(covariance, sigmas=sigmas)
+        return self._data.add_factor(gps_factor(self._data, key, (position_m, lever_arm_m), noise, robust, calibration))
 
     def add_gps_geodetic(  # noqa: PLR0913  (the three coordinates of a place, as GPS receivers give them)
         self, key: Key, latitude_deg: float, longitude_deg: float, altitude_m: float, sigmas: ArrayLike | None = None,
-        lever_arm_m: ArrayLike = (0, 0, 0), *, covariance: ArrayLike | None = None, robust: RobustLike = None,
+        lever_arm_m: ArrayLike | None = None, *, covariance: ArrayLike | None = None, robust: RobustLike = None,
+        calibration: CalibrationNames = (),
     ) -> int:  # fmt: skip
         """Add the antenna's place on Earth; world is east, north, up at ``origin``, which is the first fix if not set.
 
@@ -50,12 +62,14 @@ class BodyMeasurements:
             key: of a pose that the graph has.
             latitude_deg, longitude_deg, altitude_m: on WGS 84, metres above the ellipsoid (not above sea level).
             sigmas, covariance: exactly one of them, of east, north, up in metres.
-            lever_arm_m, robust: as in :meth:`add_gps`.
+            lever_arm_m, robust, calibration: as in :meth:`add_gps`.
         """
         point = check_geodetic(latitude_deg, longitude_deg, altitude_m, factor_label("gps", (key,)))
         origin = self.origin or point
         position = enu_from_geodetic([point], origin)[0]
-        number = self.add_gps(key, position, sigmas, lever_arm_m, covariance=covariance, robust=robust)
+        number = self.add_gps(
+            key, position, sigmas, lever_arm_m, covariance=covariance, robust=robust, calibration=calibration
+        )
         self._data.origin = origin
         return number
 
@@ -88,9 +102,16 @@ class BodyMeasurements:
         """
         return self._add_vectors("bias", key, (accel_m_s2, gyro_rad_s), NoiseInput(sigmas=sigmas))
 
-    def add_imu(self, i: Key, j: Key, samples: ImuSamples, noise: ImuNoise | None = None) -> int:
-        """Add two or more raw samples, the first at pose i, the last at pose j; brings both velocities and biases."""
-        return self._data.add_factor(imu_factor(self._data, (i, j), samples, ImuNoise() if noise is None else noise))
+    def add_imu(
+        self, i: Key, j: Key, samples: ImuSamples, noise: ImuNoise | None = None, *, calibration: CalibrationNames = ()
+    ) -> int:  # fmt: skip
+        """Add two or more raw samples, the first at pose i, the last at pose j; brings both velocities and biases.
+
+        ``calibration`` names variables ``bias``, which takes the place of walking biases, and ``gravity``, which takes
+        that of −z (:meth:`add_calibration`).
+        """
+        noise = ImuNoise() if noise is None else noise
+        return self._data.add_factor(imu_factor(self._data, (i, j), samples, noise, calibration))
 
     def _add_vectors(
         self, kind: Kind, key: Key, vectors: tuple[ArrayLike, ...], noise: NoiseInput, robust: RobustLike = None

@@ -13,15 +13,15 @@ from numpy.typing import ArrayLike
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
+from hybridlio.graph.calibrated_measurements import CalibratedMeasurements
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, check_key, list_keys
 from hybridlio.graph.model.noise import NoiseInput, make_noise
-from hybridlio.graph.user_factors import UserFactors
 from hybridlio.graph.views.gtsam_graph import from_gtsam, to_gtsam
 
 
-class WholeGraph(UserFactors):
+class WholeGraph(CalibratedMeasurements):
     """The part of a pose graph that copies, cuts and joins graphs."""
 
     def copy(self) -> Self:
@@ -76,7 +76,8 @@ class WholeGraph(UserFactors):
         """Add another graph's poses and factors; return the new id of each of its factors.
 
         Args:
-            other: a graph of the same dimension, without landmarks, geodetic origin or fixed poses.
+            other: a graph of the same dimension, without landmarks, geodetic origin or fixed poses. Its calibration
+                variables keep their names, which this graph must not have.
             keys: new keys of its poses, for those that change, such as ``{k: (1, k) for k in other.keys}``.
             T_world_other: the other graph's world in this one ``(4, 4)``, by which its initial values and priors are
                 moved; without it they are left out, and factors between the graphs place its poses. Its other factors
@@ -98,6 +99,7 @@ class WholeGraph(UserFactors):
             T, known = co.to_matrices(at[None])[0], ~np.isnan(theirs.initial_values[:, 0])
             initial[known] = _moved(theirs.initial_values[known], T)
         self._data.add_poses(list(renamed.values()), initial)
+        self._data.calibrations |= theirs.calibrations
         ids = {}
         for factor_id, factor in theirs.factors.items():
             if factor.kind == "prior" and T is not None:
@@ -148,7 +150,7 @@ def _part(data: GraphData, kept: set[Key]) -> GraphData:
     part.add_poses(order, data.initial_values[[old[key] for key in order]])
     for key in data.fixed & kept:
         part.fix(key)
-    part.origin = data.origin
+    part.origin, part.calibrations = data.origin, data.calibrations.copy()
     part.other_factors = {n: f for n, f in data.other_factors.items() if kept.issuperset(f.keys)}
     seen = {factor.landmark for factor in part.other_factors.values()}
     for key in data.landmarks.keys:
@@ -167,6 +169,9 @@ def _check_mergeable(ours: GraphData, theirs: GraphData, keys: list[Key]) -> Non
         raise GraphError(f"merge: one graph is {ours.dimension}D, the other {theirs.dimension}D")
     if len(theirs.landmarks) or theirs.origin is not None or theirs.fixed:
         raise GraphError("merge: a graph with landmarks, a geodetic origin or fixed poses cannot be added to another")
+    same = sorted(ours.calibrations.keys() & theirs.calibrations.keys())
+    if same:
+        raise GraphError(f"merge: both graphs have a calibration variable {same[0]!r}")
     in_use = [key for key in keys if key in ours or key in ours.landmarks]
     if in_use or len(set(keys)) < len(keys):
         raise GraphError(f"merge: keys in use, or given twice: {list_keys(in_use or keys)}; give new ones by keys=")

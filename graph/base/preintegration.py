@@ -5,6 +5,8 @@ Forster, Carlone, Dellaert, Scaramuzza, "On-Manifold Preintegration for Real-Tim
 
 from __future__ import annotations
 
+from typing import Any
+
 import gtsam
 import numpy as np
 
@@ -67,11 +69,29 @@ def preintegrate(imu: ImuSamples, state: State, noise: ImuNoise) -> gtsam.Preint
     Raises:
         DataError: there are fewer than two samples.
     """
+    pim = gtsam.PreintegratedCombinedMeasurements(_params_for(imu, state, noise), gtsam_bias(state))
+    _integrate(pim, imu, state)
+    return pim
+
+
+def preintegrate_constant_biases(
+    imu: ImuSamples, state: State, noise: ImuNoise
+) -> gtsam.PreintegratedImuMeasurements:  # fmt: skip
+    """Preintegrate as :func:`preintegrate`, for biases that do not walk."""
+    pim = gtsam.PreintegratedImuMeasurements(_params_for(imu, state, noise), gtsam_bias(state))
+    _integrate(pim, imu, state)
+    return pim
+
+
+def _params_for(imu: ImuSamples, state: State, noise: ImuNoise) -> gtsam.PreintegrationCombinedParams:
     if len(imu) < 2:
         raise DataError(f"preintegration: {len(imu)} IMU samples after {state.stamp_ns} ns, at least 2 are needed")
+    longest_s = float(np.diff(imu.stamps_ns).max()) / NS_PER_S
+    return preintegration_params(noise, longest_s, state.gravity_m_s2)
+
+
+def _integrate(pim: Any, imu: ImuSamples, state: State) -> None:
     steps_s = np.diff(imu.stamps_ns) / NS_PER_S
-    params = preintegration_params(noise, float(steps_s.max()), state.gravity_m_s2)
-    pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam_bias(state))
     gyro = (imu.gyro_rad_s[1:] + imu.gyro_rad_s[:-1]) / 2
     # GTSAM takes the specific force in the sensor's frame at the start of the step (Euler integration); the second
     # sample is measured at its end, so it is rotated back by the turn in between before the mean is taken
@@ -79,7 +99,6 @@ def preintegrate(imu: ImuSamples, state: State, noise: ImuNoise) -> gtsam.Preint
     accel = (imu.accel_m_s2[:-1] + (turned @ imu.accel_m_s2[1:, :, None])[..., 0]) / 2
     for step_s, a, w in zip(steps_s, accel, gyro, strict=True):
         pim.integrateMeasurement(a, w, step_s)
-    return pim
 
 
 def preintegrate_unknown(state: State, dt_s: float) -> gtsam.PreintegratedCombinedMeasurements:

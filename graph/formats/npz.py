@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 from pathlib import Path
 from typing import Any, get_args
@@ -13,7 +14,9 @@ from hybridlio.core.errors import DataError, GraphError
 from hybridlio.core.files import UNREADABLE_NPZ, write_atomically
 from hybridlio.core.geodesy import check_geodetic
 from hybridlio.core.sensors import ImuSamples
+from hybridlio.graph.formats.npz_calibration import add_calibrations, calibration_arrays
 from hybridlio.graph.model import coordinates as co
+from hybridlio.graph.model.calibrations import CALIBRATION_KINDS, chosen
 from hybridlio.graph.model.edge_table import FORMS
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, check_key
@@ -22,7 +25,8 @@ from hybridlio.graph.model.new_factors import check_vector
 from hybridlio.graph.model.noise import Noise, NoiseInput, Robust, make_noise, make_robust
 
 _FORMAT = "hybridlio pose graph 1"
-_FORMAT_WITH_LANDMARKS = "hybridlio pose graph 2"  # earlier releases, which would lose the landmarks, refuse it
+# earlier releases, which would lose the landmarks or the calibration variables, refuse these
+_FORMAT_WITH_LANDMARKS, _FORMAT_WITH_CALIBRATION = "hybridlio pose graph 2", "hybridlio pose graph 3"
 _NO_ROBOT = -1  # in the robots' column, of an integer key
 
 
@@ -35,7 +39,7 @@ def write_npz(data: GraphData, path: str | os.PathLike[str]) -> None:
     keys = data.keys
     key_table = _key_table([(key,) for key in keys], 1)
     arrays: dict[str, Any] = {
-        "format": np.array(_FORMAT_WITH_LANDMARKS if len(data.landmarks) else _FORMAT),
+        "format": np.array(_format_of(data)),
         "dimension": np.array(data.dimension),
         "next_id": np.array(data.next_id),
         "keys": key_table,
@@ -47,6 +51,8 @@ def write_npz(data: GraphData, path: str | os.PathLike[str]) -> None:
     if len(data.landmarks):
         arrays["landmark_keys"] = _key_table([(key,) for key in data.landmarks.keys], 1)
         arrays["landmark_initial"] = data.landmarks.initial_values
+    if data.calibrations:
+        arrays |= calibration_arrays(data)
     if len(data.edges):
         arrays |= {f"between_{name}": column for name, column in _edge_columns(data, key_table[:, 0]).items()}
     code = [factor.label for factor in data.other_factors.values() if factor.kind in CODE]
@@ -59,6 +65,12 @@ def write_npz(data: GraphData, path: str | os.PathLike[str]) -> None:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     write_atomically(path, buffer.getvalue())
+
+
+def _format_of(data: GraphData) -> str:
+    if data.calibrations:
+        return _FORMAT_WITH_CALIBRATION
+    return _FORMAT_WITH_LANDMARKS if len(data.landmarks) else _FORMAT
 
 
 def _edge_columns(data: GraphData, keys: Any) -> dict[str, Any]:
@@ -93,6 +105,8 @@ def _factor_columns(by_id: dict[int, Factor]) -> dict[str, Any]:
     landmarks: list[tuple[Key, ...]] = [(factor.landmark,) for factor in factors if factor.landmark is not None]
     if landmarks:
         columns["landmark"] = _key_table(landmarks, 1)
+    if any(factor.calibration for factor in factors):
+        columns["calibration"] = np.array([json.dumps(factor.calibration) for factor in factors])
     noises = [factor.noise for factor in factors if factor.noise is not None]
     if noises:
         columns["noise_form"] = np.array([noise.form for noise in noises])
@@ -116,8 +130,8 @@ def read_npz(path: str | os.PathLike[str]) -> GraphData:
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-        if str(arrays["format"]) not in (_FORMAT, _FORMAT_WITH_LANDMARKS):
-            raise DataError(f"{path}: has format {arrays['format']!s}; this release reads {_FORMAT_WITH_LANDMARKS}")
+        if str(arrays["format"]) not in (_FORMAT, _FORMAT_WITH_LANDMARKS, _FORMAT_WITH_CALIBRATION):
+            raise DataError(f"{path}: has format {arrays['format']!s}; this release reads {_FORMAT_WITH_CALIBRATION}")
         return _assemble(arrays)
     except OSError as error:
         raise DataError(f"cannot read {path}: {error}") from error
@@ -132,6 +146,7 @@ def _assemble(arrays: dict[str, Any]) -> GraphData:
         data.set_origin(check_geodetic(latitude_deg, longitude_deg, height_m, "origin"))
     _add_poses(data, arrays)
     _add_landmarks(data, arrays)
+    add_calibrations(data, arrays)
     by_id: dict[int, Factor] = {}
     for kind in get_args(Kind):
         prefix = f"{kind}_"
@@ -144,6 +159,7 @@ def _assemble(arrays: dict[str, Any]) -> GraphData:
             raise DataError(f"{factor.label}: no pose has key {missing[0]}")
         if factor.landmark is not None and factor.landmark not in data.landmarks:
             raise DataError(f"{factor.label}: no landmark has key {factor.landmark}")
+        chosen(data.calibrations, factor.calibration, CALIBRATION_KINDS, factor.label)
         data.add_factor(factor, factor_id)
     data.next_id = max(data.next_id, int(arrays["next_id"]))
     return data
@@ -191,7 +207,8 @@ def _factors(kind: Kind, columns: dict[str, Any]) -> dict[int, Factor]:
         robust: Robust | None = make_robust((kernel, float(columns["width"][row])), 1, name) if kernel else None
         measured = check_vector(measured, len(measured), name)
         sample, landmark = samples[row] if samples else None, landmarks[row] if landmarks else None
-        found[factor_id] = Factor(kind, keys, measured, noise, robust, sample, landmark)
+        names = tuple(json.loads(str(columns["calibration"][row]))) if "calibration" in columns else ()
+        found[factor_id] = Factor(kind, keys, measured, noise, robust, sample, landmark, calibration=names)
     return found
 
 

@@ -51,6 +51,8 @@ def write_text(data: GraphData, path: str | os.PathLike[str], dialect: Dialect) 
         unsupported["gps"] = sum(f.kind == "gps" for f in data.other_factors.values())
     if len(data.landmarks) and "landmark" not in tags:
         unsupported["landmark"] = len(data.landmarks)
+    if data.calibrations:
+        unsupported["calibration"] = len(data.calibrations)
     if unsupported.total():
         kinds = ", ".join(f"{count} × {kind}" for kind, count in unsupported.items())
         raise GraphError(f"{path}: {dialect}'s format cannot hold {kinds}; save as .npz, which holds everything")

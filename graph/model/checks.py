@@ -8,10 +8,11 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
 from hybridlio.graph.model import coordinates as co
+from hybridlio.graph.model.calibrations import of_kind
 from hybridlio.graph.model.connectivity import components, groups
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, list_keys
-from hybridlio.graph.model.measurements import OBSERVATIONS, VELOCITIES, Factor
+from hybridlio.graph.model.measurements import OBSERVATIONS, STEPS, VELOCITIES, Factor
 from hybridlio.graph.model.user_residual import sample_poses
 
 _MOTIONS = ("rotation about x", "rotation about y", "rotation about z", "x", "y", "z")
@@ -21,7 +22,12 @@ _RANK_TOLERANCE = 1e-6
 # Share of a named motion in an unobserved unit direction from which a message names it: a direction may mix all six,
 # none then has less than 1/√6 = 0.4 in its largest, and smaller shares only confuse.
 _NAMED_SHARE = 0.1
-_ROWS = {"heading": [2], "altitude": [5], "body-velocity": []}  # motions that these measure by themselves
+_ROWS = {
+    "heading": [2],
+    "altitude": [5],
+    "body-velocity": [],
+    "sensor-step": [],
+}  # motions that these measure by themselves
 
 
 def check_determined(data: GraphData) -> None:
@@ -38,6 +44,7 @@ def check_determined(data: GraphData) -> None:
     if free:
         raise GraphError(_free_message(data, free))
     _check_velocities(data)
+    _check_clocks(data)
 
 
 def check_observed(data: GraphData) -> None:
@@ -132,7 +139,7 @@ def _check_velocities(data: GraphData) -> None:
     placed = {f.keys[0] for f in others if f.kind in ("prior", "gps")} | data.fixed
     # poses of one group have known relative positions; group 0 holds all whose position in world is known
     group_of: dict[Key, int] = {}
-    for number, group in enumerate(groups(data, ("between",)), 1):
+    for number, group in enumerate(groups(data, STEPS), 1):
         group_of |= dict.fromkeys(group, 0 if placed & set(group) else number)
     for chain in groups(data, ("imu",)):
         numbers = [group_of[key] for key in chain]
@@ -140,4 +147,18 @@ def _check_velocities(data: GraphData) -> None:
             raise GraphError(
                 f"nothing determines the velocity along the inertial factors of poses {list_keys(chain)}; "
                 "add a velocity, or another factor between two of the poses"
+            )
+
+
+def _check_clocks(data: GraphData) -> None:
+    """Check that the poses of factors on another clock have a velocity, which moves them."""
+    others = data.other_factors.values()
+    moving = {key for factor in others if factor.kind in ("imu", *VELOCITIES) for key in factor.keys}
+    for factor in others:
+        if of_kind(data.calibrations, factor.calibration, "time_offset") is None:
+            continue
+        still = [key for key in factor.keys if key not in moving]
+        if still:
+            raise GraphError(
+                f"{factor.label}: its clock needs the velocity of pose {still[0]}; add_imu or add_velocity"
             )

@@ -12,9 +12,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from hybridlio.core.sensors import ImuNoise
+from hybridlio.graph.model.calibrations import of_kind
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key
-from hybridlio.graph.model.measurements import CODE, OBSERVATIONS
+from hybridlio.graph.model.measurements import CODE, OBSERVATIONS, STEPS, Factor
 
 
 def group_labels(data: GraphData, kinds: Iterable[str]) -> tuple[int, NDArray[np.int32]]:
@@ -46,7 +47,7 @@ def components(data: GraphData) -> list[list[Key]]:
 
     Two parts are joined where they share as many landmarks as determine a rigid transform: two, or three in space.
     """
-    parts = groups(data, ("between", "imu", *CODE))
+    parts = groups(data, (*STEPS, "imu", *CODE))
     observations = [f for f in data.other_factors.values() if f.kind in OBSERVATIONS]
     if len(parts) == 1 or not observations:
         return parts
@@ -90,7 +91,7 @@ def chains_without_bias(data: GraphData) -> list[InertialChain]:
     measured = {factor.keys[0] for factor in data.other_factors.values() if factor.kind == "bias"}
     first: dict[Key, ImuNoise] = {}
     for factor in data.other_factors.values():
-        if factor.kind == "imu":
+        if walks(data, factor):
             first.setdefault(factor.keys[0], ImuNoise(*factor.measured))
     found = []
     for chain in groups(data, ("imu",)) if first else []:
@@ -98,3 +99,8 @@ def chains_without_bias(data: GraphData) -> list[InertialChain]:
         if starts and not measured & set(chain):
             found.append(InertialChain(chain, starts[0], first[starts[0]]))
     return found
+
+
+def walks(data: GraphData, factor: Factor) -> bool:
+    """Return whether a factor is inertial, with biases that each pose has of its own."""
+    return factor.kind == "imu" and of_kind(data.calibrations, factor.calibration, "bias") is None

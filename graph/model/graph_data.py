@@ -12,6 +12,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError, shown
 from hybridlio.core.geodesy import GeodeticPoint
 from hybridlio.graph.model import coordinates as co
+from hybridlio.graph.model.calibrations import CalibrationVariable
 from hybridlio.graph.model.edge_table import FORMS, EdgeTable
 from hybridlio.graph.model.growing_array import GrowingArray
 from hybridlio.graph.model.keys import Key, check_key, list_keys
@@ -62,6 +63,7 @@ class GraphData:
     Attributes:
         dimension: 2 or 3.
         landmarks: points that poses observe.
+        calibrations: calibration variables by name.
         edges: the between-factors.
         other_factors: all other factors by id, in the order they were added.
         next_id: id of the next factor.
@@ -78,6 +80,7 @@ class GraphData:
         self._initial = GrowingArray(co.IDENTITY[dimension].shape)  # NaN where there is no initial value
         self._fixed: set[Key] = set()
         self.landmarks = Landmarks(dimension)
+        self.calibrations: dict[str, CalibrationVariable] = {}
         self.edges = EdgeTable(dimension)
         self._edge_factors: dict[int, Factor] = {}
         self.other_factors: dict[int, Factor] = {}
@@ -186,6 +189,7 @@ class GraphData:
         copy._keys, copy._index, copy._fixed = self._keys.copy(), self._index.copy(), self._fixed.copy()
         copy._initial, copy.next_id = self._initial.where(slice(None)), self.next_id
         copy.origin, copy.landmarks = self.origin, self.landmarks.copy()
+        copy.calibrations = self.calibrations.copy()
         keep = ~np.isin(self.edges.ids, list(without)) if without else slice(None)
         copy.edges = self.edges.where(keep)
         copy.other_factors = {n: factor for n, factor in self.other_factors.items() if n not in without}

@@ -14,7 +14,7 @@ from hybridlio.graph.model.noise import Noise, Robust
 
 Kind: TypeAlias = Literal[
     "between", "prior", "gps", "attitude", "velocity", "bias", "imu", "point", "bearing-range", "altitude", "heading",
-    "body-velocity", "custom", "gtsam",
+    "body-velocity", "sensor-step", "custom", "gtsam",
 ]  # fmt: skip
 CODE = ("custom", "gtsam")  # of users, which no file holds
 OBSERVATIONS = ("point", "bearing-range")  # of landmarks
@@ -23,7 +23,8 @@ VECTOR_NOISE_SIZE = {
     "gps": 3, "attitude": 2, "velocity": 3, "bias": 6, "altitude": 1, "heading": 1, "body-velocity": 3,
 }  # fmt: skip
 VELOCITIES = ("velocity", "body-velocity")
-IN_OWN_ORDER = ("custom", "heading")  # residuals that are no tangent vectors, which GTSAM orders in its own way
+STEPS = ("between", "sensor-step")  # a pose in the frame of another
+IN_OWN_ORDER = ("custom", "heading", "gps")  # residuals that are no tangent vectors, which GTSAM orders in its own way
 SCALARS = ("altitude", "heading")
 
 
@@ -34,16 +35,18 @@ class Factor:
     Attributes:
         kind: what is measured.
         keys: of the poses that it concerns.
-        measured: ``between`` and ``prior``: coordinates of a pose (:mod:`hybridlio.graph.model.coordinates`);
-            ``gps``: position, lever arm (6); ``attitude``: direction in world, in body (6); ``velocity``: m/s (3);
-            ``bias``: accelerometer, gyroscope (6); ``imu``: the fields of
-            :class:`hybridlio.core.sensors.ImuNoise` in their order (6); ``point``: a landmark in the frame of the pose
-            (d); ``bearing-range``: angle or unit direction, and range (2, in space 4); ``altitude``: m (1);
-            ``heading``: rad (1); ``body-velocity``: m/s (3); empty for ``custom`` and ``gtsam``.
+        measured: ``between``, ``sensor-step`` and ``prior``: coordinates of a pose
+            (:mod:`hybridlio.graph.model.coordinates`); ``gps``: position, lever arm (6; in the plane z is 0);
+            ``attitude``: direction in world, in body (6); ``velocity``: m/s (3); ``bias``: accelerometer, gyroscope
+            (6); ``imu``: the fields of :class:`hybridlio.core.sensors.ImuNoise` in their order (6); ``point``: a
+            landmark in the frame of the pose (d); ``bearing-range``: angle or unit direction, and range (2, in space
+            4); ``altitude``: m (1); ``heading``: rad (1); ``body-velocity``: m/s (3); empty for ``custom`` and
+            ``gtsam``.
         noise: of the measurement; None for ``imu``, whose noise follows from the samples.
         robust: kernel, or None.
         samples: of an ``imu`` factor.
         landmark: key of the observed landmark, of ``point`` and ``bearing-range``.
+        calibration: names of the calibration variables that the measurement depends on.
         code: of ``custom`` a :class:`hybridlio.graph.model.user_residual.UserResidual`, of ``gtsam`` GTSAM's factor.
     """
 
@@ -55,6 +58,7 @@ class Factor:
     samples: ImuSamples | None = None
     landmark: Key | None = None
     code: Any = None
+    calibration: tuple[str, ...] = ()
 
     @property
     def label(self) -> str:

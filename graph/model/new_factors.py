@@ -12,6 +12,7 @@ from hybridlio.core.errors import DataError, GraphError
 from hybridlio.core.se3 import as_floats
 from hybridlio.core.sensors import ImuNoise, ImuSamples
 from hybridlio.graph.model import coordinates as co
+from hybridlio.graph.model.calibrations import CalibrationNames, chosen, of_kind
 from hybridlio.graph.model.graph_data import GraphData, PosesByKey
 from hybridlio.graph.model.keys import Key, check_key
 from hybridlio.graph.model.measurements import SCALARS, VECTOR_NOISE_SIZE, Factor, Kind, factor_label
@@ -78,12 +79,44 @@ def vector_factor(
     return Factor(kind, (key,), measured, make_noise(name, size, noise), make_robust(robust, size, name))
 
 
-def imu_factor(data: GraphData, ends: tuple[Key, Key], samples: ImuSamples, noise: ImuNoise) -> Factor:
+def gps_factor(
+    data: GraphData, key: Key, vectors: tuple[ArrayLike, ArrayLike | None], noise: NoiseInput, robust: RobustLike,
+    calibration: CalibrationNames,
+) -> Factor:  # fmt: skip
+    """Return the measured position of an antenna; in the plane the vectors get z = 0.
+
+    Args:
+        data: the graph.
+        key: of the pose.
+        vectors: position in world, and antenna in the body frame or None.
+        noise: of the position.
+        robust: kernel.
+        calibration: names of calibration variables.
+
+    Raises:
+        DataError: a vector is malformed, or the noise is not symmetric positive definite.
+        GraphError: unknown pose or variable, a variable of another kind, a lever arm given twice, or none or several
+            forms of noise.
+    """
+    name, d = factor_label("gps", (key,)), data.dimension
+    (key,) = data.known_keys(key, what=name)
+    names = chosen(data.calibrations, calibration, ("lever_arm", "time_offset"), name)
+    if vectors[1] is not None and of_kind(data.calibrations, names, "lever_arm") is not None:
+        raise GraphError(f"{name}: give lever_arm_m or a calibration variable, not both")
+    given = (np.zeros(d) if vector is None else check_vector(vector, d, name) for vector in vectors)
+    measured = np.concatenate([np.r_[vector, np.zeros(3 - d)] for vector in given])
+    made = make_noise(name, d, noise), make_robust(robust, d, name)
+    return Factor("gps", (key,), measured, *made, calibration=names)
+
+
+def imu_factor(
+    data: GraphData, ends: tuple[Key, Key], samples: ImuSamples, noise: ImuNoise, calibration: CalibrationNames = ()
+) -> Factor:  # fmt: skip
     """Return an inertial factor between two poses.
 
     Raises:
         DataError: fewer than two samples, or noise densities that are not positive.
-        GraphError: unknown pose, a pose joined to itself, or a planar graph.
+        GraphError: unknown pose or calibration variable, a pose joined to itself, or a planar graph.
     """
     name = factor_label("imu", ends)
     i, j = data.known_keys(*ends, what=name)
@@ -97,7 +130,8 @@ def imu_factor(data: GraphData, ends: tuple[Key, Key], samples: ImuSamples, nois
     densities = np.array(astuple(noise))
     if not (np.isfinite(densities).all() and densities.min() > 0):
         raise DataError(f"{name}: noise densities must be finite and positive, got {densities.tolist()}")
-    return Factor("imu", (i, j), densities, samples=samples)
+    names = chosen(data.calibrations, calibration, ("bias", "gravity"), name)
+    return Factor("imu", (i, j), densities, samples=samples, calibration=names)
 
 
 def observation_factor(

@@ -74,7 +74,7 @@ def condense(data: GraphData, loops: Edges, odometry: Edges, chain: GraphOdometr
     small.add_poses(keys, data.initial_values[kept])
     for key in data.fixed:
         small.fix(key)
-    small.landmarks = data.landmarks.copy()
+    small.landmarks, small.calibrations = data.landmarks.copy(), data.calibrations
     small.origin, small.other_factors = data.origin, dict(data.other_factors)
     steps = _stretches(chain, keep, odometry)
     d = data.tangent_size

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hybridlio.graph.calibration.plain_steps import plain_steps
 from hybridlio.graph.model.checks import check_determined, check_observed
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.outliers.rejection import reject_outliers
@@ -30,8 +31,10 @@ def solve_batch(graph: GraphData, settings: Settings, report: IterationProgress)
 
 def _solve_without_outliers(data: GraphData, settings: Settings, report: IterationProgress) -> Solution:
     start = None if settings.initial == "auto" else choose_start(data, settings.initial)
-    found = reject_outliers(data, start, report)
-    kept = data.copy(without=found.wrong)
+    plain, sensor_steps = plain_steps(data)  # loops are judged with the calibration as stated
+    found = reject_outliers(plain, start, report)
+    wrong = frozenset(sensor_steps.get(number, number) for number in found.wrong)
+    kept = data.copy(without=wrong)
     check_determined(kept)
     solver = NonlinearSolver(kept, settings.max_iterations, settings.tolerance, report)
-    return Solution(data, solver(found.start), found.wrong, found.doubts)
+    return Solution(data, solver(found.start), wrong, found.doubts)

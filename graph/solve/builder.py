@@ -1,12 +1,14 @@
 """A pose graph as GTSAM's factors and values.
 
-Variables are ``x`` pose, ``v`` velocity and ``b`` biases, by pose index, and ``l`` landmark, by landmark index.
+Variables are ``x`` pose, ``v`` velocity and ``b`` biases, by pose index, ``l`` landmark, by landmark index, and ``c``
+calibration, by its order in the graph.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from functools import cached_property
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -18,9 +20,19 @@ from hybridlio.core.estimates import State
 from hybridlio.core.motion_limits import GRAVITY_M_S2
 from hybridlio.core.sensors import NS_PER_S, ImuNoise
 from hybridlio.graph.base.noise import with_kernel
-from hybridlio.graph.base.preintegration import preintegrate
+from hybridlio.graph.base.preintegration import preintegrate, preintegrate_constant_biases
+from hybridlio.graph.calibration.biases import BiasAt, bias_variable, measured_biases, turn_rates
+from hybridlio.graph.calibration.factors import (
+    AntennaFix,
+    SensorStep,
+    extrinsics_matrix,
+    inertial_factor,
+)
+from hybridlio.graph.calibration.moving_pose import MovingPose
+from hybridlio.graph.calibration.variables import insert_calibrations, prior, variable_of
 from hybridlio.graph.model import coordinates as co
-from hybridlio.graph.model.connectivity import InertialChain, chains_without_bias
+from hybridlio.graph.model.calibrations import CalibrationKind, of_kind
+from hybridlio.graph.model.connectivity import InertialChain, chains_without_bias, walks
 from hybridlio.graph.model.edge_table import FORMS
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key
@@ -29,8 +41,6 @@ from hybridlio.graph.model.noise import Robust
 from hybridlio.graph.model.user_residual import altitude, heading
 from hybridlio.graph.solve.custom_factors import body_velocity_factor, custom_factor
 from hybridlio.graph.solve.landmark_factors import initial_landmarks, insert_landmarks, observation
-
-BiasAt: TypeAlias = Callable[[int], gtsam.imuBias.ConstantBias]
 
 # rad, m: of the prior that holds a fixed pose. Small against any sensor, large enough that information of 1e12 beside
 # that of edges still solves in double precision.
@@ -50,17 +60,20 @@ class Builder:
 
     Args:
         data: the graph.
-        bias_at: biases around which the samples of an IMU factor are preintegrated, by index of its first pose; by
-            default those of bias factors, else zero.
+        bias_at: biases around which the samples of an IMU factor are preintegrated, by the variable of its first
+            biases; by default those of bias factors and stated constant ones, else zero.
+        pose_variable: of a pose, by index, in factors in Python, which GTSAM cannot rename.
     """
 
-    def __init__(self, data: GraphData, bias_at: BiasAt | None = None) -> None:
-        self.data = data
-        self._bias_at = bias_at or _measured_biases(data)
+    def __init__(
+        self, data: GraphData, bias_at: BiasAt | None = None, pose_variable: Callable[[int], int] = X
+    ) -> None:  # fmt: skip
+        self.data, self._pose_variable = data, pose_variable
+        self._bias_at = bias_at or measured_biases(data)
         self._models: dict[tuple[int, bytes, Robust | None], gtsam.noiseModel.Base] = {}
 
     def graph(self, robust: bool = True) -> gtsam.NonlinearFactorGraph:
-        """Return all factors in the order of :meth:`factor_ids`, then the priors of fixed poses and of initial biases.
+        """Return all factors in the order of :meth:`factor_ids`, then the priors of fixed poses, biases, calibration.
 
         Args:
             robust: whether to apply the robust kernels.
@@ -77,6 +90,8 @@ class Builder:
             graph.add(self.fixed_pose_prior(key))
         for chain in chains_without_bias(self.data):
             graph.add(self.initial_bias_prior(chain))
+        for name in self.data.calibrations:
+            graph.add(prior(self.data.calibrations, name))
         return graph
 
     def factor_ids(self) -> list[int]:
@@ -92,14 +107,20 @@ class Builder:
         for k, velocity in _initial_velocities(self.data, poses).items():
             insert(V(k), velocity)
         for k in self.poses_with_bias():
-            insert(B(k), self._bias_at(k))
+            insert(B(k), self._bias_at(B(k)))
         insert_landmarks(values, initial_landmarks(self.data, poses))
+        insert_calibrations(values, self.data.calibrations)
         return values
 
     def poses_with_bias(self) -> list[int]:
         """Return the indices of the poses whose biases are variables."""
-        kinds = ("imu", "bias")
-        return sorted({self.data.index[k] for f in self.data.other_factors.values() if f.kind in kinds for k in f.keys})
+        walking = (f for f in self.data.other_factors.values() if f.kind == "bias" or walks(self.data, f))
+        return sorted({self.data.index[key] for factor in walking for key in factor.keys})
+
+    @property
+    def has_inertial_factors(self) -> bool:
+        """Whether samples are preintegrated around biases."""
+        return any(factor.kind == "imu" for factor in self.data.other_factors.values())
 
     def edges(self, rows: slice, robust: bool = True) -> list[Any]:
         """Return the between-factors of some rows of the edge table."""
@@ -168,8 +189,30 @@ class Builder:
         return make(X(index), co.gtsam_poses(at[None])[0], model)
 
     def _gps(self, factor: Factor, indices: list[int], model: Any) -> Any:
-        z = factor.measured
-        return gtsam.GPSFactorArm(X(indices[0]), z[:3], z[3:], model)
+        z, arm = factor.measured, self._calibrated(factor, "lever_arm")
+        return AntennaFix(z[:3], self._moving(factor, indices[0]), z[3:], arm).factor(model)
+
+    def _sensor_step(self, factor: Factor, indices: list[int], model: Any) -> Any:
+        first, second = (self._moving(factor, index) for index in indices)
+        stated = extrinsics_matrix(of_kind(self.data.calibrations, factor.calibration, "extrinsics"))
+        variables = (self._calibrated(factor, "extrinsics"), self._calibrated(factor, "scale"))
+        return SensorStep(co.to_matrices(factor.measured[None])[0], first, second, stated, *variables).factor(model)
+
+    def _moving(self, factor: Factor, index: int) -> MovingPose:
+        """Return a pose of a factor at the time that the factor's clock gives it."""
+        planar, clock = self.data.dimension == 2, self._calibrated(factor, "time_offset")
+        if clock is None:
+            return MovingPose(self._pose_variable(index), planar)
+        return MovingPose(self._pose_variable(index), planar, (clock, V(index)), self._rates.get(index))
+
+    def _calibrated(self, factor: Factor, kind: CalibrationKind) -> int | None:
+        """Return GTSAM's variable of the calibration of one kind that a factor depends on, or None."""
+        found = of_kind(self.data.calibrations, factor.calibration, kind)
+        return None if found is None else variable_of(self.data.calibrations, found.name)
+
+    @cached_property
+    def _rates(self) -> dict[int, Array]:
+        return turn_rates(self.data, self._bias_at)
 
     def _attitude(self, factor: Factor, indices: list[int], model: Any) -> Any:
         z = factor.measured
@@ -179,17 +222,19 @@ class Builder:
         return gtsam.PriorFactorVector(V(indices[0]), factor.measured, model)
 
     def _custom(self, factor: Factor, indices: list[int], model: Any) -> Any:
-        return custom_factor(factor.code, [X(k) for k in indices], model)
+        return custom_factor(factor.code, [self._pose_variable(k) for k in indices], model)
 
     def _altitude(self, factor: Factor, indices: list[int], model: Any) -> Any:
-        return custom_factor(altitude(float(factor.measured[0]), factor.label), [X(indices[0])], model)
+        return custom_factor(
+            altitude(float(factor.measured[0]), factor.label), [self._pose_variable(indices[0])], model
+        )
 
     def _heading(self, factor: Factor, indices: list[int], model: Any) -> Any:
         residual = heading(float(factor.measured[0]), factor.label, self.data.dimension)
-        return custom_factor(residual, [X(indices[0])], model)
+        return custom_factor(residual, [self._pose_variable(indices[0])], model)
 
     def _body_velocity(self, factor: Factor, indices: list[int], model: Any) -> Any:
-        return body_velocity_factor(factor.measured, X(indices[0]), V(indices[0]), model)
+        return body_velocity_factor(factor.measured, self._pose_variable(indices[0]), V(indices[0]), model)
 
     def _bias(self, factor: Factor, indices: list[int], model: Any) -> Any:
         z = factor.measured
@@ -198,13 +243,17 @@ class Builder:
     def _imu(self, factor: Factor, indices: list[int], _: Any) -> Any:
         assert factor.samples is not None
         z, (i, j) = factor.measured, indices
-        bias, zero, stamp_ns = self._bias_at(i), np.zeros(3), int(factor.samples.stamps_ns[0])
+        bias = self._bias_at(bias_variable(self.data, factor))
+        zero, stamp_ns = np.zeros(3), int(factor.samples.stamps_ns[0])
         # preintegration only uses the state's stamp, biases and gravity
         state = State(
             stamp_ns, np.eye(4), zero, bias.accelerometer(), bias.gyroscope(), _GRAVITY, np.eye(15), np.eye(3)
         )  # fmt: skip
-        pim = preintegrate(factor.samples, state, ImuNoise(*z))
-        return gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), pim)
+        constant = self._calibrated(factor, "bias")
+        integrate = preintegrate if constant is None else preintegrate_constant_biases
+        pim = integrate(factor.samples, state, ImuNoise(*z))
+        biases = (B(i), B(j)) if constant is None else (constant,)
+        return inertial_factor((X(i), V(i), X(j), V(j)), biases, self._calibrated(factor, "gravity"), pim)
 
 
 def noise_model(form: str, values: Array, kernel: Robust | None, dimension: int) -> gtsam.noiseModel.Base:
@@ -222,18 +271,6 @@ def _in_gtsams_order(values: Array, dimension: int) -> Array:
 def _model(form: str, values: Array, kernel: Robust | None) -> gtsam.noiseModel.Base:
     model = _GAUSSIAN[form](values)
     return model if kernel is None else with_kernel(model, kernel.kernel, kernel.width)
-
-
-def _measured_biases(data: GraphData) -> BiasAt:
-    """Return biases by pose index: those of bias factors, else zero."""
-    measured = {data.index[f.keys[0]]: f.measured for f in data.other_factors.values() if f.kind == "bias"}
-    zero = np.zeros(6)
-
-    def bias_at(index: int) -> gtsam.imuBias.ConstantBias:
-        bias = measured.get(index, zero)
-        return gtsam.imuBias.ConstantBias(bias[:3], bias[3:])
-
-    return bias_at
 
 
 def _initial_velocities(data: GraphData, poses: Array) -> dict[int, Array]:

@@ -7,6 +7,7 @@ from itertools import takewhile
 
 import numpy as np
 
+from hybridlio.core.errors import GraphError
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key
 from hybridlio.graph.model.measurements import Factor
@@ -41,6 +42,12 @@ class Changes:
         return [factor for factor in self.other_factors.values() if factor.kind in kinds]
 
 
+def check_followed(data: GraphData) -> None:
+    """Raise GraphError where a graph has what online solvers do not follow: calibration variables."""
+    if data.calibrations:
+        raise GraphError("online solvers take no calibration variables; solve the graph by optimize()")
+
+
 class ChangeTracker:
     """Finds changes in constant time each; only where factors were removed it goes through all."""
 
@@ -51,8 +58,13 @@ class ChangeTracker:
         self._ids: set[int] = set()
 
     def read(self) -> Changes:
-        """Return the changes since the last :meth:`accept`."""
+        """Return the changes since the last :meth:`accept`.
+
+        Raises:
+            GraphError: the graph has calibration variables.
+        """
         data = self._data
+        check_followed(data)
         first = int(np.searchsorted(data.edges.ids, self._next_id))
         newest = takewhile(lambda factor_id: factor_id >= self._next_id, reversed(data.other_factors))
         others = {factor_id: data.other_factors[factor_id] for factor_id in sorted(newest)}

@@ -9,6 +9,7 @@ import numpy as np
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
+from hybridlio.graph.calibration.plain_steps import with_plain_steps
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.connectivity import group_labels, groups
 from hybridlio.graph.model.edge_arrays import Edges, edges_of
@@ -39,7 +40,8 @@ def choose_start(data: GraphData, initial: str) -> Array:
         GraphError: values are missing and cannot be found.
     """
     if initial in INITIAL_METHODS:
-        return find_initial_values(data, initial)
+        return find_initial_values(with_plain_steps(data), initial)
+    data = with_plain_steps(data)
     values = data.initial_values
     missing = np.isnan(values[:, 0])
     if initial == "given":
@@ -161,14 +163,15 @@ def _align_to_gps(data: GraphData, T: Array) -> None:
         measured = np.array([factor.measured for factor in here])
         antennas = (poses[:, :3, :3] @ measured[:, 3:, None])[..., 0] + poses[:, :3, 3]
         indices = [data.index[key] for key in part]
-        T[indices] = _rigid_fit(antennas, measured[:, :3]) @ T[indices]
+        T[indices] = _rigid_fit(antennas, measured[:, :3], data.dimension) @ T[indices]
 
 
-def _rigid_fit(points: Array, onto: Array) -> Array:
-    """Return the transform ``(4, 4)`` that brings points ``(N, 3)`` closest to others."""
+def _rigid_fit(points: Array, onto: Array, d: int) -> Array:
+    """Return the transform ``(4, 4)`` that brings points ``(N, 3)`` closest to others; in the plane for ``d`` of 2."""
     a, b = points - points.mean(axis=0), onto - onto.mean(axis=0)
-    U, _, Vt = np.linalg.svd(b.T @ a)
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    U, _, Vt = np.linalg.svd((b.T @ a)[:d, :d])
+    R = np.eye(3)
+    R[:d, :d] = U @ np.diag([*np.ones(d - 1), np.linalg.det(U @ Vt)]) @ Vt
     return se3.make(R, onto.mean(axis=0) - R @ points.mean(axis=0))
 
 
@@ -206,6 +209,7 @@ def _chi2(data: GraphData, coordinates: Array, edges: Edges) -> float:
 def _absolute_residual(factor: Factor, pose: Array) -> Array:
     """Return the residual of a prior or a GPS factor at a pose ``(4, 4)``."""
     if factor.kind == "gps":
-        return np.asarray(se3.transform(pose, factor.measured[None, 3:])[0] - factor.measured[:3])
+        apart = se3.transform(pose, factor.measured[None, 3:])[0] - factor.measured[:3]
+        return np.asarray(apart if factor.noise is None else apart[: len(factor.noise.values)])
     step = se3.log(se3.between(co.to_matrices(factor.measured[None])[0], pose))
     return step if len(factor.measured) == 7 else step[2:5]

@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
 from hybridlio.graph.base.isam import gtsam_message
+from hybridlio.graph.calibration.biases import BiasAt
 from hybridlio.graph.model.graph_data import GraphData
-from hybridlio.graph.solve.builder import BiasAt, Builder
+from hybridlio.graph.solve.builder import Builder
 from hybridlio.graph.solve.linear_solver import levenberg_marquardt_params, linear_solver, needs_qr, poses_of
 from hybridlio.graph.solve.settings import IterationProgress
 
@@ -104,8 +104,7 @@ class NonlinearSolver:
         """
         graph = self._graph
         found = self._descend(graph, self._builder.values(start))
-        inertial = self._builder.poses_with_bias()
-        for _ in range(_INERTIAL_ROUNDS - 1 if inertial else 0):
+        for _ in range(_INERTIAL_ROUNDS - 1 if self._builder.has_inertial_factors else 0):
             graph = Builder(self._data, biases_of(found.values)).graph()
             again = self._descend(graph, found.values)
             found = replace(again, before=found.before, iterations=found.iterations + again.iterations)
@@ -164,5 +163,5 @@ class NonlinearSolver:
 
 
 def biases_of(values: gtsam.Values) -> BiasAt:
-    """Return the estimated biases by pose index, for a :class:`Builder`."""
-    return lambda index: values.atConstantBias(B(index))
+    """Return the estimated biases by variable, for a :class:`Builder`."""
+    return values.atConstantBias

@@ -103,7 +103,7 @@ class OnlineStart:
         self._poses: dict[int, Any] = {}
         self._velocities: dict[int, Any] = {}
         self._biases = {data.index[f.keys[0]]: f.measured for f in changes.of_kind("bias")}
-        self.builder = Builder(data, self.bias)
+        self.builder = Builder(data, lambda variable: self.bias(gtsam.Symbol(variable).index()))
 
     def bias(self, index: int) -> gtsam.imuBias.ConstantBias:
         """Return a pose's biases, around which samples are preintegrated: estimated, else measured, else zero."""

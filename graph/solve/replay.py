@@ -9,6 +9,7 @@ from hybridlio.core.errors import GraphError
 from hybridlio.graph.model.checks import check_determined, check_observed
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.solve.builder import Builder
+from hybridlio.graph.solve.changes import check_followed
 from hybridlio.graph.solve.initial_values import choose_start
 from hybridlio.graph.solve.linear_solver import poses_of
 from hybridlio.graph.solve.nonlinear import SolverResult, biases_of
@@ -27,6 +28,7 @@ def solve_online(graph: GraphData, settings: Settings, report: IterationProgress
     Raises:
         GraphError: the factors do not determine every pose, or a factor spans more than the lag; names the keys.
     """
+    check_followed(graph)
     check_determined(graph)
     check_observed(graph)
     data = graph.copy()

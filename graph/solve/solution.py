@@ -8,13 +8,14 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, L, V, X
+from gtsam.symbol_shorthand import B, V, X
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
 from hybridlio.graph.base.deep_stack import on_deep_stack
 from hybridlio.graph.base.isam import gtsam_message, incremental_solver
+from hybridlio.graph.calibration.estimates import CalibrationEstimate, estimate, reported
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, check_key
@@ -26,7 +27,7 @@ from hybridlio.graph.views.solution_views import SolutionViews
 
 
 class Solution(SolutionViews):
-    """Poses, velocities and biases of a solved graph, and how well they fit; independent of later changes to the graph.
+    """What was found for a solved graph, and how well it fits; independent of later changes to the graph.
 
     Attributes:
         error_before: half the sum of squared, whitened residuals at the start, under the robust kernels.
@@ -134,21 +135,33 @@ class Solution(SolutionViews):
         bias = self._result.values.atConstantBias(variable)
         return np.array(bias.accelerometer()), np.array(bias.gyroscope())
 
-    def covariance(self, key: Key) -> Array:
-        """Return the marginal covariance of a pose in world, of a right perturbation, or of a landmark in world.
+    @property
+    def calibrations(self) -> list[str]:
+        """Names of all calibration variables, in the order they were added."""
+        return list(self._data.calibrations)
 
-        A pose's is ``(6, 6)`` in rad² and m², rotation first; in the plane ``(3, 3)`` of heading, x, y. A landmark's is
-        ``(3, 3)`` in m², in the plane ``(2, 2)``. A fixed pose has the covariance of the prior that holds it, 1e-6 rad
-        and m.
+    def calibration(self, name: str) -> CalibrationEstimate:
+        """Return a calibration variable: value, covariance, and what the measurements do not determine.
 
         Raises:
-            GraphError: no pose or landmark has this key, or the graph is too ill-conditioned for covariances.
+            GraphError: no variable has this name.
         """
-        if (key := check_key(key)) in self._data.landmarks:
-            covariance = self._marginal(L(self._data.landmarks.index[key]))
-            return np.asarray((covariance + covariance.T) / 2)
-        covariance = self._marginal(X(self._known(key)))
-        return co.our_order((covariance + covariance.T) / 2, self._data.dimension)
+        variable, _ = reported(self._data, self._result.values, name)
+        return estimate(self._data, self._result.values, name, self._marginal(variable))
+
+    def covariance(self, key: Key | str) -> Array:
+        """Return the marginal covariance of a pose, a landmark or a calibration variable.
+
+        A pose's, of a right perturbation in world, is ``(6, 6)`` in rad² and m², rotation first; in the plane
+        ``(3, 3)`` of heading, x, y. A landmark's is ``(3, 3)`` in m², in the plane ``(2, 2)``. A fixed pose has the
+        covariance of the prior that holds it, 1e-6 rad and m. A calibration variable's, by its name, is as
+        :class:`~hybridlio.graph.CalibrationEstimate` has it.
+
+        Raises:
+            GraphError: no pose, landmark or variable has this key, or the graph is too ill-conditioned for covariances.
+        """
+        variable, M = reported(self._data, self._result.values, key)
+        return _symmetric(M @ self._marginal(variable) @ M.T)
 
     def relative_covariance(self, i: Key, j: Key) -> Array:
         """Return the covariance of ``T_i_j = T_i⁻¹ T_j``, the pose of j in the frame of i; shape as :meth:`covariance`.
@@ -174,23 +187,17 @@ class Solution(SolutionViews):
         """Return the covariance ``(6, 6)`` of the biases, accelerometer first; raises as :meth:`bias`."""
         return _symmetric(self._marginal(self._variable(B(self._known(key)), key, "biases")))
 
-    def joint_covariance(self, keys: Sequence[Key]) -> Array:
-        """Return the joint covariance of several poses and landmarks, in blocks in the order of the keys.
+    def joint_covariance(self, keys: Sequence[Key | str]) -> Array:
+        """Return the joint covariance of several poses, landmarks and calibration variables, in blocks in their order.
 
         Each block is as in :meth:`covariance`, which also lists what is raised.
         """
-        variables = [
-            L(self._data.landmarks.index[key]) if key in self._data.landmarks else X(self._known(key)) for key in keys
-        ]
+        found = [reported(self._data, self._result.values, key) for key in keys]
+        if len(found) == 1:
+            return self.covariance(keys[0])
+        variables = [variable for variable, _ in found]
         joint: Any = on_deep_stack(len(self._index), lambda: self._marginals.jointMarginalCovariance(variables))
-        orders = [
-            np.argsort(co.GTSAM_ORDER[2]) if self._data.dimension == 2 and key in self._index else slice(None)
-            for key in keys
-        ]
-        return _symmetric(
-            np.block([[joint.at(a, b)[m][:, n] for b, n in zip(variables, orders, strict=True)]
-                      for a, m in zip(variables, orders, strict=True)])
-        )  # fmt: skip
+        return _symmetric(np.block([[M @ joint.at(a, b) @ N.T for b, N in found] for a, M in found]))
 
     def residual(self, factor_id: int) -> Array:
         """Return the difference of a factor's measurement and the solution, not whitened; of rejected factors too.

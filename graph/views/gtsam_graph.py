@@ -9,6 +9,7 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 
 from hybridlio.core.errors import DataError
+from hybridlio.graph.calibration.variables import insert_calibrations
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, from_integer, to_integer
@@ -21,20 +22,27 @@ _PRIOR = {"PriorFactorPose3", "PriorFactorPose2"}
 
 
 def to_gtsam(data: GraphData) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """Return all factors, priors of fixed poses included, and the initial values of the poses that have one.
+    """Return all factors, priors of fixed poses and of calibration included, and the initial values that are known.
 
     A pose's key is its integer, or GTSAM's symbol for ``(robot, index)``. Velocities ``v``, biases ``b`` and landmarks
-    ``l`` are symbols of their index.
+    ``l`` are symbols of their index, calibration variables ``c`` of their order.
     """
-    renamed = {X(k): to_integer(key) for key, k in data.index.items()}
-    graph, built = gtsam.NonlinearFactorGraph(), Builder(data).graph()
+    names = [to_integer(key) for key in data.index]
+    renamed = {X(k): name for k, name in enumerate(names)}
+    graph = gtsam.NonlinearFactorGraph()
+    built, in_python = Builder(data).graph(), Builder(data, pose_variable=names.__getitem__)
+    ids = in_python.factor_ids()
     for k in range(built.size()):
         factor = built.at(k)
-        graph.add(factor.rekey([renamed.get(key, key) for key in list(factor.keys())]))
+        if isinstance(factor, gtsam.CustomFactor):  # a copy by rekey is not possible
+            graph.add(in_python.factor(data.other_factors[ids[k]]))
+        else:
+            graph.add(factor.rekey([renamed.get(key, key) for key in list(factor.keys())]))
     values, initial = gtsam.Values(), data.initial_values
     known = np.flatnonzero(~np.isnan(initial[:, 0]))
     for key, pose in zip(data.keys_at(known.tolist()), co.gtsam_poses(initial[known]), strict=True):
         values.insert(to_integer(key), pose)
+    insert_calibrations(values, data.calibrations)
     return graph, values
 
 

@@ -69,9 +69,32 @@ def pose_graph(dimension: int) -> Case:
         graph.add_imu(1, 2, samples(rng))
         graph.add_bias(1, 0.1 * rng.normal(size=3), 0.01 * rng.normal(size=3), sigmas=0.2)
         graph.add_imu(0, 1, samples(rng))
+    add_calibrated(graph, rng)
     builder = Builder(graph._data)
     made, values = builder.graph(), builder.values(from_matrices(np.array(poses), graph.dimension))
     return [made.at(k) for k in range(made.size())], values
+
+
+def add_calibrated(graph: PoseGraph, rng: np.random.Generator) -> None:
+    """Add every kind of factor that depends on calibration variables."""
+    size, of_pose = graph.dimension, 6 if graph.dimension == 3 else 3
+    graph.add_calibration("mount", "extrinsics", pose(rng, size), sigmas=0.3)
+    graph.add_calibration("scale", "scale", 1.2, sigmas=0.1)
+    graph.add_calibration("arm", "lever_arm", rng.normal(size=size), sigmas=0.1)
+    steps, fixes = ["mount", "scale"], ["arm"]
+    if size == 3:
+        graph.add_calibration("clock", "time_offset", 0.1, sigmas=0.1)
+        graph.add_calibration("biases", "bias", 0.1 * rng.normal(size=6), sigmas=0.1)
+        graph.add_calibration("down", "gravity", rng.normal(size=3), sigmas=0.1)
+        graph.add_velocity(2, rng.normal(size=3), sigmas=0.3)
+        steps, fixes = [*steps, "clock"], [*fixes, "clock"]
+        for names in ("biases", "down", ["biases", "down"]):
+            graph.add_imu(1, 2, samples(rng), calibration=names)
+        graph.add_gps(1, rng.normal(size=3), 0.2, calibration="arm")
+    graph.add_sensor_step(1, 2, pose(rng, size), steps, covariance(rng, of_pose))
+    graph.add_gps(1, rng.normal(size=size), 0.2, calibration=fixes)
+    graph.add_gps(2, rng.normal(size=size), 0.2, rng.normal(size=size))
+    graph.add_gps(2, rng.normal(size=size), 0.2)
 
 
 def odometry() -> Case:
@@ -160,9 +183,14 @@ def moved(values: gtsam.Values, rng: np.random.Generator) -> gtsam.Values:
 KINDS = {
     "pose graph in space": {
         "PriorFactorPose3", "BetweenFactorPose3", "GPSFactorArm", "AttitudeFactorPose3", "PriorFactorVector",
-        "CombinedImuFactor", "PriorFactorConstantBias",
+        "CombinedImuFactor", "PriorFactorConstantBias", "ImuFactor", "ImuFactorWithGravityDirection", "CustomFactor",
+        "CombinedImuFactorWithGravityDirection", "GPSFactorArmCalib", "PriorFactorPoint3", "PriorFactorUnit3",
     },
-    "pose graph in the plane": {"PriorFactorPose2", "BetweenFactorPose2"},
+    "pose graph in the plane": {
+        "PriorFactorPose2", "BetweenFactorPose2", "CustomFactor", "PoseTranslationPrior2D", "PriorFactorPoint2",
+        "PriorFactorPoint3",
+        "PriorFactorVector",
+    },
     "odometry": {
         "PriorFactorPose3", "PriorFactorVector", "PriorFactorConstantBias", "PriorFactorPoint3", "RangeFactor3D",
         "BetweenFactorPose3", "CombinedImuFactorWithGravityVector", "BetweenFactorPoint3",
