@@ -15,7 +15,7 @@ from hybridlio.odometry.estimate import Estimate
 from hybridlio.odometry.pipeline import Pipeline, timed
 from hybridlio.odometry.registry import check_names, make_implementations
 from hybridlio.odometry.setup import Setup
-from hybridlio.odometry.start_up import repeat_first_step, start_backend, start_residual, take_up_imu
+from hybridlio.odometry.start_up import measure_step, restore_search, start_backend, start_residual, take_up_imu
 from hybridlio.record import plain_values
 from hybridlio.record.loop_keyframes import LoopKeyframeSelector
 from hybridlio.record.record import Record
@@ -99,14 +99,11 @@ class Odometry:
 
         pipeline = self._pipeline
         seconds: dict[str, float] = {}
-        is_first_step = pipeline.state is None
         before = self._state_before(frame, pipeline)
         recorded, frame = frame, pipeline.usable(frame)
         with timed(seconds, "initial pose"):
             initial = pipeline.predict(frame, before)
-        compensated, relative = pipeline.refine(frame, initial, before, seconds)
-        if is_first_step:
-            compensated, relative = repeat_first_step(pipeline, frame, (compensated, relative), before)
+        compensated, relative = measure_step(pipeline, frame, initial, before, seconds)
         with timed(seconds, "graph"):
             relative, gate = pipeline.apply_gate(recorded, initial, relative, before)
             frame = frame if gate.uses_imu else without_imu(frame)
@@ -159,6 +156,7 @@ class Odometry:
         return {
             "residual": plain_values.state_of(pipeline.residual),
             "gate": plain_values.state_of(pipeline.gate),
+            "start_search": None if pipeline.start_search is None else plain_values.state_of(pipeline.start_search),
             "keyframe_position": self._keyframes.last_position,
             "keyframes": self._keyframes.kept_since(row),
             "start": pipeline.start,
@@ -189,6 +187,7 @@ class Odometry:
         if self._pipeline is not None:
             plain_values.restore(self._pipeline.residual, state["residual"])
             plain_values.restore(self._pipeline.gate, state["gate"])
+            restore_search(self._pipeline, state["start_search"])
         self._keyframes.restore(state["keyframes"], state["keyframe_position"])
         return difference
 

@@ -18,6 +18,7 @@ from hybridlio.core.estimates import Backend, InitialPoseSource, RelativePose, R
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise
 from hybridlio.odometry.compensation import MotionCompensation
 from hybridlio.odometry.estimate import InertialState
+from hybridlio.odometry.start_search import StartSearch
 from hybridlio.sources.imu_trust import ImuTrust, without_imu
 from hybridlio.sources.innovation_gate import GateResult, InnovationGate
 
@@ -51,6 +52,7 @@ class Pipeline:
         trust: how far the IMU is believed.
         start: state at the first scan that the backend started from; None until the second frame.
         state: the backend's state at the last scan; None until the second frame has been added.
+        start_search: while the first motion is undecided, its search; None otherwise.
     """
 
     first: Frame
@@ -63,6 +65,7 @@ class Pipeline:
     trust: ImuTrust = field(init=False)
     start: State | None = None
     state: State | None = None
+    start_search: StartSearch | None = None
     _has_warned: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:

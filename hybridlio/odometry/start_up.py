@@ -7,7 +7,9 @@ has been found. The backend starts at the second frame, because the samples up t
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -15,8 +17,12 @@ from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.motion_limits import BRIDGED_ACCELERATION_SIGMA_M_S2
 from hybridlio.core.sensors import NS_PER_S, Frame, ImuSamples, Scan
 from hybridlio.core.start_state import start_state
-from hybridlio.odometry.pipeline import Pipeline
+from hybridlio.odometry.pipeline import Pipeline, timed
+from hybridlio.odometry.start_search import StartSearch
+from hybridlio.record import plain_values
 from hybridlio.record.record import Record
+from hybridlio.sources.recent_points import repeats_pattern
+from hybridlio.sources.scan_matching import ScanMatching
 
 _log = logging.getLogger(__name__)
 
@@ -58,6 +64,60 @@ def start_backend(pipeline: Pipeline, second: Frame) -> State:
     pipeline.start = start_state(first.scan.stamp_ns, samples, pipeline.imu_noise)
     pipeline.backend.start(pipeline.start)
     return pipeline.start
+
+
+def measure_step(
+    pipeline: Pipeline, frame: Frame, initial: RelativePose, before: State, seconds: dict[str, float]
+) -> tuple[Frame, RelativePose]:
+    """Return the compensated frame and the step to it: of the search while the start is undecided, else refined.
+
+    Args:
+        pipeline: its residual source refines.
+        frame: as recorded.
+        initial: initial relative pose of the step.
+        before: the backend's state at the scan before.
+        seconds: gets the time spent.
+    """
+    is_first_step = pipeline.state is None
+    if is_first_step:
+        pipeline.start_search = start_search(pipeline, frame)
+    if pipeline.start_search is not None:
+        found = _searched(pipeline, pipeline.start_search, frame, seconds)
+        if found is not None:
+            return found
+    answer = pipeline.refine(frame, initial, before, seconds)
+    return repeat_first_step(pipeline, frame, answer, before) if is_first_step else answer
+
+
+def start_search(pipeline: Pipeline, second: Frame) -> StartSearch | None:
+    """Return a search of the start if the lidar does not repeat its pattern; None where two scans decide it."""
+    residual, first = pipeline.residual, pipeline.first
+    if not isinstance(residual, ScanMatching) or repeats_pattern(first.scan, second.scan):
+        return None
+    return StartSearch(first, residual.settings, pipeline.calibration, pipeline.imu_noise)
+
+
+def restore_search(pipeline: Pipeline, state: Mapping[str, Any] | None) -> None:
+    """Restore an unfinished search from its stored attributes; the residual source is restored already."""
+    if state is not None and isinstance(pipeline.residual, ScanMatching):
+        settings = pipeline.residual.settings
+        pipeline.start_search = StartSearch(pipeline.first, settings, pipeline.calibration, pipeline.imu_noise)
+        plain_values.restore(pipeline.start_search, state)
+
+
+def _searched(
+    pipeline: Pipeline, search: StartSearch, frame: Frame, seconds: dict[str, float]
+) -> tuple[Frame, RelativePose] | None:
+    """Return the search's answer, and give its scans to scan matching when it ends; None if it ends without one."""
+    assert pipeline.start is not None
+    assert isinstance(pipeline.residual, ScanMatching)
+    with timed(seconds, "residual"):
+        found = search.add(frame, pipeline.start, pipeline.residual.name)
+        if found is None or found.is_decided:
+            pipeline.start_search = None
+            if search.last is not None:
+                pipeline.residual.start_from(search.last.frames, search.last.poses)
+    return None if found is None else (found.frames[-1], found.relative)
 
 
 def repeat_first_step(

@@ -63,6 +63,18 @@ class MatchingState:
         origin = PathPoint(np.eye(4), map_changed=True)
         return cls(origin, origin, keyframe=keyframe)
 
+    @classmethod
+    def placed(cls, T_map_previous: Array, T_map_lidar: Array, dt_s: float, keyframe: Array) -> MatchingState:
+        """Return the state after scans whose poses were found otherwise.
+
+        Args:
+            T_map_previous, T_map_lidar: ``(4, 4)`` poses of the last two.
+            dt_s: time between them.
+            keyframe: ``(N, 3)`` points of all scans in the frame of the last.
+        """
+        twist = se3.log(se3.between(T_map_previous, T_map_lidar)) / dt_s
+        return cls(PathPoint(T_map_lidar, twist, map_changed=True), PathPoint(T_map_previous), keyframe=keyframe)
+
     def matched(self, T_map_lidar: Array, dt_s: float, is_degenerate: bool, is_vague: bool) -> MatchingState:
         """Return the state after a scan that was matched.
 

@@ -41,8 +41,7 @@ class RecentPoints:
         directions, before = _directions(scan.points), self._directions
         self._directions = directions
         if before is not None:
-            shared = len(np.intersect1d(directions, before, assume_unique=True))
-            self._repeats = shared > _REPEATED_SHARE * len(directions)
+            self._repeats = _repeats(before, directions)
             self._directions = None
 
     def add(self, points: Array, T_map_lidar: Array) -> None:
@@ -61,6 +60,16 @@ class RecentPoints:
         T_lidar_map = se3.inverse(T_map_lidar)
         everything = [se3.transform(T_lidar_map @ pose, earlier) for earlier, pose in self._recent]
         return np.asarray(voxel_average(np.concatenate(everything), None, voxel_m)[0], np.float64)
+
+
+def repeats_pattern(earlier: Scan, later: Scan) -> bool:
+    """Return whether a lidar measures in about the same directions in two consecutive scans."""
+    return _repeats(_directions(earlier.points), _directions(later.points))
+
+
+def _repeats(before: Index, directions: Index) -> bool:
+    shared = len(np.intersect1d(directions, before, assume_unique=True))
+    return shared > _REPEATED_SHARE * len(directions)
 
 
 def _directions(points: Array | Floats) -> Index:

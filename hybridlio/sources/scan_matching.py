@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from hybridlio.registration.degeneracy import ObservedRegistration, Registration
 from hybridlio.registration.icp import Registration
 from hybridlio.registration.local_map import LocalMap
 from hybridlio.registration.motion_search import best_start, coarse_kernel_m, fits_better, motions
+from hybridlio.sources import map_errors
 from hybridlio.sources.matching_state import MatchingState, PathPoint
 from hybridlio.sources.recent_points import RecentPoints
 from hybridlio.sources.scene_scale import SceneScale
@@ -34,12 +36,6 @@ _LOST_COST = 0.6  # mean cost of the points, 0 to 1; well above that of any scan
 # A new map starts after this number of scans in a row that have enough points and do not fit. A passing occlusion lasts
 # less than half a second at 10 Hz; bridging longer adds more error than a new map, which starts at the bridges' error.
 _LOST_SCANS = 5
-# The local map is least reliable while it is young: one keyframe has ground along its own rings only, and normals
-# between them are guesses. Its covariance is inflated by 1 + 5/keyframes, and at least half of it, divided by
-# the number of keyframes, is drift, because the map is as wrong as the few scans that it consists of.
-_YOUNG_MAP_INFLATION, _YOUNG_MAP_DRIFT_SHARE = 5.0, 0.5
-# Steps along an unchanged map do not drift against it. The share is above 0 because a covariance has to be definite.
-_UNCHANGED_MAP_DRIFT_SHARE = 1e-3
 _FLOOR_COVARIANCE = np.diag(MEASUREMENT_FLOOR_SIGMAS**2)
 
 
@@ -57,7 +53,7 @@ class ScanMatching:
 
     def __init__(self, settings: ScanMatchingSettings | None = None) -> None:
         self._scale = SceneScale(settings or ScanMatchingSettings())
-        self._map = LocalMap(self._settings.local_map)
+        self._map = LocalMap(self.settings.local_map)
         self._state = MatchingState(PathPoint(np.eye(4)), PathPoint(np.eye(4)))
         self._stamp_ns = 0
         self._recent = RecentPoints()
@@ -71,19 +67,35 @@ class ScanMatching:
         """
         scan = self._thin(frame.scan)
         while self._rescale(frame.scan, scan):  # until its settings are its own; later ones follow scan by scan
-            scan = thin(frame.scan, self._settings)
-        if len(scan.points) < self._settings.min_points:
+            scan = thin(frame.scan, self.settings)
+        if len(scan.points) < self.settings.min_points:
             raise DataError(
-                f"frame {frame.index}: only {len(scan.points)} points between {self._settings.min_range_m:.2g} "
-                f"and {self._settings.max_range_m:g} m; start at a scan with at least {self._settings.min_points}"
+                f"frame {frame.index}: only {len(scan.points)} points between {self.settings.min_range_m:.2g} "
+                f"and {self.settings.max_range_m:g} m; start at a scan with at least {self.settings.min_points}"
             )
-        self._map = LocalMap(self._settings.local_map)
+        self._map = LocalMap(self.settings.local_map)
         self._state = MatchingState.started(scan.points)
         self._recent = RecentPoints()
         self._recent.observe(frame.scan)
         self._recent.add(scan.points, np.eye(4))
         self.current_scan = scan
         self._stamp_ns = frame.scan.stamp_ns
+
+    def start_from(self, frames: Sequence[Frame], poses: Array) -> None:
+        """Start at the last of two or more scans with known poses ``(K, 4, 4)``; the map is made of all of them.
+
+        Raises:
+            DataError: the first scan has too few points.
+        """
+        self.start(frames[0])
+        for frame, pose in zip(frames[1:], poses[1:], strict=True):
+            self._recent.observe(frame.scan)
+            self.current_scan = scan = self._thin(frame.scan)
+            self._recent.add(scan.points, pose)
+        dt_s = (frames[-1].scan.stamp_ns - frames[-2].scan.stamp_ns) / NS_PER_S
+        together = self._recent.together(scan.points, poses[-1], self.settings.map_voxel_m)
+        self._state = MatchingState.placed(poses[-2], poses[-1], dt_s, together)
+        self._stamp_ns = frames[-1].scan.stamp_ns
 
     def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:
         """Register the scan; where that fails, return the initial pose with ``ok`` False."""
@@ -92,29 +104,29 @@ class ScanMatching:
         self.current_scan = scan = self._thin(frame.scan)
         dt_s = (frame.scan.stamp_ns - self._stamp_ns) / NS_PER_S
         self._stamp_ns = frame.scan.stamp_ns
-        usable = len(scan.points) >= self._settings.min_points and self._map.surface is not None
+        usable = len(scan.points) >= self.settings.min_points and self._map.surface is not None
         observed = self._register(scan, initial, dt_s) if usable else None
-        if observed is None or observed.registration.matched < self._settings.min_matched:
+        if observed is None or observed.registration.matched < self.settings.min_matched:
             return self._bridge(scan, initial, observed)
         return self._accept(scan, initial, observed, dt_s)
 
     @property
-    def _settings(self) -> ScanMatchingSettings:
+    def settings(self) -> ScanMatchingSettings:
         """The settings at the scene's scale."""
         return self._scale.settings
 
     def _thin(self, scan: Scan) -> ThinnedScan:
         """Thin a scan at the scene's scale, which it may change; the map then goes on at the new one."""
-        thinned = thin(scan, self._settings)
-        return thin(scan, self._settings) if self._rescale(scan, thinned) else thinned
+        thinned = thin(scan, self.settings)
+        return thin(scan, self.settings) if self._rescale(scan, thinned) else thinned
 
     def _rescale(self, scan: Scan, thinned: ThinnedScan) -> bool:
         """Let the scale of the scene follow the scan; return whether it has changed."""
-        if len(scan) < self._settings.min_points:
+        if len(scan) < self.settings.min_points:
             return False
         changed = self._scale.observe(thinned.view_m, len(thinned.points), len(scan))
         if changed:
-            self._map.rescale(self._settings.local_map)
+            self._map.rescale(self.settings.local_map)
         return changed
 
     def take_back(self, initial: RelativePose) -> None:
@@ -132,14 +144,14 @@ class ScanMatching:
         Returns:
             ``T_j_k`` of the current scan in the earlier one; ``initial`` with ``ok`` False where registration fails.
         """
-        too_few = min(len(earlier.points), len(current.points)) < self._settings.min_points
+        too_few = min(len(earlier.points), len(current.points)) < self.settings.min_points
         if too_few or earlier.surface is None:
             return replace(initial, ok=False)
-        settings = self._settings.registration
+        settings = self.settings.registration
         kernel_start_m = min(max(settings.kernel_m, initial.translation_sigma_m), settings.max_distance_m)
         problem = RegistrationProblem(earlier.surface, current.source, settings, current.points, np.eye(4))
         observed = register_with_degeneracy(problem, initial.pose, kernel_start_m)
-        if observed.registration.matched < self._settings.min_matched:
+        if observed.registration.matched < self.settings.min_matched:
             return replace(initial, ok=False)
         covariance = self._covariance(observed, keyframes=1)
         return RelativePose(observed.registration.pose, covariance, self.name, degenerate=observed.degenerate)
@@ -151,10 +163,10 @@ class ScanMatching:
         pose, before = observed.registration.pose, self._state.current
         self._state = self._state.matched(pose, dt_s, bool(len(observed.degenerate)), _is_vague(initial))
         self._recent.add(scan.points, pose)
-        if self._settings.target == "last-scan" or self._state.adrift:
+        if self.settings.target == "last-scan" or self._state.adrift:
             self._state = self._state.keyframe_pending(scan.points)
         elif self._map.needs_keyframe(pose) or self._recent.is_filling:
-            filled = self._recent.together(scan.points, pose, self._settings.map_voxel_m)
+            filled = self._recent.together(scan.points, pose, self.settings.map_voxel_m)
             self._state = self._state.keyframe_pending(filled)
         covariance = self._covariance(observed, self._keyframes)
         drift = self._drift(covariance, before.map_changed)
@@ -193,32 +205,26 @@ class ScanMatching:
     @property
     def _keyframes(self) -> int:
         """Number of keyframes in the map, with the pending one."""
-        if self._settings.target == "last-scan":
+        if self.settings.target == "last-scan":
             return 1
         return self._map.keyframes + (self._state.keyframe is not None)
 
     def _covariance(self, observed: ObservedRegistration, keyframes: int) -> Array:
-        return observed.covariance(self._settings.covariance_scale * (1 + _YOUNG_MAP_INFLATION / keyframes))
+        return observed.covariance(self.settings.covariance_scale * map_errors.inflation(keyframes))
 
     def _drift(self, covariance: Array, map_changed: bool) -> Array | None:
-        """Return the part of a step's covariance that adds up over steps; None if all of it does.
-
-        Errors against one map cancel from step to step. What adds up is the error of each keyframe that joins it.
-        """
-        if self._settings.target == "last-scan":
+        """Return the part of a step's covariance that adds up over steps; None if all of it does."""
+        if self.settings.target == "last-scan":
             return None
-        share = _UNCHANGED_MAP_DRIFT_SHARE
-        if map_changed:
-            share = max(self._settings.drift_share, _YOUNG_MAP_DRIFT_SHARE / self._keyframes)
-        return share * covariance
+        return map_errors.drift_share(map_changed, self._keyframes, self.settings.drift_share) * covariance
 
     def _insert_pending_keyframe(self) -> None:
         """Insert the last scan into the map if it is a keyframe; otherwise use the time to rebuild the map if due."""
         if self._state.keyframe is None:
             self._map.rebuild_if_due()
             return
-        if self._settings.target == "last-scan" or self._state.adrift:
-            self._map = LocalMap(self._settings.local_map)
+        if self.settings.target == "last-scan" or self._state.adrift:
+            self._map = LocalMap(self.settings.local_map)
         self._map.insert(self._state.keyframe, self._state.current.T_map_lidar)
         self._state = self._state.keyframe_inserted()
 
@@ -232,9 +238,7 @@ class ScanMatching:
                 return continued
             start = self._search_motion(scan, start, initial, dt_s)
         observed = self._register_from(start, scan, initial)
-        if (
-            observed.registration.matched < self._settings.min_matched
-        ):  # the initial pose may be wrong, as a faulty IMU's is
+        if observed.registration.matched < self.settings.min_matched:  # a faulty IMU's initial pose is wrong
             return self._continue_motion(self._state.last_found, scan, dt_s) or observed
         return observed
 
@@ -242,7 +246,7 @@ class ScanMatching:
         """Register from where the last motion leads; None if that is unknown or the scan does not fit there."""
         if last.twist is None or self._map.surface is None:
             return None
-        settings, start = self._settings, last.T_map_lidar @ se3.exp(last.twist * dt_s)
+        settings, start = self.settings, last.T_map_lidar @ se3.exp(last.twist * dt_s)
         observed = register_with_degeneracy(
             self._problem(scan), start, coarse_kernel_m(settings.registration), is_start_vague=True
         )
@@ -251,7 +255,7 @@ class ScanMatching:
 
     def _search_motion(self, scan: ThinnedScan, start: Array, initial: RelativePose, dt_s: float) -> Array:
         """Return the best of several motions from ``start``: speeds ahead and, if the rotation is unknown, turns."""
-        surface, settings = self._map.surface, self._settings
+        surface, settings = self._map.surface, self.settings
         assert surface is not None
         turns = initial.covariance[:3, :3].trace() > _UNKNOWN_ROTATION_SIGMA_RAD**2
         rates_deg_s = settings.start_rates_deg_s if turns else (0.0,)
@@ -276,7 +280,7 @@ class ScanMatching:
     def _problem(self, scan: ThinnedScan) -> RegistrationProblem:
         surface = self._map.surface
         assert surface is not None
-        settings, only_keyframe = self._settings.registration, self._map.only_keyframe_pose
+        settings, only_keyframe = self.settings.registration, self._map.only_keyframe_pose
         return RegistrationProblem(surface, scan.source, settings, scan.points, only_keyframe)
 
 

@@ -102,3 +102,12 @@ def test_a_new_map_starts_where_the_bridges_led_without_their_error(matched: Mat
     assert restarted.adrift
     assert restarted.current.map_changed
     assert not restarted.current.bridge_covariance.any()
+
+
+def test_a_state_placed_by_two_poses_moves_on_by_their_twist():
+    state = MatchingState.placed(np.eye(4), STEP, 0.1, POINTS)
+    assert state.current.twist is not None
+    np.testing.assert_allclose(state.current.twist, TWIST, atol=1e-12)
+    np.testing.assert_array_equal(state.current.T_map_lidar, STEP)
+    assert state.current.map_changed
+    assert state.keyframe is POINTS

@@ -1,0 +1,282 @@
+"""The start of a lidar that does not repeat its pattern: its first motion is decided over several scans.
+
+Two of its scans fit each other nearly as well metres away as where they were. Taken for sure, a false fit makes a false
+map, which later scans then fit, too. So all scans since the first are placed by one smooth motion
+(:mod:`hybridlio.registration.joint_motion`), from many starts. Each new scan is one more to agree, and motions under
+which the points fit significantly worse are dropped. While several are left, or there are few scans, the step is that
+of the slowest motion, with a covariance that spans the others. When one is left, scan matching gets a map of all scans
+so far, and the step brings relative poses to them, by which the graph corrects the steps before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from hybridlio.cloud.deskew import deskew
+from hybridlio.cloud.voxel import voxel_pick
+from hybridlio.core import se3
+from hybridlio.core.arrays import Array, Index
+from hybridlio.core.estimates import EarlierScanPose, RelativePose, State
+from hybridlio.core.motion_limits import (
+    MEAN_ACCELERATION_SIGMA_M_S2,
+    MEASUREMENT_FLOOR_SIGMAS,
+    UNKNOWN_SPEED_SIGMA_M_S,
+)
+from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples, Scan
+from hybridlio.core.trajectory import Trajectory
+from hybridlio.odometry.inertial_motion import inertial_motion
+from hybridlio.registration.joint_motion import SIZE, JointMotion, JointPoints, JointProblem
+from hybridlio.sources.settings import ScanMatchingSettings
+
+_LEAST_SCANS, _MOST_SCANS = 4, 10  # with four, all of 54 starts in six recordings were right to 7 cm; ten are a second
+_LONGEST_S = 2.0  # over which one acceleration and one rate of turn describe what the IMU does not
+# Rise of the cost over its scatter at which a motion is dropped: that of an observed direction
+# (hybridlio/registration/cost_profile.py). From three scans on: the minima of two are where they like.
+_DROPPED_RATIO = 4.5
+_DROPPING_SCANS = 3
+_TEMPERATURE = 1.5  # of the weights of motions that are left, as there
+_FEW_JUDGED, _JUDGED = 500, 2000  # points to compare starts, some hundreds of a scan; and to find each minimum
+_COARSE_STEPS, _FINE_STEPS = 6, 5  # the kernel is halved from 1 m to 0.1 m in four
+_MOST_MOTIONS = 6
+_LEVER_M = 10.0  # half of a scan's points are nearer; makes a rotation a displacement
+# On the variance of independent residuals: that of scan matching, doubled. In the 54 starts above the squared
+# normalised error per axis was 1.6 with scan matching's.
+_SHARED_ERROR_SCALE = 2.0
+_FLOOR = np.diag(MEASUREMENT_FLOOR_SIGMAS**2)
+
+
+@dataclass(frozen=True, eq=False)
+class StartEstimate:
+    """What is known of the motion after a scan.
+
+    Attributes:
+        relative: the step to it. Once decided it carries the poses relative to all scans before.
+        frames: all frames so far, compensated by that motion.
+        poses: ``(K, 4, 4)`` their lidar poses in the frame of the first.
+        is_decided: whether the search ends here.
+    """
+
+    relative: RelativePose
+    frames: list[Frame]
+    poses: Array
+    is_decided: bool
+
+
+class StartSearch:
+    """Searches the motion through the first scans.
+
+    Attributes:
+        last: the last estimate.
+
+    Args:
+        first: the first frame, as recorded.
+        settings: of scan matching, at the scale of its scene.
+        calibration: the extrinsics.
+        noise: the IMU's.
+    """
+
+    NOT_STATE = ("_settings", "_calibration", "_noise")
+
+    def __init__(self, first: Frame, settings: ScanMatchingSettings, calibration: Calibration, noise: ImuNoise) -> None:
+        self._settings, self._calibration, self._noise = settings, calibration, noise
+        self._frames = [first]
+        self._motions: list[JointMotion] = []
+        self.last: StartEstimate | None = None
+
+    def add(self, frame: Frame, start: State, source: str) -> StartEstimate | None:
+        """Take the next frame and return what is known now; None if it cannot take part.
+
+        Args:
+            frame: as recorded.
+            start: the backend's state at the first frame.
+            source: name of the residual source, for the step.
+        """
+        base = self._base(frame, start) if self._has_points_in_time(frame) else None
+        if base is None:
+            return None
+        self._frames.append(frame)
+        problem = self._problem(base)
+        self._motions = self._minima(problem)
+        is_last = len(self._frames) >= _MOST_SCANS
+        is_decided = is_last or (len(self._motions) == 1 and len(self._frames) >= _LEAST_SCANS)
+        slowest = min(range(len(self._motions)), key=lambda i: float(np.linalg.norm(self._motions[i].motion[3:6])))
+        chosen = 0 if is_last else slowest
+        spread = _Spread(base, self._motions, [base.poses_beside(one.motion) for one in self._motions], chosen)
+        motion = self._motions[chosen]
+        self.last = StartEstimate(
+            replace(
+                spread.step(source, is_decided),
+                details={"motions": float(len(self._motions)), "cost": float(motion.costs.mean())},
+            ),
+            [replace(one, scan=base.compensated(one.scan, k, motion.motion)) for k, one in enumerate(self._frames)],
+            spread.poses[chosen],
+            is_decided,
+        )
+        return self.last
+
+    def _has_points_in_time(self, frame: Frame) -> bool:
+        since_s = (frame.scan.stamp_ns - self._frames[0].scan.stamp_ns) / NS_PER_S
+        return len(frame.scan) >= self._settings.min_points and since_s < _LONGEST_S
+
+    def _base(self, last: Frame, start: State) -> _Base | None:
+        """Return the motion by the IMU that starts and ends at the origin; None where its samples have gaps."""
+        first, after = self._frames[0], [*self._frames[1:], last]
+        before = first.sweep_imu.between(first.scan.stamp_ns - NS_PER_S, first.scan.stamp_ns)
+        samples = ImuSamples.concatenate([before, *(frame.imu for frame in after), last.sweep_imu])
+        motion = None
+        if start.has_imu:
+            motion = inertial_motion(samples, start, np.eye(4), last.scan.stamp_ns, self._calibration)
+        return None if motion is None else _Base(motion, [frame.scan.stamp_ns for frame in (first, *after)])
+
+    def _problem(self, base: _Base) -> JointProblem:
+        parts = []
+        for k, frame in enumerate(self._frames):
+            points = deskew(frame.scan, base.motion).points.astype(np.float64)
+            ranges2 = np.einsum("ij,ij->i", points, points)
+            kept = np.flatnonzero((ranges2 > self._settings.min_range_m**2) & (ranges2 < self._settings.max_range_m**2))
+            kept = kept[voxel_pick(points[kept], self._settings.source_voxel_m)]
+            parts.append(base.place(frame.scan, points, k, kept))
+        sigmas = np.r_[
+            np.full(3, self._noise.gyro_bias_sigma_rad_s),
+            np.full(3, UNKNOWN_SPEED_SIGMA_M_S),
+            np.full(3, MEAN_ACCELERATION_SIGMA_M_S2),  # of gravity's direction
+        ]
+        scale = _SHARED_ERROR_SCALE * self._settings.covariance_scale
+        return JointProblem(JointPoints.concatenate(parts), self._settings.registration, sigmas, scale)
+
+    def _starts(self, problem: JointProblem) -> list[Array]:
+        """Return motions to start from: at first the best of all speeds, later those that are left, and rest."""
+        if self._motions:
+            return [*(motion.motion for motion in self._motions), np.zeros(SIZE)]
+        beside = abs(self._settings.start_speeds_m_s[1])
+        speeds = [(speed, 0.0) for speed in self._settings.start_speeds_m_s[::2]]
+        speeds += [(-beside, 0.0), (0.0, beside), (0.0, -beside)]
+        starts = [np.r_[np.zeros(3), ahead, left, np.zeros(4)] for ahead, left in speeds]
+        widest_m = self._settings.registration.max_distance_m
+        return sorted(starts, key=lambda start: problem.cost(start, widest_m))[:_MOST_MOTIONS]
+
+    def _minima(self, problem: JointProblem) -> list[JointMotion]:
+        """Return distinct minima that are not significantly worse than the best, the best first."""
+        count, settings = len(problem.points.times_s), self._settings.registration
+        coarse, fine = (problem.with_stride(max(1, count // judged)) for judged in (_FEW_JUDGED, _JUDGED))
+        starts = self._starts(coarse)
+        found = self._distinct([coarse.solve(start, settings.max_distance_m, _COARSE_STEPS) for start in starts])
+        found = [fine.solve(one.motion, 2 * settings.kernel_m, _FINE_STEPS) for one in found[:_MOST_MOTIONS]]
+        found = self._distinct(found)
+        if len(self._frames) < _DROPPING_SCANS:
+            return found
+        return [one for one in found if one.rise_over_scatter(found[0]) < _DROPPED_RATIO]
+
+    def _distinct(self, found: list[JointMotion]) -> list[JointMotion]:
+        """Return minima that put the last scan at different places, the lowest cost first."""
+        last_s = (self._frames[-1].scan.stamp_ns - self._frames[0].scan.stamp_ns) / NS_PER_S
+        out: list[JointMotion] = []
+        for one in sorted(found, key=lambda motion: float(motion.costs.mean())):
+            apart = (one.motion - other.motion for other in out)
+            if all(_displacement_m(xi, last_s) > self._settings.registration.kernel_m for xi in apart):
+                out.append(one)
+        return out
+
+
+def _displacement_m(motion: Array, time_s: float) -> float:
+    shift = time_s * motion[3:6] + time_s**2 / 2 * motion[6:]
+    return float(np.linalg.norm(shift) + _LEVER_M * time_s * np.linalg.norm(motion[:3]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Base:
+    """The motion by the IMU, and the stamps of the scans on it."""
+
+    motion: Trajectory
+    stamps_ns: list[int]
+
+    @cached_property
+    def times_s(self) -> Array:
+        """``(K,)`` of the scans since the first."""
+        return (np.array(self.stamps_ns) - self.stamps_ns[0]) / NS_PER_S
+
+    @cached_property
+    def from_first(self) -> Array:
+        """``(S, 4, 4)`` all poses, in the frame of the first scan."""
+        first = int(np.searchsorted(self.motion.stamps_ns, self.stamps_ns[0]))
+        return np.asarray(se3.inverse(self.motion.poses[first]) @ self.motion.poses)
+
+    @property
+    def poses(self) -> Array:
+        """``(K, 4, 4)`` of the scans."""
+        return np.asarray(self.from_first[np.searchsorted(self.motion.stamps_ns, self.stamps_ns)])
+
+    def poses_beside(self, xi: Array) -> Array:
+        """Return the scans' poses ``(K, 4, 4)`` by the base and a motion ``(9,)`` beside it."""
+        t, poses = self.times_s[:, None], self.poses
+        turned = se3.so3_exp(t * xi[:3]) @ poses[:, :3, :3]
+        return np.asarray(se3.make(turned, poses[:, :3, 3] + t * xi[3:6] + t**2 / 2 * xi[6:]))
+
+    def place(self, scan: Scan, points: Array, k: int, kept: Index) -> JointPoints:
+        """Return some of scan ``k``'s points ``(N, 3)``, which are compensated, as the base places them."""
+        times_s = np.full(len(kept), self.times_s[k])
+        if scan.time_offsets_ns is not None:
+            times_s = times_s + scan.time_offsets_ns[kept] / NS_PER_S
+        knots_s = (self.motion.stamps_ns - self.stamps_ns[0]) / NS_PER_S
+        centres = np.column_stack([np.interp(times_s, knots_s, self.from_first[:, i, 3]) for i in range(3)])
+        return JointPoints(se3.transform(self.poses[k], points[kept]), centres, times_s, np.full(len(kept), k))
+
+    def compensated(self, scan: Scan, k: int, xi: Array) -> Scan:
+        """Return scan ``k`` compensated by the base and a motion ``(9,)`` beside it."""
+        if scan.time_offsets_ns is None:
+            return scan
+        by_base = deskew(scan, self.motion)
+        placed = self.place(scan, by_base.points.astype(np.float64), k, np.arange(len(scan)))
+        points = se3.transform(se3.inverse(self.poses_beside(xi)[k]), placed.moved(xi))
+        return replace(by_base, points=points.astype(np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class _Spread:
+    """The uncertainty of relative poses: that of the chosen motion, and its distance from the others."""
+
+    base: _Base
+    motions: list[JointMotion]
+    poses: list[Array]
+    chosen: int
+
+    def step(self, source: str, is_decided: bool) -> RelativePose:
+        """Return the step to the last scan; once decided, with its poses relative to all scans before."""
+        poses, stamps_ns, last = self.poses[self.chosen], self.base.stamps_ns, len(self.base.stamps_ns) - 1
+        step = se3.between(poses[last - 1], poses[last])
+        if not is_decided:  # the errors of all these steps are one and the same, and do not cancel
+            return RelativePose(step, self.covariance(0, last), source)
+        earlier = (
+            EarlierScanPose(stamps_ns[j], se3.between(poses[j], poses[last]), self.covariance(j, last))
+            for j in range(last - 1)
+        )
+        return RelativePose(step, self.covariance(last - 1, last), source, earlier_scans=tuple(earlier))
+
+    def covariance(self, j: int, k: int) -> Array:
+        """Return the covariance ``(6, 6)`` of scan ``k``'s pose in scan ``j``'s frame.
+
+        Rotation and translation of one motion against another are taken as independent: between motions that lie metres
+        apart there is nothing in between, and a rotation that the gyroscope corrects slightly must not move the lidar.
+        """
+        rises = np.array([motion.rise_over_scatter(self.motions[0]) for motion in self.motions])
+        weights = np.exp(-rises / _TEMPERATURE)
+        weights /= weights.sum()
+        step = se3.between(self.poses[self.chosen][j], self.poses[self.chosen][k])
+        total = _FLOOR + self._of_motion(j, k)
+        for weight, poses in zip(weights, self.poses, strict=True):
+            apart = se3.log(se3.between(step, se3.between(poses[j], poses[k])))
+            total = total + weight * block_diag(*(np.outer(part, part) for part in (apart[:3], apart[3:])))
+        return np.asarray(total)
+
+    def _of_motion(self, j: int, k: int) -> Array:
+        """Return the part by the chosen motion's own covariance."""
+        t, R = self.base.times_s, self.poses[self.chosen][k][:3, :3]
+        to_step = np.zeros((6, SIZE))
+        to_step[:3, :3] = (t[k] - t[j]) * R.T
+        to_step[3:, 3:6] = (t[k] - t[j]) * R.T
+        to_step[3:, 6:] = (t[k] ** 2 - t[j] ** 2) / 2 * R.T
+        return np.asarray(to_step @ self.motions[self.chosen].covariance @ to_step.T)
