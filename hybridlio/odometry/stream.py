@@ -137,7 +137,10 @@ class OdometryStream:
     def add_fix(
         self, stamp_ns: int, position_m: ArrayLike, covariance_m2: ArrayLike, origin: GeodeticPoint | None = None
     ) -> list[Estimate]:
-        """Add one GPS fix, for smoothing after the run: estimates do not use it.
+        """Add one GPS fix. It goes into the frame of the next scan, as in a run, and into the record if one is kept.
+
+        hybridlio's own backends smooth with fixes after the run, so their estimates do not change; a backend of your
+        own finds them in :attr:`Frame.gps`.
 
         Args:
             stamp_ns: its time.
@@ -147,10 +150,8 @@ class OdometryStream:
 
         Raises:
             DataError: as :meth:`add_imu`.
-            ConfigError: the odometry keeps no record, which alone takes fixes; or the stream is closed.
+            ConfigError: the stream is closed.
         """
-        if not self.odometry.keeps_record:
-            raise ConfigError("add_fix: fixes go into the record, and this stream keeps none; give odometry=Odometry()")
         fix = checked_fix(stamp_ns, position_m, covariance_m2, origin)
         return self._add(lambda: self._frames.add_fix(fix))
 

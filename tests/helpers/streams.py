@@ -39,6 +39,9 @@ def events(sequence: Sequence, delay: Callable[[], int] = lambda: 0) -> list[Eve
     imu = sequence.imu
     for stamp_ns, gyro, accel in zip(imu.stamps_ns.tolist(), imu.gyro_rad_s, imu.accel_m_s2, strict=True):
         found.append(Event(stamp_ns + delay(), "add_imu", (stamp_ns, gyro, accel)))
+    for fix in sequence.gps:
+        arguments = (fix.stamp_ns, fix.position_m, fix.covariance_m2, fix.origin)
+        found.append(Event(fix.stamp_ns + delay(), "add_fix", arguments))
     return sorted(found, key=lambda event: event.arrival_ns)
 
 

@@ -10,11 +10,13 @@ import pytest
 from streams import MS, Event, events, feed, same, stream_of, thinned, with_point_times, without_imu
 
 import hybridlio as hl
-from hybridlio.core.sensors import Calibration
+from hybridlio.core.estimates import RelativePose, State
+from hybridlio.core.sensors import Calibration, Frame, GpsFix
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.odometry.estimate import Estimate
 from hybridlio.odometry.odometry import Odometry
 from hybridlio.odometry.stream import OdometryStream
+from hybridlio.sources.dead_reckoning import DeadReckoning
 
 
 def offline(sequence: Sequence, **choices: str) -> list[Estimate]:
@@ -118,6 +120,40 @@ def test_a_record_of_a_stream_is_that_of_the_run(recordings):
     np.testing.assert_array_equal(found.imu.accel_m_s2, expected.imu.accel_m_s2)
     assert [f.stamp_ns for f in found.gps] == [int(recording.stamps_ns[3])] * 2
     assert stream.counts.late_fixes == 2
+
+
+class ListensToFixes(DeadReckoning):
+    """A backend that lists the stamps of the fixes that each step brings."""
+
+    def __init__(self, calibration: Calibration) -> None:
+        super().__init__(calibration)
+        self.fixes: list[tuple[int, ...]] = []
+
+    def update(self, frame: Frame, relative: RelativePose) -> State:
+        self.fixes.append(tuple(fix.stamp_ns for fix in frame.gps))
+        return super().update(frame, relative)
+
+
+def test_fixes_reach_a_backend_as_offline_without_a_record(recordings):
+    recording = recordings["swept scans"]
+    start_ns, end_ns = (int(stamp) for stamp in recording.stamps_ns[[0, -1]])
+    fixes = tuple(GpsFix(t, np.zeros(3), np.eye(3)) for t in range(start_ns + 7 * MS, end_ns, 70 * MS))
+    recording = replace(recording, gps=fixes)
+    offline_backend, backend = (ListensToFixes(recording.calibration) for _ in range(2))
+    run = Odometry(backend=offline_backend)
+    expected = [run.step(frame) for frame in recording]
+    stream = stream_of(recording, odometry=Odometry(backend=backend, keep_record=False))
+    assert_same(feed(stream, events(recording)), expected)
+    assert backend.fixes == offline_backend.fixes
+    assert sum(backend.fixes, ()) == tuple(fix.stamp_ns for fix in fixes)
+    assert stream.counts.fixes == len(fixes)
+    assert stream.counts.late_fixes == 0
+
+
+def test_fixes_without_a_record_change_no_estimate(recordings, expected):
+    recording = recordings["swept scans"]
+    fixes = tuple(GpsFix(int(t) + MS, np.full(3, 50.0), np.eye(3)) for t in recording.stamps_ns)
+    assert_same(feed(stream_of(recording), events(replace(recording, gps=fixes))), expected["swept scans"])
 
 
 # ------------------------------------------------------------------------------------------- when they are ready
@@ -293,8 +329,6 @@ def test_misuse_is_refused():
         OdometryStream(None, lag_s=-1)
     with pytest.raises(hl.HybridLioError, match="made without an IMU"):
         OdometryStream(None).add_imu(*SAMPLE)
-    with pytest.raises(hl.HybridLioError, match="this stream keeps none"):
-        OdometryStream(None).add_fix(0, np.zeros(3), np.eye(3))
     with pytest.raises(hl.HybridLioError, match="calibration must be a Calibration"):
         OdometryStream(np.eye(4))  # type: ignore[arg-type]
     stream = OdometryStream(None)
