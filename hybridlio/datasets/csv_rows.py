@@ -1,4 +1,4 @@
-"""CSV files with a header, read as rows of text with their line numbers."""
+"""CSV files with a header, separated by commas, semicolons or tabs, as rows of text with their line numbers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ def read_csv(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file, skipinitialspace=True)
+            head = file.readline()
+            file.seek(0)
+            delimiter = "," if "," in head else next((sign for sign in ";\t" if sign in head), ",")
+            reader = csv.reader(file, skipinitialspace=True, delimiter=delimiter)
             header = [name.strip().lstrip("# ") for name in next(reader, [])]
             rows = [(reader.line_num, row) for row in reader if any(field.strip() for field in row)]
     except UnicodeDecodeError:

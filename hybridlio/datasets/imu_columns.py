@@ -15,7 +15,7 @@ import numpy as np
 
 STANDARD_GRAVITY_M_S2 = 9.80665  # the unit g, by definition; not the gravity of a place
 
-_GYRO = "gyroscope|gyro|gyr|angularvelocity|angvel|angularrate|omega|wrss|w|g"
+_GYRO = "gyroscope|gyro|gyr|angularvelocity|angvel|angularrate|rotationrate|omega|wrss|w|g"
 _ACCEL = "linearacceleration|linacc|acceleration|accelerometer|accel|acc|specificforce|arss|a"
 _AXIS = re.compile(rf"(?P<gyro>{_GYRO})(?P<axis>[xyz])|(?P<accel>{_ACCEL})(?P<axis2>[xyz])")
 _UNIT = re.compile(r"(.*?)\s*(?:[\[(]([^\])]*)[\])]|_(rad_s|deg_s|dps|mdps|mrad_s|m_s2|g|mg))")
@@ -62,13 +62,21 @@ def imu_columns(header: Sequence[str]) -> ImuColumns:
     found: dict[str, tuple[int, float | None]] = {}
     for column, name in enumerate(header):
         known = _axis(name)
-        if known is not None:
-            found.setdefault(known[0], (column, known[1]))
+        if known is None or (known[0] in found and _is_linear(name)):
+            continue
+        if known[0] in found and not _is_linear(header[found[known[0]][0]]):
+            raise ColumnError(f"has {known[0]} twice, as '{header[found[known[0]][0]]}' and '{name}'; keep one of them")
+        found[known[0]] = column, known[1]
     lacking = [kind + axis for kind in "ga" for axis in "xyz" if kind + axis not in found]
     if lacking:
         raise ColumnError(f"lacks {', '.join(lacking)}")
     time, unit_ns, nanoseconds = _time(header)
     return ImuColumns(time, unit_ns, nanoseconds, tuple(found[kind + axis] for kind in "ga" for axis in "xyz"))
+
+
+def _is_linear(name: str) -> bool:
+    """Return whether a column is of a linear acceleration, which beside another one is that without gravity."""
+    return _plain(name).startswith("lin")
 
 
 def _plain(name: str) -> str:

@@ -64,12 +64,11 @@ def _stream(stamps: Stamps, scans: Stamps) -> dict[str, Any]:
 
 
 def _points(sequence: Sequence, scans: list[Scan]) -> dict[str, Any]:
-    columns = getattr(sequence.load_scan, "columns", None)
     ranges = np.concatenate([np.linalg.norm(scan.points, axis=1) for scan in scans]) if scans else np.empty(0)
     offsets = [scan.time_offsets_ns for scan in scans if scan.time_offsets_ns is not None]
     return {
         "model": None if sequence.lidar is None else sequence.lidar.name,
-        "fields": sorted(columns(0)) if columns is not None and scans else None,
+        "fields": _fields(sequence),
         "points_per_scan": int(np.median([len(scan) for scan in scans])) if scans else None,
         "ranges_m": [round(float(q), 2) for q in np.quantile(ranges, _RANGE_QUANTILES)] if len(ranges) else None,
         "has_intensity": any(scan.intensity is not None for scan in scans),
@@ -79,6 +78,18 @@ def _points(sequence: Sequence, scans: list[Scan]) -> dict[str, Any]:
         if offsets
         else None,
     }  # fmt: skip
+
+
+def _fields(sequence: Sequence) -> list[str] | None:
+    """Return the names of the points' fields, of the first looked-at scan that can be read; None if there are none."""
+    load = getattr(sequence.load_scan, "load", sequence.load_scan)  # behind a correction of the vertical angle
+    columns = getattr(load, "columns", None)
+    for k in sampled(len(sequence)) if columns is not None else ():
+        try:
+            return sorted(columns(k))
+        except DataError:
+            continue
+    return None
 
 
 def _imu(sequence: Sequence) -> dict[str, Any]:

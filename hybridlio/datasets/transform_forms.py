@@ -22,6 +22,7 @@ HOW_TO_WRITE = (
 )
 ROTATIONS = ("quaternion_xyzw", "quaternion_wxyz", "roll_pitch_yaw_deg", "roll_pitch_yaw_rad", "rotation")
 
+_MAX_ANGLE_RAD = 6.3  # a whole turn, and rounding
 _MAX_NORM_ERROR = 1e-2  # of a quaternion; two decimals of each number keep it below
 
 
@@ -69,6 +70,8 @@ def _rotation(name: str, kind: str, numbers: Array) -> Array:
 
     if kind == "rotation":
         return numbers.reshape(3, 3)
+    if kind == "roll_pitch_yaw_rad" and np.abs(numbers).max() > _MAX_ANGLE_RAD:
+        raise DataError(f"{name}: {kind} has an angle beyond a whole turn; for degrees write roll_pitch_yaw_deg")
     if kind.startswith("roll"):
         return np.asarray(Rotation.from_euler("ZYX", numbers[::-1], degrees=kind.endswith("deg")).as_matrix())
     norm = float(np.linalg.norm(numbers))

@@ -15,6 +15,7 @@ _HALF = round(_FAR_M / _VOXEL_M) + 1  # voxels on each side of the lidar, and on
 _SHAPE = (2 * _HALF, 2 * _HALF, 2 * _HALF)
 _MIN_SCANS = 4  # a wall that is as near in all of fewer scans is usual
 _MIN_SHARE = 0.01  # of the points, worth a note
+_MIN_FAR = 100  # farther voxels of a scan: with fewer, as in a small room, nobody can see whether the scene moves
 _MAX_STILL = 0.2  # share of the farther voxels that are occupied in all scans: more, and the vehicle stands
 
 
@@ -35,7 +36,7 @@ def note_vehicle(clouds: list[Floats], notes: Notes) -> None:
         far.append(_voxels(cloud[(across >= _NEAR_M) & (across < _FAR_M)]))
     still, elsewhere = _in_all(near), _in_all(far)
     usual = float(np.median([len(voxels) for voxels in far]))
-    if not len(still) or len(elsewhere) > _MAX_STILL * usual:
+    if not len(still) or usual < _MIN_FAR or len(elsewhere) > _MAX_STILL * usual:
         return
     corners_at = np.column_stack(np.unravel_index(still, _SHAPE)) - _HALF
     low, high = corners_at.min(axis=0) * _VOXEL_M, (corners_at.max(axis=0) + 1) * _VOXEL_M

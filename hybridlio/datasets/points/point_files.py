@@ -51,6 +51,14 @@ class PointFiles:
     read: Callable[[Path], Columns]
     format: PointFormat
 
+    def columns(self, k: int) -> Columns:
+        """Return the columns of scan ``k``, as the file holds them.
+
+        Raises:
+            DataError: the file cannot be read; the message does not name it.
+        """
+        return self.read(self.paths[k])
+
     def __call__(self, k: int) -> Scan:
         """Load scan ``k``.
 

@@ -14,6 +14,7 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import MAX_RANGE_M, Scan
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.points.own_vehicle import note_vehicle
+from hybridlio.datasets.points.plausible_ranges import NO_LIDARS_MEDIAN, check_ranges
 from hybridlio.datasets.points.point_times import PointTimes, StatedTimes, find_point_times
 
 Columns = Mapping[str, NDArray[Any]]
@@ -25,9 +26,10 @@ _INTENSITIES = ("intensity", "reflectivity", "reflectance", "remission")
 _FULL_SCALES = (1.0, 255.0, 65535.0)  # of intensities: the smallest that holds them
 _MM = 1e-3
 _FEW = 100  # points; of coordinates in metres nearly none is a whole number
-_MIN_WHOLE_RANGE = 500.0  # median of whole numbers above which they are millimetres: no lidar's median range is 500 m
+_SURE_MM_RANGE = 5000.0  # median of whole numbers from which they are no centimetres: those would be 50 m and more
 _SAME_RANGE_M = 0.002  # of one no-return code, also where coordinates are rounded to millimetres
 _MIN_CODE_SHARE, _MIN_CODE_POINTS = 0.005, 20  # of a scan at its largest range; surfaces leave a few points there
+_BESIDE_CODE = 10  # times that range: nothing is there beside a code, and more than at the edge of any smooth surface
 _MIN_CODE_ELEVATIONS_RAD = 0.03  # standard deviation: a code fills many beams, a real ring of equal ranges only one
 
 
@@ -194,28 +196,15 @@ def find_format(
         notes.found(f"points at the origin, {zeros:.1%} of a scan, are left out: beams without a return")
     seen = [cloud[plain._returns(cloud)] for cloud in clouds]
     ranges = [_ranges(points) for points in seen]
-    _check_frame(ranges)
     found = PointFormat(scale_m, _no_return_m(seen, ranges, notes), None, stated.limits_m, stated.vehicle)
+    code_m = np.inf if found.no_return_m is None else found.no_return_m - _SAME_RANGE_M
+    check_ranges([of_scan[of_scan < code_m] for of_scan in ranges], notes)
     if stated.vehicle is None:
         note_vehicle(seen, notes)
     valid = []
     for (stamp, columns), cloud in zip(samples, clouds, strict=True):
         valid.append((stamp, _rows(columns, found._returns(cloud))))
     return replace(found, times=find_point_times(valid, step_ns, notes, stated.times))
-
-
-def _check_frame(ranges: list[Array]) -> None:
-    """Refuse clouds in a map's frame, such as UTM.
-
-    Raises:
-        DataError: most points of most clouds are beyond the range of any lidar.
-    """
-    far = [float(np.median(of_scan)) for of_scan in ranges if len(of_scan)]
-    if far and np.median(far) > MAX_RANGE_M:
-        raise DataError(
-            f"points are {np.median(far) / 1000:.0f} km from the origin, as in a map's frame (UTM); they must be in "
-            "the lidar's: transform each scan by the inverse of its pose"
-        )
 
 
 def _scale_m(clouds: list[NDArray[Any]], notes: Notes) -> float:
@@ -229,9 +218,13 @@ def _scale_m(clouds: list[NDArray[Any]], notes: Notes) -> float:
     whole = all((cloud == np.round(cloud)).all() for cloud in finite)
     medians = [float(np.median(_ranges(cloud[cloud.any(axis=1)]))) for cloud in finite if cloud.any()]
     typical = float(np.median(medians or [0.0]))
-    if not whole or typical < _MIN_WHOLE_RANGE:
+    if not whole or typical < NO_LIDARS_MEDIAN:
         return 1.0
-    notes.found(f"coordinates are whole numbers with a median range of {typical:.0f}: read as millimetres")
+    text = f"coordinates are whole numbers with a median range of {typical:.0f}: read as millimetres"
+    if typical < _SURE_MM_RANGE:
+        notes.add(f"{text}; if they are in another unit, write metres")
+    else:
+        notes.found(text)
     return _MM
 
 
@@ -242,8 +235,10 @@ def _no_return_m(clouds: list[Floats], ranges_m: list[Array], notes: Notes) -> f
     """
     codes, shares = [], []
     for cloud, ranges in zip(clouds, ranges_m, strict=True):
-        at = ranges > ranges.max() - _SAME_RANGE_M if len(ranges) else np.zeros(0, dtype=bool)
-        if at.sum() < max(_MIN_CODE_POINTS, _MIN_CODE_SHARE * len(cloud)):
+        largest = ranges.max(initial=0.0)
+        at = ranges > largest - _SAME_RANGE_M
+        near = (ranges > largest - _BESIDE_CODE * _SAME_RANGE_M).sum() - at.sum()
+        if at.sum() < max(_MIN_CODE_POINTS, _MIN_CODE_SHARE * len(cloud)) or near > at.sum():
             continue
         if np.std(np.arcsin(cloud[at, 2] / ranges[at])) > _MIN_CODE_ELEVATIONS_RAD:
             codes.append(float(np.median(ranges[at])))

@@ -31,6 +31,11 @@ _REMEDIES = {
     ".mcap": "mcap recover",
     ".db3": "sqlite3 .recover",
 }
+# whole files that are not of ROS, by what the library says of them
+_FOREIGN = {
+    "Profile is not ros2": "an MCAP file of another system, not of ROS 2; record or convert it with the profile 'ros2'",
+    "Serialization format": "its messages are not serialised as ROS 2 does (CDR); record or convert it as CDR",
+}
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,8 @@ def readable(path: Path) -> Iterator[None]:
         raise
     except Exception as error:
         text = " ".join(str(error).split()) or type(error).__name__
+        if foreign := next((reason for sign, reason in _FOREIGN.items() if sign in text), None):
+            raise DataError(f"{path}: {foreign}") from None
         remedy = _REMEDIES.get(path.suffix, "ros2 bag reindex")
         raise DataError(
             f"{path}: cannot be read, the bag is truncated or damaged ({text[:160]}); `{remedy}` may repair it"

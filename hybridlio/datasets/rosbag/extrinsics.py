@@ -111,6 +111,8 @@ class Mounting:
         names = self.tree.names()
         listed = ", ".join(names[:_FRAMES_LISTED]) + (", …" if len(names) > _FRAMES_LISTED else "")
         known = f"the frames of /tf_static and /tf are: {listed}" if names else "the bag has no /tf_static and no /tf"
+        if loose := self.tree.unfixed():
+            known += f"; not fixed, as they move or have several parents: {', '.join(loose[:_FRAMES_LISTED])}"
         empty = [option for option, frame in (("--imu-frame", imu), ("--lidar-frame", lidar)) if not frame]
         why = f"messages name no frame, give {' and '.join(empty)}" if empty else known
         return (

@@ -11,6 +11,7 @@ from hybridlio.core.sensors import NS_PER_S, Scan
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.points.point_format import PointFormat, StatedFormat, find_format
 from hybridlio.datasets.rosbag.clouds import Columns, cloud_columns
+from hybridlio.datasets.rosbag.wire import measured
 
 # Looked at to find how columns are read: a recording has five of the whole run; here scans wait for it, 0.2 s at 10 Hz.
 _SAMPLES = 3
@@ -30,14 +31,22 @@ def header_ns(header: Any) -> int:
     return int(seconds) * NS_PER_S + int(nanoseconds)
 
 
-def imu_sample(message: Any) -> tuple[int, tuple[float, float, float], tuple[float, float, float]]:
+def imu_sample(message: Any) -> tuple[int, tuple[float, ...], tuple[float, ...]]:
     """Return stamp (ns), angular velocity (rad/s) and specific force (m/s²) of a ``sensor_msgs/Imu``.
 
     Raises:
-        DataError: it has no stamp.
+        DataError: it has no stamp, or says that it holds no rates or no forces.
     """
-    rate, force = message.angular_velocity, message.linear_acceleration
-    return header_ns(message.header), (rate.x, rate.y, rate.z), (force.x, force.y, force.z)
+    rate, force = (
+        measured((vector.x, vector.y, vector.z), covariance[0])
+        for vector, covariance in (
+            (message.angular_velocity, message.angular_velocity_covariance),
+            (message.linear_acceleration, message.linear_acceleration_covariance),
+        )
+    )
+    if any(np.isnan((*rate, *force))):
+        raise DataError("an inertial message says that it holds no rates or no forces (a covariance of -1)")
+    return header_ns(message.header), rate, force
 
 
 class LiveClouds:

@@ -23,6 +23,7 @@ from hybridlio.datasets.stamps import sorted_unique
 _MAX_DELAY_S = 1.0  # between a stamp and its receipt; drivers and networks take milliseconds, other clocks are far off
 _MAX_DELAY_DIFFERENCE_S = 0.2  # between lidar and IMU; a sweep is stamped 0.1 s before it is sent
 _MIN_SIGMA_M = 1e-3  # a fix declared exact still needs an invertible covariance
+_IMU_PARTS = {"angular velocity": slice(0, 3), "linear acceleration": slice(3, 6)}  # of the values of a message
 _DEFAULT_SIGMA_M = 5.0  # of a fix without covariance: that of satellite navigation without corrections
 
 
@@ -96,10 +97,16 @@ def imu_samples(log: Log, topic: str, notes: Notes) -> ImuSamples:
     """Return the samples of a log of angular velocity and specific force, sorted; corrections are noted.
 
     Raises:
-        DataError: no sample is finite.
+        DataError: no sample is finite, or the messages hold no rates or no forces.
     """
     stamps, known = stamps_of(log, topic, notes)
     values = log.rows()
+    absent = [what for what, part in _IMU_PARTS.items() if np.isnan(values[:, part]).all()]
+    if absent:
+        raise DataError(
+            f"{topic}: its messages say that they hold no {' and no '.join(absent)} (zeros, with a covariance of -1); "
+            "choose another IMU by --imu-topic, or none by '--imu-topic none'"
+        )
     force = np.linalg.norm(values[:, 3:], axis=1)
     median = float(np.median(force[np.isfinite(force)])) if np.isfinite(force).any() else 0.0
     if ONE_G[0] < median < ONE_G[1]:

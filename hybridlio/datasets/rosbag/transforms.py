@@ -55,12 +55,20 @@ class FrameTree:
             self.connect(parent, child, T)
 
     def connect(self, parent: str, child: str, T_parent_child: Array) -> None:
-        """Add one transform; the frame is marked as moving if an earlier one differs."""
+        """Add one transform; frames are marked as moving if earlier ones differ, also where they close a loop."""
         known = self.edges.get(child)
         if known is None:
+            closed = self._up(parent).get(child)
             self.edges[child] = _Edge(parent, T_parent_child)
+            if closed is not None and _differ(se3.inverse(closed), T_parent_child):
+                self._loosen(child)
         elif known.parent != parent or _differ(known.T_parent_child, T_parent_child):
             known.moves = True
+
+    def _loosen(self, frame: str) -> None:
+        """Mark the frames of the loop through a frame as moving: their transforms contradict each other."""
+        while not (edge := self.edges[frame]).moves:
+            edge.moves, frame = True, edge.parent
 
     def find(self, target: str, source: str) -> Array | None:
         """Return ``T_target_source``, ``(4, 4)``; None if frames are unknown, unconnected or move to each other."""
@@ -80,6 +88,10 @@ class FrameTree:
             frame = edge.parent
             found[frame] = T
         return found
+
+    def unfixed(self) -> tuple[str, ...]:
+        """Return the names of the frames whose pose in their parent changes, or that have several parents, sorted."""
+        return tuple(sorted(child for child, edge in self.edges.items() if edge.moves))
 
     def names(self) -> tuple[str, ...]:
         """Return the names of all frames, sorted."""

@@ -63,20 +63,26 @@ def read_header(raw: bytes, is_ros2: bool) -> Header:
 
 
 def read_imu(raw: bytes, header: Header, is_ros2: bool) -> tuple[float, ...]:
-    """Return angular velocity (rad/s) and specific force (m/s²) of a ``sensor_msgs/Imu``.
+    """Return angular velocity (rad/s) and specific force (m/s²) of a ``sensor_msgs/Imu``; NaN for what it lacks.
 
     Behind the header there are 37 numbers: orientation (4) and its covariance (9), then each vector (3) and its
-    covariance (9).
+    covariance (9). A vector that a driver does not measure is zero, and its covariance begins with -1.
 
     Raises:
         DataError: the message is too short.
     """
     at = _aligned(header.end, 8) if is_ros2 else header.end
     try:
-        rate = struct.unpack_from(header.order + "3d", raw, at + 8 * 13)
-        return rate + struct.unpack_from(header.order + "3d", raw, at + 8 * 25)
+        rate = struct.unpack_from(header.order + "4d", raw, at + 8 * 13)
+        force = struct.unpack_from(header.order + "4d", raw, at + 8 * 25)
     except struct.error:
         raise DataError("an inertial message is too short") from None
+    return measured(rate[:3], rate[3]) + measured(force[:3], force[3])
+
+
+def measured(vector: tuple[float, ...], variance: float) -> tuple[float, ...]:
+    """Return a vector of an inertial message, or NaN if the message says that it is not measured."""
+    return (np.nan,) * 3 if variance == -1.0 and not any(vector) else vector
 
 
 def read_livox(raw: bytes, is_ros2: bool) -> tuple[int, NDArray[Any]]:

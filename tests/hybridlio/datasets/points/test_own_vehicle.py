@@ -47,6 +47,13 @@ def test_a_moving_scene_without_the_vehicle_gets_no_note() -> None:
     assert notes.texts == []
 
 
+def test_a_room_without_farther_points_does_not_say_whether_the_vehicle_moves() -> None:
+    notes = Notes("test")
+    walls = scene(0)
+    note_vehicle([walls[np.abs(walls).max(axis=1) < 4] for _ in range(5)], notes)
+    assert notes.texts == []
+
+
 def test_points_in_the_stated_box_are_left_out(tmp_path: Path) -> None:
     paths = tuple(tmp_path / f"{k}.npy" for k in range(3))
     for k, path in enumerate(paths):
