@@ -84,7 +84,9 @@ def _fields(sequence: Sequence) -> list[str] | None:
     """Return the names of the points' fields, of the first looked-at scan that can be read; None if there are none."""
     load = getattr(sequence.load_scan, "load", sequence.load_scan)  # behind a correction of the vertical angle
     columns = getattr(load, "columns", None)
-    for k in sampled(len(sequence)) if columns is not None else ():
+    if columns is None:
+        return None
+    for k in sampled(len(sequence)):
         try:
             return sorted(columns(k))
         except DataError:
