@@ -198,7 +198,7 @@ def find_format(
     ranges = [_ranges(points) for points in seen]
     found = PointFormat(scale_m, _no_return_m(seen, ranges, notes), None, stated.limits_m, stated.vehicle)
     code_m = np.inf if found.no_return_m is None else found.no_return_m - _SAME_RANGE_M
-    check_ranges([of_scan[of_scan < code_m] for of_scan in ranges], notes)
+    check_ranges([of_scan[of_scan < code_m] for of_scan in ranges], MAX_RANGE_M, notes)
     if stated.vehicle is None:
         note_vehicle(seen, notes)
     valid = []
