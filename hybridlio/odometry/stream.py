@@ -137,10 +137,9 @@ class OdometryStream:
     def add_fix(
         self, stamp_ns: int, position_m: ArrayLike, covariance_m2: ArrayLike, origin: GeodeticPoint | None = None
     ) -> list[Estimate]:
-        """Add one GPS fix. It goes into the frame of the next scan, as in a run, and into the record if one is kept.
+        """Add one GPS fix, for the next frame and for the record, if one is kept.
 
-        hybridlio's own backends smooth with fixes after the run, so their estimates do not change; a backend of your
-        own finds them in :attr:`Frame.gps`.
+        hybridlio's own backends use fixes after the run alone; a backend of yours finds them in ``Frame.gps``.
 
         Args:
             stamp_ns: its time.
