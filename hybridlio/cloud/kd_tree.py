@@ -115,7 +115,10 @@ class _Surroundings:
 
     def may_matter(self, queries: Array, nearest2: Array) -> Index:
         """Return the queries with a point that may be nearer than ``nearest2``; for the others all are a side away."""
-        return np.flatnonzero(self._table.take(self._blocks(queries)) | (nearest2 > self.side_m**2))
+        from hybridlio.cloud import voxel_loops  # late: compiled
+
+        near = voxel_loops.flagged(queries, self._low, self.side_m, self._most, self._table)
+        return np.flatnonzero(near | (nearest2 > self.side_m**2))
 
     def _blocks(self, points: Array) -> Index:
         x, y, z = np.clip((points - self._low) / self.side_m, 0, self._most).astype(np.int64).T

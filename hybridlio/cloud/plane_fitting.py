@@ -55,9 +55,9 @@ def fit_planes(neighbours: Array) -> FittedPlanes:
     found to grow with the thickness ``d``, the root mean square distance of the neighbours from their plane. Their
     variance is taken as ``σ²·(1 + d²/τ²)``, so the weight, its inverse, is ``τ²/(τ² + d²)``, with ``τ`` = 15 cm.
     """
-    centred = neighbours - neighbours.mean(axis=1, keepdims=True)
-    eigenvalues, axes = np.linalg.eigh(centred.transpose(0, 2, 1) @ centred)
-    mean_squares = np.maximum(eigenvalues, 0.0) / centred.shape[1]
+    from hybridlio.cloud import plane_loops  # late: compiled
+
+    mean_squares, axes = plane_loops.principal_axes(np.ascontiguousarray(neighbours, np.float64))
     weights = _HALF_WEIGHT_THICKNESS_M**2 / (_HALF_WEIGHT_THICKNESS_M**2 + mean_squares[:, 0])
     return FittedPlanes(np.asarray(axes[:, :, 0]), np.asarray(weights), np.sqrt(mean_squares[:, 1]))
 
@@ -72,11 +72,8 @@ def span_several_rings(points: Array, neighbours: NDArray[np.uint64]) -> NDArray
         points: ``(N, 3)``, lidar frame.
         neighbours: ``(M, K)`` indices of points.
     """
+    from hybridlio.cloud import plane_loops  # late: compiled
+
     elevation_rad = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
-    sorted_rad = np.sort(elevation_rad[neighbours], axis=1)
-    count = sorted_rad.shape[1]
-    median_rad = (
-        sorted_rad[:, (count - 1) // 2] + sorted_rad[:, count // 2]
-    ) / 2  # np.median takes three times as long
-    others = np.abs(sorted_rad - median_rad[:, None]) > _SAME_RING_RAD
-    return np.asarray(others.sum(axis=1) >= _MIN_OTHER_RINGS)
+    others = plane_loops.far_from_median(elevation_rad, neighbours, _SAME_RING_RAD)
+    return np.asarray(others >= _MIN_OTHER_RINGS)

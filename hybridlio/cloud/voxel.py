@@ -53,9 +53,9 @@ def voxel_average(points: ArrayLike, normals: ArrayLike | None, voxel_size_m: fl
     from hybridlio.cloud import voxel_loops  # late: compiled
 
     points, normals = _checked(points, normals)
-    labels, count = voxel_labels(points, voxel_size_m)
-    mean = label_means(points, labels, count)
-    return mean, None if normals is None else _unit(voxel_loops.sums(normals, labels, count)[0])
+    labels, order = _unordered_labels(points, voxel_size_m)
+    mean = label_means(points, labels, len(order))[order]
+    return mean, None if normals is None else _unit(voxel_loops.sums(normals, labels, len(order))[0][order])
 
 
 def voxel_pick(points: ArrayLike, voxel_size_m: float) -> NDArray[np.int64]:
@@ -70,8 +70,8 @@ def voxel_pick(points: ArrayLike, voxel_size_m: float) -> NDArray[np.int64]:
     from hybridlio.cloud import voxel_loops  # late: compiled
 
     points = _checked(points, None)[0]
-    labels, count = voxel_labels(points, voxel_size_m)
-    return voxel_loops.nearest_to(label_means(points, labels, count), points, labels)
+    labels, order = _unordered_labels(points, voxel_size_m)
+    return voxel_loops.nearest_to(label_means(points, labels, len(order)), points, labels)[order]
 
 
 def voxel_labels(points: Floats, voxel_size_m: float) -> tuple[NDArray[np.int64], int]:
@@ -80,19 +80,10 @@ def voxel_labels(points: Floats, voxel_size_m: float) -> tuple[NDArray[np.int64]
     Returns:
         the labels ``(N,)``, and the number of occupied voxels.
     """
-    from hybridlio.cloud import voxel_loops  # late: compiled
-
-    if not (math.isfinite(voxel_size_m) and voxel_size_m > 0):
-        raise ConfigError(f"voxel size must be positive, got {voxel_size_m}")
-    side_m, points = np.float32(voxel_size_m), np.ascontiguousarray(points)
-    if not len(points):
-        return np.empty(0, np.int64), 0
-    low, high = voxel_loops.extent(points, side_m)
-    nx, ny, _ = _cell_counts(low, high, voxel_size_m)
-    labels, keys = voxel_loops.label(points, side_m, low, ny, nx)
-    rank = np.empty(len(keys), np.int64)
-    rank[np.argsort(keys)] = np.arange(len(keys))
-    return rank.take(labels), len(keys)
+    labels, order = _unordered_labels(points, voxel_size_m)
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    return rank.take(labels), len(order)
 
 
 def label_means(values: Floats, labels: NDArray[np.int64], count: int) -> Floats:
@@ -155,6 +146,21 @@ def _size_for(points: Floats, count: int, tolerance: int, start_size_m: float) -
             # the count falls with the square of the side on surfaces, and less where voxels hold single points
             size = max(size * math.exp(min(max(here[1] / 1.5, -1.0), 1.0)), _FINEST_M)
     return best
+
+
+def _unordered_labels(points: Floats, voxel_size_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Label points ``(N, 3)`` by their voxel, in any order; return also the labels ``(M,)`` in the voxels' order."""
+    from hybridlio.cloud import voxel_loops  # late: compiled
+
+    if not (math.isfinite(voxel_size_m) and voxel_size_m > 0):
+        raise ConfigError(f"voxel size must be positive, got {voxel_size_m}")
+    side_m, points = np.float32(voxel_size_m), np.ascontiguousarray(points)
+    if not len(points):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    low, high = voxel_loops.extent(points, side_m)
+    nx, ny, _ = _cell_counts(low, high, voxel_size_m)
+    labels, keys = voxel_loops.label(points, side_m, low, ny, nx)
+    return labels, np.argsort(keys)
 
 
 def _checked(points: ArrayLike, normals: ArrayLike | None) -> tuple[Floats, Floats | None]:

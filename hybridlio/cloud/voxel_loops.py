@@ -101,3 +101,24 @@ def nearest_to(centres: Floats, points: Floats, labels: Keys) -> Keys:
         if distance2 < least[k]:
             least[k], picked[k] = distance2, i
     return picked
+
+
+@compiled
+def flagged(points: Array, low: Array, side_m: float, most: Array, table: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return whether each of the points ``(N, 3)`` is in a flagged block.
+
+    Args:
+        points: any; those outside the table's box count as in its outermost blocks.
+        low: ``(3,)`` corner of the box.
+        side_m: of the blocks.
+        most: ``(3,)`` largest block along each axis.
+        table: flags of all blocks, x slowest.
+    """
+    out = np.empty(len(points), np.bool_)
+    for i in range(len(points)):
+        block = np.int64(0)
+        for j in range(3):
+            cell = np.int64(min(max((points[i, j] - low[j]) / side_m, 0.0), most[j]))
+            block = block * (np.int64(most[j]) + 1) + cell
+        out[i] = table[block]
+    return out

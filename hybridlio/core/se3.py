@@ -39,6 +39,8 @@ def so3_exp(rotvec: ArrayLike) -> Array:
 def so3_log(R: ArrayLike) -> Array:
     """Return the rotation vectors ``(..., 3)`` (rad, length at most π) of rotation matrices ``(..., 3, 3)``."""
     R = np.asarray(R, dtype=np.float64)
+    if R.ndim == 2 and (rotvec := se3_single.rotation_vector(R)) is not None:
+        return np.array(rotvec)
     flat = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec()
     return np.asarray(flat.reshape(*R.shape[:-2], 3))
 
@@ -120,6 +122,8 @@ def interpolate(T_a: ArrayLike, T_b: ArrayLike, fraction: ArrayLike) -> Array:
 def orthonormalise(T: ArrayLike) -> Array:
     """Return the poses ``(..., 4, 4)`` with their rotations replaced by the nearest ones (Frobenius norm)."""
     T = np.asarray(T, dtype=np.float64)
+    if T.ndim == 2 and (near := se3_single.nearest_rotation(T)) is not None:
+        return near
     U, _, Vt = np.linalg.svd(T[..., :3, :3])
     U = U * np.stack([np.ones_like(d := np.linalg.det(U @ Vt)), np.ones_like(d), d], axis=-1)[..., None, :]
     return make(U @ Vt, T[..., :3, 3])

@@ -13,6 +13,10 @@ from numpy.typing import NDArray
 _SMALL_ANGLE_RAD = 1e-4  # below it the closed forms lose digits, while the series' next terms are below 1e-17
 # A matrix whose quaternion has a squared length off by more than this is no rotation within rounding.
 _ROTATION_TOLERANCE = 1e-9
+_NEAR_ROTATION = 0.1  # largest entry of RᵀR − 1 from which steps converge, to 1e-16 within the number below
+_MOST_STEPS = 5
+_SQUARED_IS_ROUNDING = 1e-9
+_EYE = np.eye(3)
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
@@ -57,7 +61,7 @@ def exp(xi: Array) -> Array:
 
 def log(T: Array) -> Array | None:
     """Return the tangent vector ``(6,)`` of a pose ``(4, 4)``; None where its rotation is off by more than rounding."""
-    rotvec = _rotation_vector(T)
+    rotvec = rotation_vector(T)
     if rotvec is None:
         return None
     x, y, z = rotvec
@@ -82,9 +86,32 @@ def log(T: Array) -> Array | None:
     )
 
 
-def _rotation_vector(T: Array) -> Vector | None:
+def nearest_rotation(T: Array) -> Array | None:
+    """Return the pose ``(4, 4)`` with the nearest rotation (Frobenius norm); None where that is not near at all.
+
+    By Newton's iteration for the polar factor without an inverse (Björck and Bowie, 1971), whose error is squared by
+    each step.
+    """
+    R = T[:3, :3]
+    for _ in range(_MOST_STEPS):
+        excess = R.T @ R - _EYE
+        size = float(np.abs(excess).max())
+        if not size < _NEAR_ROTATION:
+            return None
+        R = R - R @ excess / 2
+        if size < _SQUARED_IS_ROUNDING:
+            break
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
+    if a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0:
+        return None  # a reflection
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = R, T[:3, 3]
+    return out
+
+
+def rotation_vector(T: Array) -> Vector | None:
     """Return the rotation vector by the quaternion whose largest component divides the others (Shepperd, 1978)."""
-    (a, b, c, _), (d, e, f, _), (g, h, i, _), _ = T.tolist()
+    (a, b, c), (d, e, f), (g, h, i) = T[:3, :3].tolist()
     trace = a + e + i
     largest = max(trace, a, e, i)
     if largest == trace:

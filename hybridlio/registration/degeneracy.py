@@ -27,8 +27,9 @@ from numpy.typing import NDArray
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.registration.cost_profile import OFFSETS_M, PROBE_STEP_M, parabola_minimum, weigh_offsets
-from hybridlio.registration.icp import Registration, register
+from hybridlio.registration.icp import Registration, register, register_neighbours
 from hybridlio.registration.information import UNKNOWN_SIGMA_M, covariance_of, weak_basis
+from hybridlio.registration.point_to_point import MixedNeighbours
 from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Surface
 
@@ -71,6 +72,10 @@ class RegistrationProblem:
     settings: RegistrationSettings
     dense_source: Array | None = None
     only_scan_pose: Array | None = None
+
+    def neighbours(self) -> MixedNeighbours:
+        """Return the source's neighbours on the surface, to be followed from a pose."""
+        return MixedNeighbours(self.surface, self.source, self.settings.threads)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,12 +133,13 @@ def register_with_degeneracy(
         is_start_vague: ``initial`` is not known to a decimetre: along unobserved directions weigh costs up to 2 m away.
     """
     surface = problem.surface
-    found = register(surface, problem.source, initial, problem.settings, kernel_start_m)
+    neighbours = problem.neighbours()
+    found = register_neighbours(neighbours, initial, problem.settings, kernel_start_m)
     noise = surface.normal_noise
     basis, to_tangent = weak_basis(found.hessian, found.lever_arms_m, noise.largest)
     if not basis.shape[1]:
         return ObservedRegistration(found, basis, np.empty((0, 6)), np.empty(0, dtype=bool), np.empty(0), noise.mean)
-    probe = _Probe(problem, basis, to_tangent)
+    probe = _Probe(problem, neighbours, basis, to_tangent)
     found, minima = probe.descend(found)
     is_observed = np.isfinite(minima.sigmas_m) & (not probe.may_match_itself(found.pose))
     found, sigmas_m = probe.refine_by_points(found, minima.sigmas_m, is_observed)
@@ -154,9 +160,14 @@ class _Minima:
 
 @dataclass(frozen=True, eq=False)
 class _Probe:
-    """Evaluates costs beside a pose along the weak directions, where the strong ones have been minimised again."""
+    """Evaluates costs beside a pose along the weak directions, where the strong ones have been minimised again.
+
+    Attributes:
+        neighbours: of the source near the pose.
+    """
 
     problem: RegistrationProblem
+    neighbours: MixedNeighbours
     basis: Array
     to_tangent: Array
 
@@ -230,22 +241,19 @@ class _Probe:
             minima.offsets_m[i], minima.sigmas_m[i] = parabola_minimum(rises_back, rises_ahead)
         return minima
 
-    def _register_strong(self, pose: Array, settings: RegistrationSettings | None = None) -> Registration:
+    def _register_strong(self, pose: Array) -> Registration:
         """Register with the weak directions fixed."""
-        problem = self.problem
-        return register(problem.surface, problem.source, pose, settings or problem.settings, fixed=self.basis)
+        return register_neighbours(self.neighbours, pose, self.problem.settings, fixed=self.basis)
 
     def _displace(self, pose: Array, costs_here: Array, xi: Array) -> tuple[Array, Array]:
         """Return the pose displaced by ``xi`` and minimised in the strong directions, and the points' rises in cost."""
         settings = replace(self.problem.settings, max_iterations=_PROBE_ITERATIONS)
-        there = self._register_strong(pose @ se3.exp(xi), settings).pose
-        rises = self._costs(there) - costs_here
+        neighbours = self.problem.neighbours()
+        there = register_neighbours(neighbours, pose @ se3.exp(xi), settings, fixed=self.basis).pose
+        rises = neighbours.costs(there, settings.kernel_m, settings.max_distance_m) - costs_here
         return there, np.asarray(rises[~np.isnan(rises)])  # points matched at both poses
 
     def _costs(self, pose: Array) -> Array:
         """Return the robust cost of each point ``(N,)``, between 0 and 1; NaN where it has no neighbour."""
-        surface, settings = self.problem.surface, self.problem.settings
-        moved = se3.transform(pose, self.problem.source)
-        index, distance2 = surface.nearest(moved, settings.threads)
-        r2 = np.einsum("ij,ij->i", moved - surface.points[index], surface.normals[index]) ** 2
-        return np.where(distance2 < settings.max_distance_m**2, r2 / (settings.kernel_m**2 + r2), np.nan)
+        settings = self.problem.settings
+        return self.neighbours.costs(pose, settings.kernel_m, settings.max_distance_m)

@@ -19,7 +19,7 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.registration.information import free_directions
+from hybridlio.registration.information import free_directions, scale_of
 from hybridlio.registration.point_to_point import MixedMatches, MixedNeighbours
 from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Neighbours, PlaneMatches, Surface
@@ -104,15 +104,28 @@ def register(
         match_thick_as_points: match scan points with points of the surface where its planes are thick, see
             :mod:`hybridlio.registration.point_to_point`.
     """
-    kernel_m, threads = max(settings.kernel_m, kernel_start_m), settings.threads
-    descent = _Descent(settings, initial, kernel_m, fixed, surface.normal_noise.largest)
-    neighbours = MixedNeighbours(surface, source, threads)
+    neighbours = MixedNeighbours(surface, source, settings.threads)
+    return register_neighbours(neighbours, initial, settings, kernel_start_m, fixed, match_thick_as_points)
+
+
+def register_neighbours(
+    neighbours: MixedNeighbours,
+    initial: Array,
+    settings: RegistrationSettings,
+    kernel_start_m: float = 0.0,
+    fixed: Array | None = None,
+    match_thick_as_points: bool = False,
+) -> Registration:
+    """Find the pose as :func:`register` does. The neighbours then are those near the pose, for further evaluations."""
+    descent = _Descent(
+        settings, initial, max(settings.kernel_m, kernel_start_m), fixed, neighbours.surface.normal_noise.largest
+    )
     match = neighbours.mixed if match_thick_as_points else neighbours.matches
     for _ in range(_MAX_MATCHINGS):
         matches = match(descent.pose, max(settings.max_distance_m, _MATCH_KERNELS * descent.kernel_m))
         if not descent.follow(matches):
             break
-    return descent.result(len(source))
+    return descent.result(len(neighbours))
 
 
 class _Descent:
@@ -121,8 +134,8 @@ class _Descent:
     def __init__(
         self, settings: RegistrationSettings, pose: Array, kernel_m: float, fixed: Array | None, normal_noise: float
     ) -> None:
-        self.pose, self.kernel_m, self._normal_noise = pose, kernel_m, normal_noise
-        self._settings, self._fixed = settings, fixed
+        self.pose, self.kernel_m, self._settings = pose, kernel_m, settings
+        self._free = free_directions(normal_noise, fixed)
         self._steps = 0
         self._matches: PlaneMatches | MixedMatches
         self._lever_arms_m: Array
@@ -134,7 +147,7 @@ class _Descent:
 
         settings = self._settings
         self._matches, self._lever_arms_m = matches, matches.lever_arms_m
-        free = free_directions(self._lever_arms_m, self._normal_noise, self._fixed)
+        free = self._free._replace(scale=scale_of(self._lever_arms_m))
         limits = loops.Limits(settings.kernel_m, settings.max_iterations)
         self._followed = found = loops.follow(matches.rows, free, limits, self.kernel_m, self._steps)
         self.kernel_m, self._steps = found.kernel_m, found.steps

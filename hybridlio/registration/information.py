@@ -62,8 +62,9 @@ _HALF = 0.5  # after projection an eigenvector lies in the fixed subspace (1) or
 
 def lever_arms(points: Array) -> Array:
     """Return the ``(3,)`` root mean square distances, metres, of points ``(N, 3)`` from the x, y and z axes."""
-    squares = np.einsum("ij,ij->j", points, points) / max(len(points), 1)
-    return np.asarray(np.sqrt(np.maximum(squares.sum() - squares, 1e-6)))
+    from hybridlio.registration import match_loops  # late: compiled
+
+    return match_loops.lever_arms(points)
 
 
 def scaled_spectrum(hessian: Array, lever_arms_m: Array | None = None) -> tuple[Array, Array, Array]:
@@ -80,8 +81,7 @@ def scaled_spectrum(hessian: Array, lever_arms_m: Array | None = None) -> tuple[
         eigenvalues ``(6,)`` in ascending order, eigenvectors as columns ``(6, 6)``, and the scale ``(6,)`` by which a
         vector in these units is multiplied to become a tangent vector (rad, m).
     """
-    scale = np.ones(6)
-    scale[:3] /= _mean_lever(hessian) if lever_arms_m is None else lever_arms_m
+    scale = scale_of(_mean_lever(hessian) if lever_arms_m is None else lever_arms_m)
     values, vectors = np.linalg.eigh(hessian * (scale[:, None] * scale))
     return values, vectors, scale
 
@@ -171,22 +171,28 @@ def newton_step(
     """
     from hybridlio.registration import loops  # late: compiled
 
-    free = free_directions(lever_arms_m if lever_arms_m is not None else _mean_lever(hessian), normal_noise, fixed)
+    free = free_directions(normal_noise, fixed, _mean_lever(hessian) if lever_arms_m is None else lever_arms_m)
     reduced = loops.newton_step(np.ascontiguousarray(hessian), np.ascontiguousarray(gradient), free)
     return np.asarray(free.scale * reduced * min(1.0, limit_m / max(float(np.linalg.norm(reduced)), 1e-12)))
 
 
-def free_directions(lever_arms_m: Array, normal_noise: float, fixed: Array | None) -> Free:
+def free_directions(normal_noise: float, fixed: Array | None, lever_arms_m: Array | None = None) -> Free:
     """Return the directions of a step for compiled loops; the arguments are those of :func:`newton_step`."""
     from hybridlio.registration import loops  # late: compiled
 
-    scale = np.ones(6)
-    scale[:3] /= lever_arms_m
+    scale = scale_of(np.ones(3) if lever_arms_m is None else lever_arms_m)
     if fixed is None:
         return loops.Free(scale, np.eye(6), _STRONG_RATIO * normal_noise)
     count = fixed.shape[1]
     basis = np.linalg.svd(fixed)[0][:, count:] if count else np.eye(6)
     return loops.Free(scale, np.ascontiguousarray(basis), -np.inf)
+
+
+def scale_of(lever_arms_m: Array) -> Array:
+    """Return the scale ``(6,)`` of :func:`scaled_spectrum`."""
+    scale = np.ones(6)
+    scale[:3] /= lever_arms_m
+    return scale
 
 
 def _without(fixed: Array, hessian: Array, to_tangent: Array) -> tuple[Array, Array, NDArray[np.bool_]]:

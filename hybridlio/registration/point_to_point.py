@@ -76,11 +76,11 @@ class MixedNeighbours(Neighbours):
 
     def mixed(self, pose: Array, max_distance_m: float) -> MixedMatches:
         """Match the points at a pose; points without a neighbour within ``max_distance_m`` are left out."""
-        from hybridlio.registration.loops import THIN_PLANE_WEIGHT  # late: compiled
+        from hybridlio.registration.match_loops import THIN_PLANE_WEIGHT  # late: compiled
 
         index, source = self.within(pose, max_distance_m)
-        planes = self._surface.planes(index)
+        planes = self.surface.planes(index)
         flat = planes[:, 4] >= THIN_PLANE_WEIGHT
-        targets = self._surface.points.take(index[~flat], axis=0)
+        targets = self.surface.points.take(index[~flat], axis=0)
         plane_matches = PlaneMatches.linearised(pose, source[flat], planes[flat])
         return MixedMatches.linearised(plane_matches, source[~flat], targets, planes[~flat, 4])

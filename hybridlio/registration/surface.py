@@ -52,10 +52,10 @@ class PlaneMatches:
     @classmethod
     def linearised(cls, pose: Array, source: Array, planes: Array) -> PlaneMatches:
         """Compute distances and derivatives at ``pose``."""
-        from hybridlio.registration import loops  # late: compiled
+        from hybridlio.registration import loops, match_loops  # late: compiled
 
         source, planes = np.ascontiguousarray(source), np.ascontiguousarray(planes)
-        rows = loops.linearise(np.ascontiguousarray(pose), source, planes)
+        rows = match_loops.linearise(np.ascontiguousarray(pose), source, planes)
         return cls(pose, source, planes, loops.Rows(rows, planes[:, 4].copy(), *NO_POINTS))
 
     def __len__(self) -> int:
@@ -168,40 +168,55 @@ class Neighbours:
         surface: where neighbours are searched.
         source: ``(N, 3)`` the scan's points, scan frame.
         threads: for the search.
+
+    Attributes:
+        surface: as given.
     """
 
     def __init__(self, surface: Surface, source: Array, threads: int) -> None:
-        self._surface, self._source, self._threads = surface, np.ascontiguousarray(source), threads
+        self.surface, self._source, self._threads = surface, np.ascontiguousarray(source), threads
         self._searched: Array | None = None  # (N, 3) where each point was when its neighbour was last searched
         self._margin_m = np.empty(0)
         self._index = np.empty(0, np.int64)
 
     def matches(self, pose: Array, max_distance_m: float) -> PlaneMatches:
         """Match the points at a pose with planes; points without a neighbour within ``max_distance_m`` are left out."""
-        index, source = self._near(pose, max_distance_m, self._surface.one_sided)
-        return PlaneMatches.linearised(pose, source, self._surface.planes(index))
+        index, source = self._near(pose, max_distance_m, self.surface.one_sided)
+        return PlaneMatches.linearised(pose, source, self.surface.planes(index))
 
     def within(self, pose: Array, max_distance_m: float) -> tuple[NDArray[np.int64], Array]:
         """Return indices ``(M,)`` of the neighbours within a distance, and the scan points ``(M, 3)`` that have one."""
         return self._near(pose, max_distance_m, one_sided=False)
 
+    def __len__(self) -> int:
+        return len(self._source)
+
     def _near(self, pose: Array, max_distance_m: float, one_sided: bool) -> tuple[NDArray[np.int64], Array]:
-        from hybridlio.registration import loops  # late: compiled
+        from hybridlio.registration import match_loops  # late: compiled
 
         pose = np.ascontiguousarray(pose)
         self._update(pose)
-        surface, index, source = self._surface, self._index, self._source
-        kept = loops.near(pose, source, index, surface.points, surface.all_planes, max_distance_m, one_sided)
+        surface, index, source = self.surface, self._index, self._source
+        kept = match_loops.near(pose, source, index, surface.points, surface.all_planes, max_distance_m, one_sided)
         return (index, source) if len(kept) == len(source) else (index.take(kept), source.take(kept, axis=0))
+
+    def costs(self, pose: Array, kernel_m: float, max_distance_m: float) -> Array:
+        """Return the robust cost ``(N,)`` of each point at a pose, 0 to 1; NaN without a neighbour in the distance."""
+        from hybridlio.registration import match_loops  # late: compiled
+
+        pose = np.ascontiguousarray(pose)
+        self._update(pose)
+        of_surface = self.surface.points, self.surface.all_planes
+        return match_loops.costs(pose, self._source, self._index, *of_surface, max_distance_m, kernel_m)
 
     def _update(self, pose: Array) -> None:
         """Search again for the points that have moved by their margin or more."""
-        from hybridlio.registration import loops  # late: compiled
+        from hybridlio.registration import match_loops  # late: compiled
 
         if self._searched is None:
             self._searched = self._source @ pose[:3, :3].T + pose[:3, 3]
-            self._index, self._margin_m = self._surface.nearest_with_margin(self._searched, self._threads)
+            self._index, self._margin_m = self.surface.nearest_with_margin(self._searched, self._threads)
             return
-        which, queries = loops.stale(pose, self._source, self._searched, self._margin_m)
+        which, queries = match_loops.stale(pose, self._source, self._searched, self._margin_m)
         if len(which):
-            self._index[which], self._margin_m[which] = self._surface.nearest_with_margin(queries, self._threads)
+            self._index[which], self._margin_m[which] = self.surface.nearest_with_margin(queries, self._threads)

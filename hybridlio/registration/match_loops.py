@@ -1,0 +1,118 @@
+"""The loops that match a scan's points with planes, compiled. Formulas are in :mod:`hybridlio.registration.surface`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hybridlio.cloud.compiled import compiled
+from hybridlio.core.arrays import Array, Index
+
+# Planes of this weight or more are thin: their thickness is below 5 cm, about twice the noise of a range (see the
+# weight in hybridlio/cloud/plane_fitting.py). The others are bushes and the like, which have no front.
+THIN_PLANE_WEIGHT = 0.9
+# Sine of the angle under which the lidar may seem to be behind a plane that it sees: twice the usual tilt of normals,
+# 0.045 rad (hybridlio/registration/information.py).
+_LARGEST_FROM_BEHIND = 0.1
+
+
+@compiled
+def near(
+    pose: Array, source: Array, index: Index, points: Array, planes: Array, max_distance_m: float, one_sided: bool
+) -> Index:
+    """Return which of the points ``(N, 3)`` are within a distance of their neighbours, ascending.
+
+    Args:
+        pose: ``(4, 4)`` of the scan.
+        source: scan frame.
+        index: ``(N,)`` of the neighbours.
+        points: ``(M, 3)`` of the surface.
+        planes: ``(M, 5)`` of the surface.
+        max_distance_m: largest distance.
+        one_sided: leave out points of thin planes that the lidar would have to see from behind.
+    """
+    kept, count = np.empty(len(source), np.int64), 0
+    for i in range(len(source)):
+        away_m, distance2, range2, k = 0.0, 0.0, 0.0, index[i]
+        for row in range(3):
+            turned = pose[row, 0] * source[i, 0] + pose[row, 1] * source[i, 1] + pose[row, 2] * source[i, 2]
+            distance2 += (turned + pose[row, 3] - points[k, row]) ** 2
+            away_m += planes[k, row] * turned
+            range2 += source[i, row] ** 2
+        if distance2 >= max_distance_m * max_distance_m:
+            continue
+        is_behind = one_sided and away_m >= _LARGEST_FROM_BEHIND * np.sqrt(range2)
+        if is_behind and planes[k, 4] >= THIN_PLANE_WEIGHT:
+            continue
+        kept[count] = i
+        count += 1
+    return kept[:count].copy()
+
+
+@compiled
+def stale(pose: Array, source: Array, searched: Array, margin_m: Array) -> tuple[Index, Array]:
+    """Return the points ``(K,)`` that have moved by their margin or more, and where they are now ``(K, 3)``.
+
+    Args:
+        pose: ``(4, 4)``.
+        source: ``(N, 3)`` scan frame.
+        searched: ``(N, 3)`` where each point was when its neighbour was searched; for the returned ones it is updated.
+        margin_m: ``(N,)``.
+    """
+    which, queries, count = np.empty(len(source), np.int64), np.empty(source.shape), 0
+    for i in range(len(source)):
+        squared = 0.0
+        for row in range(3):
+            moved = pose[row, 0] * source[i, 0] + pose[row, 1] * source[i, 1] + pose[row, 2] * source[i, 2]
+            queries[count, row] = moved + pose[row, 3]
+            squared += (queries[count, row] - searched[i, row]) ** 2
+        if squared >= margin_m[i] ** 2:
+            which[count], searched[i] = i, queries[count]
+            count += 1
+    return which[:count].copy(), queries[:count].copy()
+
+
+@compiled
+def costs(
+    pose: Array, source: Array, index: Index, points: Array, planes: Array, max_distance_m: float, kernel_m: float
+) -> Array:
+    """Return the robust cost ``(N,)`` of each point, 0 to 1, NaN where the neighbour is too far; as :func:`near`."""
+    out = np.full(len(source), np.nan)
+    for i in range(len(source)):
+        distance, distance2, k = 0.0, 0.0, index[i]
+        for row in range(3):
+            turned = pose[row, 0] * source[i, 0] + pose[row, 1] * source[i, 1] + pose[row, 2] * source[i, 2]
+            off = turned + pose[row, 3] - points[k, row]
+            distance2 += off * off
+            distance += planes[k, row] * off
+        if distance2 < max_distance_m * max_distance_m:
+            out[i] = distance * distance / (kernel_m * kernel_m + distance * distance)
+    return out
+
+
+@compiled
+def lever_arms(points: Array) -> Array:
+    """Return the ``(3,)`` of :func:`hybridlio.registration.information.lever_arms`."""
+    x2, y2, z2 = 0.0, 0.0, 0.0
+    for i in range(len(points)):
+        x2 += points[i, 0] * points[i, 0]
+        y2 += points[i, 1] * points[i, 1]
+        z2 += points[i, 2] * points[i, 2]
+    count = max(len(points), 1)
+    return np.sqrt(np.maximum(np.array([y2 + z2, x2 + z2, x2 + y2]) / count, 1e-6))
+
+
+@compiled
+def linearise(pose: Array, source: Array, planes: Array) -> Array:
+    """Return the rows ``(7, N)`` of points ``(N, 3)`` matched with planes ``(N, 5)`` at a pose ``(4, 4)``."""
+    rows = np.empty((7, len(source)))
+    for i in range(len(source)):
+        nx, ny, nz = planes[i, 0], planes[i, 1], planes[i, 2]
+        x, y, z = source[i, 0], source[i, 1], source[i, 2]
+        a = nx * pose[0, 0] + ny * pose[1, 0] + nz * pose[2, 0]  # the normal in the scan's frame
+        b = nx * pose[0, 1] + ny * pose[1, 1] + nz * pose[2, 1]
+        c = nx * pose[0, 2] + ny * pose[1, 2] + nz * pose[2, 2]
+        rows[0, i], rows[1, i], rows[2, i] = y * c - z * b, z * a - x * c, x * b - y * a
+        rows[3, i], rows[4, i], rows[5, i] = a, b, c
+        along = nx * pose[0, 3] + ny * pose[1, 3] + nz * pose[2, 3]
+        rows[6, i] = x * a + y * b + z * c + along - planes[i, 3]
+    return rows
