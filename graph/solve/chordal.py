@@ -8,21 +8,16 @@ from __future__ import annotations
 
 from typing import Any
 
-import gtsam
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import splu
 
 from hybridlio.core import se3
-from hybridlio.core.arrays import Array, Index, Mask
+from hybridlio.core.arrays import Array, Index
 from hybridlio.core.errors import GraphError
+from hybridlio.graph.base.elimination import elimination_order
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.edge_arrays import Edges
-
-# Poses from which nested dissection (METIS) orders the unknowns: minimum degree (COLAMD) is five times quicker, 2 ms at
-# 3,500 poses, but its elimination tree is as deep as chains are long, and SuperLU overflows the main thread's stack on
-# that of 200,000 poses. SuperLU's own ordering of the rotations of 50,000 poses takes 14 s, these two 0.04 and 0.2 s.
-_LARGE = 20_000
 
 
 def chordal_poses(roots: dict[int, Array], count: int, edges: Edges) -> Array:
@@ -38,24 +33,10 @@ def chordal_poses(roots: dict[int, Array], count: int, edges: Edges) -> Array:
     known[list(roots)] = True
     if len(edges.i) and not known.all():
         rotation_weights, position_weights = edges.weights()
-        order = _elimination_order(known, edges)
+        order = elimination_order(known, edges.i, edges.j)
         T[:, :3, :3] = _rotations(T, order, edges, rotation_weights)
         T[:, :3, 3] = _positions(T, order, edges, position_weights)
     return T
-
-
-def _elimination_order(known: Mask, edges: Edges) -> Index:
-    """Return the unknown poses in an order in which elimination fills the linear system little."""
-    graph = gtsam.SymbolicFactorGraph()
-    add = graph.push_factor
-    inside = ~(known[edges.i] | known[edges.j])
-    for k in np.flatnonzero(~known).tolist():
-        add(k)
-    for i, j in zip(edges.i[inside].tolist(), edges.j[inside].tolist(), strict=True):
-        add(i, j)
-    make = gtsam.Ordering.MetisSymbolicFactorGraph if len(known) > _LARGE else gtsam.Ordering.ColamdSymbolicFactorGraph
-    ordering = make(graph)
-    return np.fromiter(map(ordering.at, range(ordering.size())), np.int64)
 
 
 def _rotations(T: Array, order: Index, edges: Edges, weights: Array) -> Array:

@@ -37,8 +37,9 @@ def choose_start(data: GraphData, initial: str) -> Array:
             the start follows all factors, as an online solver's does.
 
     Raises:
-        GraphError: values are missing and cannot be found.
+        GraphError: values are missing and cannot be found, or a fixed pose has none.
     """
+    _fixed_poses(data)
     if initial in INITIAL_METHODS:
         return find_initial_values(with_plain_steps(data), initial)
     data = with_plain_steps(data)
@@ -100,11 +101,7 @@ def _find_roots(data: GraphData) -> dict[int, Array]:
     priors = {f.keys[0]: f.measured for f in data.other_factors.values() if f.kind == "prior"}
     gps_keys = {factor.keys[0] for factor in data.other_factors.values() if factor.kind == "gps"}
     parts = groups(data, ("between",))
-    roots: dict[int, Array] = {}
-    for key in data.fixed:
-        if (fixed := _initial_pose(data, key)) is None:
-            raise GraphError(f"pose {key} is fixed but has no initial value; give one by set_initial")
-        roots[data.index[key]] = fixed
+    roots = _fixed_poses(data)
     for part in parts:
         if not data.fixed.isdisjoint(part):
             continue
@@ -114,6 +111,16 @@ def _find_roots(data: GraphData) -> dict[int, Array]:
             raise GraphError(f"no factor places pose {list_keys(part)}; give an initial value")
         roots[data.index[key]] = np.eye(4) if root is None else root
     return roots
+
+
+def _fixed_poses(data: GraphData) -> dict[int, Array]:
+    """Return the fixed poses ``(4, 4)`` by index; raise GraphError where one has no initial value."""
+    found: dict[int, Array] = {}
+    for key in data.fixed:
+        if (fixed := _initial_pose(data, key)) is None:
+            raise GraphError(f"pose {key} is fixed but has no initial value; give one by set_initial")
+        found[data.index[key]] = fixed
+    return found
 
 
 def _initial_pose(data: GraphData, key: Key) -> Array | None:

@@ -41,9 +41,8 @@ def solve_online(graph: GraphData, settings: Settings, report: IterationProgress
     start = Builder(data).values(choose_start(data, settings.initial))
     factors = Builder(data, biases_of(values)).graph()
     errors = float(factors.error(start)), float(factors.error(values))
-    return Solution(
-        data, SolverResult(data, factors, values, poses_of(values, data.dimension), *errors, updates, True, True)
-    )  # fmt: skip
+    poses = poses_of(values, data.dimension)
+    return Solution(data, SolverResult(data, poses, *errors, updates, True, (factors, values)))
 
 
 def _replay(data: GraphData, settings: Settings, report: IterationProgress) -> tuple[gtsam.Values, int]:

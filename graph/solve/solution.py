@@ -255,7 +255,7 @@ class Solution(SolutionViews):
 
     @cached_property
     def _marginals(self) -> gtsam.Marginals | gtsam.ISAM2:
-        if not self._result.used_qr:
+        if not self._result.uses_qr:
             try:
                 return gtsam.Marginals(self._result.graph, self._result.values)
             except RuntimeError:  # Cholesky finds the system indeterminate
