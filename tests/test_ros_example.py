@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import runpy
 import signal
 import socket
 import subprocess
@@ -19,6 +20,7 @@ from typing import Any
 import bags
 import numpy as np
 import pytest
+from rclpy_stand_in import Graph, message_class, received, ros2
 from scipy.spatial.transform import Rotation
 from streams import thinned, with_point_times
 
@@ -144,6 +146,56 @@ def test_live_clouds_need_three_messages_to_know_their_columns(recording):
         header_ns(messages.header(0, "lidar"))
     stamp_ns, gyro, accel = imu_sample(messages.imu(5 * 10**9, [1, 2, 3], [4, 5, 6]))
     assert (stamp_ns, gyro, accel) == (5 * 10**9, (1, 2, 3), (4, 5, 6))
+
+
+# ---------------------------------------------------------------------------------------------------- ROS 2
+
+
+def two_estimates_are_published(graph: Graph) -> None:
+    wait_for(lambda: len(graph.messages("odometry")) > 1, "estimates of the first half")
+
+
+def test_the_ros2_node_publishes_the_estimates_of_the_recording(recording, tmp_path, monkeypatch):
+    """With a stand-in of rclpy, as ROS 2 cannot be installed from Debian or PyPI."""
+    maker = bags.Messages(True)
+    content = bags.drive_messages(maker, scans_of(recording), recording.imu, np.eye(4))
+    names = {"/points": "points", "/imu/data": "imu"}
+    waiting = [
+        (names[topic], received(message, kind))
+        for _, topic, kind, message in sorted(content, key=lambda row: row[0])
+        if topic in names
+    ]
+    parameters = {"calibration": str(calibration_file(tmp_path, recording)), "lag_s": 30.0}
+    half = len(waiting) // 2
+    graph = Graph(parameters, [waiting[:half], waiting[half:]], between=two_estimates_are_published)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    with ros2(graph):
+        runpy.run_path(str(ROOT / "examples/ros/ros2_node.py"), run_name="__main__")
+    assert not graph.is_up
+    expected = offline(Sequence("live", recording.stamps_ns, recording.load_scan, recording.imu, recording.calibration))
+    for message, tf, estimate in zip(graph.messages("odometry"), graph.messages("/tf"), expected, strict=True):
+        assert header_ns(message.header) == header_ns(tf.transforms[0].header) == estimate.stamp_ns
+        assert (message.header.frame_id, message.child_frame_id) == ("odom", "lidar")
+        position, moved = message.pose.pose.position, tf.transforms[0].transform.translation
+        np.testing.assert_allclose([position.x, position.y, position.z], estimate.pose[:3, 3], atol=1e-9)
+        assert (moved.x, moved.y, moved.z) == (position.x, position.y, position.z)
+        assert message.pose.covariance[0] > 0
+    predicted = [header_ns(message.header) for message in graph.messages("odometry_predicted")]
+    assert predicted == sorted(predicted)
+    assert len(predicted) > 0
+
+
+def test_the_stand_in_of_ros2_refuses_what_ros2_refuses():
+    odometry = message_class("nav_msgs/msg/Odometry")()
+    for where, name, value in (
+        (odometry.header.stamp, "nanosec", -1),
+        (odometry.pose.pose.position, "x", 1),
+        (odometry, "child_frame_id", None),
+        (odometry.pose, "covariance", [0.0] * 35),
+        (odometry, "header", "odom"),
+    ):
+        with pytest.raises(AssertionError, match=name):
+            setattr(where, name, value)
 
 
 # ---------------------------------------------------------------------------------------------------- ROS 1

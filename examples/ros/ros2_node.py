@@ -2,8 +2,8 @@
 
 python ros2_node.py --ros-args -p calibration:=calibration.yaml -r points:=/points -r imu:=/imu/data
 
-Topics and parameters are those of ros1_node.py. Its conversions are tested, in bridge.py; the node itself has not been
-run with ROS 2.
+Topics and parameters are those of ros1_node.py. In tests it runs with a stand-in of rclpy and of ROS 2's messages; it
+has not been run with ROS 2 itself.
 """
 
 from __future__ import annotations

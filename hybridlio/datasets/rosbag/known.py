@@ -15,7 +15,7 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.rosbag.bag import Bag
-from hybridlio.datasets.rosbag.choices import BagTopics
+from hybridlio.datasets.rosbag.choices import NONE, BagTopics
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +27,7 @@ class KnownBag:
         lidar, imu: the topics to use.
         others: beginnings of the names of topics that its bags hold besides, each at least once.
         T_imu_lidar: ``(4, 4)``.
+        reference: the topic of reference poses, ``none`` where topics of their type hold none; None to choose by type.
     """
 
     name: str
@@ -34,6 +35,7 @@ class KnownBag:
     imu: str
     others: tuple[str, ...]
     T_imu_lidar: Array
+    reference: str | None = None
 
     def fits(self, bag: Bag) -> bool:
         """Return whether a bag is of this data set."""
@@ -42,7 +44,12 @@ class KnownBag:
 
     def filled(self, wanted: BagTopics) -> BagTopics:
         """Return the topics that the user names, and those of the data set where he names none."""
-        return replace(wanted, lidar=wanted.lidar or self.lidar, imu=wanted.imu or self.imu)
+        return replace(
+            wanted,
+            lidar=wanted.lidar or self.lidar,
+            imu=wanted.imu or self.imu,
+            reference=wanted.reference or self.reference,
+        )
 
 
 def _pose(quaternion_xyzw: list[float], position: list[float]) -> Array:
@@ -56,6 +63,15 @@ _SPIRES_CAM_LIDAR = _pose(
 _SPIRES_CAM_IMU = _pose(
     [-0.003150684959962717, 0.7095105504964175, -0.7046875827967661, 0.0005124164367280889],
     [-0.005000230026155717, -0.0031440163748744266, -0.07336562959794378],
+)
+# github.com/Hilti-Research/hilti-slam-challenge-2023: documentation/hardware/Robot.md, groundtruth_2023
+_HILTI_ROBOT_LIDAR_IMU = np.array(
+    [
+        [0.9993809082422996, -0.003397272928783347, 0.03501797791768812, -0.13406141062872667],
+        [-0.0036988105559615262, -0.9999566093030182, 0.008549755065630918, -0.010899820828818012],
+        [0.03498741261178718, -0.0086739868491098, -0.9993501102771111, 0.006109253103427932],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
 )
 # The IMU in the sensor's frame, in which later drivers publish points. The driver of 2020 publishes them in the
 # lidar's frame, which is turned by 180° about z and 36.18 mm higher.
@@ -85,6 +101,14 @@ KNOWN = (
         "/alphasense/imu",
         (),
         _pose([np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0], [-0.001, -0.00855, 0.055]),
+    ),
+    KnownBag(
+        "Hilti 2023 (robot)",
+        "/rslidar_points",
+        "/imu/data",
+        ("/oak_cam_", "/track_odometry"),
+        se3.inverse(_HILTI_ROBOT_LIDAR_IMU),
+        reference=NONE,  # its odometry is that of the tracks
     ),
     KnownBag(
         "Oxford Spires",

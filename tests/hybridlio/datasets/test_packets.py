@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import shutil
+import struct
 import sys
 from pathlib import Path
 
@@ -90,6 +91,49 @@ def test_a_velodynes_packets_give_one_scan_a_turn(lidars: Path, name: str) -> No
         assert len(np.unique(np.round(elevations))) <= 2 * beams
         assert frame.scan.time_offsets_ns is not None
         assert -0.12e9 < frame.scan.time_offsets_ns.min() < 0
+
+
+def with_second_returns(capture: bytes, farther: int) -> bytes:
+    """Return a VLP-16's capture as of its mode of two returns, every other point with a farther one.
+
+    In that mode twelve blocks of a packet are six firings, the last return before the strongest, and byte 1204 is 0x39
+    (manual of the VLP-16, section 9.3). ``farther`` is in steps of 2 mm.
+    """
+    out, at = [capture[:24]], 24
+    while at < len(capture):
+        seconds, micros, size, _ = struct.unpack_from("<IIII", capture, at)
+        packet, at = capture[at + 16 : at + 16 + size], at + 16 + size
+        halves = [packet] if size != 1248 else [_six_firings(packet, half, farther) for half in range(2)]
+        out += [struct.pack("<IIII", seconds, micros, len(half), len(half)) + half for half in halves]
+    return b"".join(out)
+
+
+def _six_firings(packet: bytes, half: int, farther: int) -> bytes:
+    blocks = b""
+    for k in range(6 * half, 6 * half + 6):
+        strongest = packet[42 + 100 * k : 142 + 100 * k]
+        last = bytearray(strongest)
+        for channel in range(1, 32, 2):
+            (distance,) = struct.unpack_from("<H", last, 4 + 3 * channel)
+            struct.pack_into("<H", last, 4 + 3 * channel, distance + farther if distance else 0)
+        blocks += bytes(last) + strongest
+    (start_us,) = struct.unpack_from("<I", packet, 1242)
+    return packet[:42] + blocks + struct.pack("<I", start_us + half * round(6 * 110.592)) + b"\x39" + packet[1247:]
+
+
+def test_both_returns_of_a_velodyne_are_points(lidars: Path, tmp_path: Path) -> None:
+    pytest.importorskip("velodyne_decoder")
+    single = lidars / next(iter(VELODYNE))
+    (tmp_path / "dual.pcap").write_bytes(with_second_returns(single.read_bytes(), 500))
+    one, both = open_sequence(single), open_sequence(tmp_path / "dual.pcap")
+    assert len(both) == len(one)
+    near, far = (np.linalg.norm(sequence[1].scan.points, axis=1) for sequence in (one, both))
+    assert len(far) == pytest.approx(1.5 * len(near), rel=0.1)  # every other point has a second one, a metre farther
+    assert np.mean(far > near.max() + 0.2) == pytest.approx(1 / 3 * np.mean(near > near.max() - 0.8), abs=0.02)
+    for sequence in (one, both):
+        offsets = sequence[1].scan.time_offsets_ns
+        assert offsets is not None
+        assert offsets.min() / 1e6 == pytest.approx(-99.5, abs=1.0)
 
 
 @pytest.mark.parametrize("name", [OUSTER, *VELODYNE])

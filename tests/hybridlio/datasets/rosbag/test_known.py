@@ -45,3 +45,19 @@ def test_extrinsics_of_a_data_set_are_not_used_for_other_topics(recordings: Any,
     bag = write_like(tmp_path / "ride.bag", known, recordings.ride)
     with pytest.raises(DataError, match="no fixed transform"):
         open_sequence(bag, topics=BagTopics(imu=f"{known.others[0]}imu"))
+
+
+def test_the_odometry_of_a_robots_tracks_is_no_reference(recordings: Any, tmp_path: Path) -> None:
+    known = next(known for known in KNOWN if "robot" in known.name)
+    ride, messages = recordings.ride, bags.Messages(is_ros2=False)
+    content: list[bags.Message] = []
+    for k, t in enumerate(ride.stamps_ns.tolist()):
+        cloud = messages.cloud(t, bags.structured(Scan(t, ride.points(k)[:, :3].astype(np.float32))), "rslidar")
+        content.append((t, known.lidar, "sensor_msgs/msg/PointCloud2", cloud))
+        content.append((t, "/track_odometry", "nav_msgs/msg/Odometry", messages.odometry(t, np.eye(4), "base_link")))
+        imu = messages.imu(t, [0, 0, 0.2], [0, 0, 9.81], "xsens_imu_link")
+        content += [(t, topic, "sensor_msgs/msg/Imu", imu) for topic in (known.imu, "/oak_cam_front/imu")]
+    sequence = open_sequence(bags.write(tmp_path / "site2_robot_1.bag", messages, content))
+    assert sequence.reference is None
+    # the lidar looks ahead and stands on its head beside the IMU
+    np.testing.assert_allclose(sequence.calibration.T_imu_lidar[:3, 2], [0, 0, -1], atol=0.04)
