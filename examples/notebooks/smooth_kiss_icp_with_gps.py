@@ -1,7 +1,7 @@
 # %% [markdown]
 # # Smooth the result of KISS-ICP with GPS
 #
-# Poses of any odometry become a record that `smooth` takes. `kiss_poses_tum.txt` stands for the file that
+# `smooth` takes poses of any odometry. `kiss_poses_tum.txt` stands for the file that
 # `kiss_icp_pipeline DATA` writes. So that this notebook runs without KISS-ICP, it holds the true poses
 # with a growing turn.
 
@@ -18,17 +18,16 @@ turn = se3.exp(np.linspace(0, 1, len(sequence))[:, None] * [0, 0, 0.1, 0, 0, 0])
 write_tum("kiss_poses_tum.txt", hl.Trajectory(sequence.stamps_ns, turn @ sequence.reference.poses))
 
 # %% [markdown]
-# The covariance of a step, rotation first, says how far the poses are trusted.
+# The covariance of a step, rotation first, says how far the poses are trusted; with an IMU (`imu="imu.csv"`) it is
+# estimated, and the clocks are compared. GPS fixes may also be a file, `gps="gps.csv"`.
 
 # %%
-from hybridlio.record.record import Record
-
-poses = read_trajectory("kiss_poses_tum.txt", sequence.stamps_ns)
+poses = read_trajectory("kiss_poses_tum.txt")
 step_covariance = np.diag([0.002, 0.002, 0.01, 0.02, 0.02, 0.02]) ** 2
-no_imu = hl.ImuSamples.empty()
-record = Record.from_odometry(poses, no_imu, sequence.gps, sequence.calibration, covariances=step_covariance)
-smoothed = hl.smooth(record, gps=True)
-print(smoothed.found["gps"].summary())
+smoothed = hl.smooth(
+    "kiss_poses_tum.txt", gps=sequence.gps, calibration=sequence.calibration, covariances=step_covariance
+)
+print(smoothed.summary())
 
 # %% [markdown]
 # The poses before and after, aligned as a whole with the true ones:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias, Unpack
 
 import gtsam
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.errors import ConfigError, GraphError
+from hybridlio.core.errors import GraphError
 from hybridlio.core.estimates import State
 from hybridlio.core.progress import Progress
 from hybridlio.core.trajectory import Trajectory
@@ -30,6 +30,8 @@ from hybridlio.graph.run.loop_factors import LoopClosures
 from hybridlio.graph.run.robust import AddedGroups, check_robust_method
 from hybridlio.graph.run.run_calibration import RunCalibration
 from hybridlio.graph.run.scan_numbers import ScanNumbers
+from hybridlio.graph.run.wheel_factors import wheel_groups
+from hybridlio.record.inputs import Fixes, Odometry, OdometryInputs, record_of
 from hybridlio.record.record import Record
 from hybridlio.smoothing.calibration import CalibrationPriors
 from hybridlio.smoothing.gps_options import GpsOptions
@@ -40,6 +42,8 @@ from hybridlio.smoothing.verdict import Verdict
 if TYPE_CHECKING:
     from hybridlio.smoothing.loop_closure import LoopSettings
 
+Loops: TypeAlias = "Sequence[tuple[int, int, ArrayLike, ArrayLike]]"
+
 _log = logging.getLogger(__name__)
 
 _SCANS_AND_FIXES = frozenset(map(ord, "xvbgmawp"))  # letters of the keys that each scan, or each GPS fix, has one of
@@ -48,25 +52,28 @@ _RELATIVE_TOLERANCE = 1e-6  # decrease of the error at which iterations stop; a 
 
 
 def smooth(
-    record: Record,
+    odometry: Odometry,
     progress: Progress | None = None,
     *,
-    loops: bool | LoopSettings | Sequence[tuple[int, int, ArrayLike, ArrayLike]] = False,
-    gps: bool | GpsOptions = False,
+    loops: bool | LoopSettings | Loops = False,
+    gps: bool | GpsOptions | Fixes = False,
     groups: Sequence[FactorGroup] = (),
     robust: str | None = None,
     calibrate: Sequence[str] | CalibrationPriors = (),
+    **inputs: Unpack[OdometryInputs],
 ) -> Smoothed:
     """Optimise all poses, velocities, biases and gravity of a run at once (Levenberg-Marquardt).
 
     Args:
-        record: of the run, from :meth:`hybridlio.odometry.odometry.Odometry.record` or a run folder's ``odometry.npz``.
+        odometry: a run: its record, from :meth:`hybridlio.odometry.odometry.Odometry.record`, or its folder. Or poses
+            of any odometry: a TUM, KITTI or EuRoC file, a trajectory, poses ``(N, 4, 4)`` with ``stamps``, or rows
+            ``t_s, x, y, z, qx, qy, qz, qw``.
         progress: called with the stage, the steps done and the steps in total.
-        loops: True, or settings, to find and close loops; or loops ``(i, j, T_i_j, covariance)`` of lidar poses, scans
-            by row, which GNC may reject. ``found["loops"]`` is then a
-            :class:`hybridlio.smoothing.loops.ClosedLoops`.
-        gps: True, or options, to use the record's GPS fixes; ``found["gps"]`` is then a
-            :class:`hybridlio.smoothing.gps_options.GpsFit`.
+        loops: True, or settings, to find and close loops of a run with keyframes; or loops
+            ``(i, j, T_i_j, covariance)`` of lidar poses, scans by row, which GNC may reject. ``found["loops"]`` is then
+            a :class:`hybridlio.smoothing.loops.ClosedLoops`.
+        gps: True, or options, to use the record's GPS fixes or those of ``fixes``; or the fixes themselves, as
+            ``fixes`` takes them. ``found["gps"]`` is then a :class:`hybridlio.smoothing.gps_options.GpsFit`.
         groups: further measurements.
         robust: method against outliers among the measurements of all groups: ``huber``, ``cauchy``, ``geman-mcclure``,
             ``dcs`` or ``gnc``; None takes each group's default.
@@ -74,23 +81,27 @@ def smooth(
             ``lever_arm`` and ``gps_clock``; or a :class:`hybridlio.smoothing.calibration.CalibrationPriors`.
             ``found["calibration"]`` is then a :class:`hybridlio.smoothing.calibration.Calibrated`. What the motion does
             not determine stays as stated.
+        inputs: ``wheels``, whose result is a :class:`hybridlio.graph.run.wheel_factors.WheelFit`, and beside poses
+            ``imu``, ``fixes``, ``calibration``, ``covariances``, ``imu_noise``, ``imu_time_offset_s`` and ``stamps``,
+            from files or arrays (:class:`hybridlio.record.inputs.OdometryInputs`).
 
     Raises:
         GraphError: the graph cannot be solved.
-        EstimationError: too few fixes lie in the run's time.
-        ConfigError: an unknown robust method or parameter, a parameter without its sensor, or something else than a
-            record.
-        DataError: loops are to be found, and the record has no keyframes; or given loops are malformed.
+        EstimationError: too few fixes, or no wheel speeds, lie in the run's time.
+        ConfigError: an unknown robust method or parameter, or a parameter without its sensor.
+        DataError: loops are to be found, and the record has no keyframes; a file, array or loop is malformed.
     """
-    if not isinstance(record, Record):
-        raise ConfigError(f"smooth takes a Record, got {type(record).__name__}; Record.load(path) reads a run's")
     report, robust = progress or _silent, check_robust_method(robust)  # checked before the long search for loops
     priors = calibrate if isinstance(calibrate, CalibrationPriors) else CalibrationPriors(calibrate)
+    if not isinstance(gps, bool | GpsOptions):
+        inputs["fixes"], gps = gps, True
+    wheels = wheel_groups(inputs.pop("wheels", None))
+    record = record_of(odometry, inputs, with_keyframes=loops is not False and not isinstance(loops, Sequence))
     priors.check_sensors(has_imu=record.start.has_imu, has_gps=bool(gps))
     options = gps if isinstance(gps, GpsOptions) else GpsOptions()
     fixes = [GpsGroup(record, options, priors.antenna_sigma_m)] if gps else []
     closures = _loop_closures(record, loops, report)
-    added = AddedGroups([*fixes, *groups, *closures], robust)
+    added = AddedGroups([*fixes, *wheels, *groups, *closures], robust)
     calibration = RunCalibration(record, priors, fixes, closures)
     return on_deep_stack(len(record.online), lambda: _optimise(record, added, calibration, report))
 
@@ -122,7 +133,8 @@ def _optimise(record: Record, added: AddedGroups, calibration: RunCalibration, r
     smoothed = _smoothed(calibration.applied(), states, covariances, error_before or 0.0, optimiser, found)
     converged = calibration.has_converged(smoothed.iterations)
     own_poses = _own_trajectory(record) if verdict.refused else {}
-    return replace(smoothed, verdict=verdict, converged=converged, **own_poses)
+    clock_s, notes = record.imu_time_offset_s, record.notes
+    return replace(smoothed, verdict=verdict, converged=converged, imu_time_offset_s=clock_s, notes=notes, **own_poses)
 
 
 def _own_trajectory(record: Record) -> dict[str, Any]:
@@ -131,9 +143,7 @@ def _own_trajectory(record: Record) -> dict[str, Any]:
     return {"trajectory": record.online, "step_covariances": steps}
 
 
-def _loop_closures(
-    record: Record, loops: bool | LoopSettings | Sequence[tuple[int, int, ArrayLike, ArrayLike]], report: Progress
-) -> list[LoopClosures]:
+def _loop_closures(record: Record, loops: bool | LoopSettings | Loops, report: Progress) -> list[LoopClosures]:
     if loops is False:
         return []
     if isinstance(loops, Sequence):

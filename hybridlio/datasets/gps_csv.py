@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ def read_gps_csv(path: Path) -> tuple[GpsFix, ...]:
 
     Columns, in any order; others are ignored:
 
-    * ``stamp_ns``, whole nanoseconds;
+    * ``stamp_ns``, whole nanoseconds, or ``t_s``, seconds;
     * ``sigma``, standard deviation on each axis in metres;
     * the antenna's position: ``east north up`` in metres, in a local frame of the file's own, or
       ``latitude longitude height`` in degrees and metres (WGS 84), from which a local frame at the first row is made.
@@ -36,13 +37,14 @@ def read_gps_csv(path: Path) -> tuple[GpsFix, ...]:
         return ()
     header, rows = read_csv(path)
     local, geodetic = set(header) >= set(_LOCAL), set(header) >= set(_GEODETIC)
-    if not set(header) >= {"stamp_ns", "sigma"} or not (local or geodetic):
-        missing = {"stamp_ns", "sigma", *_LOCAL} - set(header)
+    time = "t_s" if "t_s" in header and "stamp_ns" not in header else "stamp_ns"
+    if not set(header) >= {time, "sigma"} or not (local or geodetic):
+        missing = {time, "sigma", *_LOCAL} - set(header)
         raise DataError(
-            f"{path}: the header lacks {', '.join(sorted(missing))}; expected stamp_ns, sigma and "
+            f"{path}: the header lacks {', '.join(sorted(missing))}; expected stamp_ns or t_s, sigma and "
             f"{','.join(_LOCAL)} or {','.join(_GEODETIC)}"
         )
-    names = ("stamp_ns", "sigma") + (_LOCAL if local else ()) + (_GEODETIC if geodetic else ())
+    names = (time, "sigma") + (_LOCAL if local else ()) + (_GEODETIC if geodetic else ())
     read = [_numbers(path, line, dict(zip(header, row, strict=True)), names) for line, row in rows]
     if not read:
         return ()
@@ -54,8 +56,8 @@ def read_gps_csv(path: Path) -> tuple[GpsFix, ...]:
 def _numbers(path: Path, line: int, row: dict[str, str], names: tuple[str, ...]) -> list[float]:
     """Return the row's numbers in the order of ``names``; the stamp, first, as an exact int."""
     try:
-        numbers = [int(row["stamp_ns"]), *(float(row[name]) for name in names[1:])]
-    except (ValueError, TypeError):
+        numbers = [_stamp(row[names[0]], names[0]), *(float(row[name]) for name in names[1:])]
+    except (ValueError, TypeError, InvalidOperation, OverflowError):
         raise DataError(f"{path}, line {line}: expected numbers in {','.join(names)}") from None
     if not np.isfinite(numbers[1:]).all() or numbers[1] < 0:
         raise DataError(f"{path}, line {line}: the position must be finite and sigma 0 or more")
@@ -63,6 +65,11 @@ def _numbers(path: Path, line: int, row: dict[str, str], names: tuple[str, ...])
         latitude, longitude, height = numbers[-len(_GEODETIC) :]
         check_geodetic(latitude, longitude, height, f"{path}, line {line}")
     return numbers
+
+
+def _stamp(text: str, name: str) -> int:
+    """Return a stamp in nanoseconds, exactly."""
+    return int(text) if name == "stamp_ns" else int((Decimal(text) * NS_PER_S).to_integral_value())
 
 
 def _fix(numbers: list[float], local: bool, origin: GeodeticPoint | None) -> GpsFix:

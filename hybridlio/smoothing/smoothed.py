@@ -29,6 +29,8 @@ class Smoothed:
             (:class:`hybridlio.smoothing.gps_options.GpsFit`).
         verdict: how well each kind of measurement fits. If it is refused, trajectory and step covariances are those of
             the odometry.
+        imu_time_offset_s: seconds that were added to the IMU's stamps before, to bring them to the poses' clock.
+        notes: what was corrected in the data, such as a clock, and what is doubtful there.
     """
 
     trajectory: Trajectory
@@ -43,6 +45,17 @@ class Smoothed:
     converged: bool
     found: dict[str, Any] = field(default_factory=dict)
     verdict: Verdict = field(default_factory=lambda: Verdict(()))
+    imu_time_offset_s: float = 0.0
+    notes: tuple[str, ...] = ()
+
+    def summary(self) -> str:
+        """Return some lines: what was corrected, how each kind of measurement fits, and what is doubtful."""
+        found = [f"{name}: {result.summary()}" for name, result in self.found.items() if _has_summary(result)]
+        doubts = [f"doubtful: {doubt}" for doubt in self.verdict.doubts]
+        calibrated = self.found.get("calibration")
+        doubts += [] if calibrated is None else list(calibrated.doubts)
+        doubts += [] if self.converged else ["stopped at the limit of iterations, before it converged"]
+        return "\n".join([*self.notes, *found, self.verdict.summary(), *doubts])
 
     def __repr__(self) -> str:
         end = "converged" if self.converged else "not converged"

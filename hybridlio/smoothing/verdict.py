@@ -21,6 +21,7 @@ _MEANINGS = {
     "units and T_imu_lidar",
     IMU: "the IMU contradicts the odometry: check its clock, units and T_imu_lidar, or raise imu_noise",
     "gps": "the fixes scatter more than they claim, or their antenna or clock is wrong: see --antenna and --max-shift",
+    "wheels": "wheels slip, or their radius, their clock or the axes of T_imu_lidar are wrong",
     "loops": "wrong loops, or odometry that drifts more than its covariances: try --robust gnc",
 }
 
