@@ -29,6 +29,7 @@ from hybridlio.core.motion_limits import (
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples, Scan
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.odometry.inertial_motion import inertial_motion
+from hybridlio.registration.cost_profile import PROBE_STEP_M
 from hybridlio.registration.joint_motion import SIZE, JointMotion, JointPoints, JointProblem
 from hybridlio.sources.settings import ScanMatchingSettings
 
@@ -57,13 +58,15 @@ class StartEstimate:
         relative: the step to it. Once decided it carries the poses relative to all scans before.
         frames: all frames so far, compensated by that motion.
         poses: ``(K, 4, 4)`` their lidar poses in the frame of the first.
-        is_decided: whether the search ends here.
+        is_decided: whether one motion is left, and the scans observe it in every direction.
+        is_last: whether the search ends here even if undecided.
     """
 
     relative: RelativePose
     frames: list[Frame]
     poses: Array
     is_decided: bool
+    is_last: bool
 
 
 class StartSearch:
@@ -77,11 +80,15 @@ class StartSearch:
         settings: of scan matching, at the scale of its scene.
         calibration: the extrinsics.
         noise: the IMU's.
+        leads: whether its steps are those of the run until it has decided.
     """
 
     NOT_STATE = ("_settings", "_calibration", "_noise")
 
-    def __init__(self, first: Frame, settings: ScanMatchingSettings, calibration: Calibration, noise: ImuNoise) -> None:
+    def __init__(
+        self, first: Frame, settings: ScanMatchingSettings, calibration: Calibration, noise: ImuNoise, leads: bool
+    ) -> None:
+        self.leads = leads
         self._settings, self._calibration, self._noise = settings, calibration, noise
         self._frames = [first]
         self._motions: list[JointMotion] = []
@@ -102,19 +109,21 @@ class StartSearch:
         problem = self._problem(base)
         self._motions = self._minima(problem)
         is_last = len(self._frames) >= _MOST_SCANS
-        is_decided = is_last or (len(self._motions) == 1 and len(self._frames) >= _LEAST_SCANS)
+        is_unique = len(self._motions) == 1 and len(self._frames) >= _LEAST_SCANS
+        is_decided = is_unique and self._is_observed(problem, self._motions[0])
         slowest = min(range(len(self._motions)), key=lambda i: float(np.linalg.norm(self._motions[i].motion[3:6])))
         chosen = 0 if is_last else slowest
         spread = _Spread(base, self._motions, [base.poses_beside(one.motion) for one in self._motions], chosen)
         motion = self._motions[chosen]
         self.last = StartEstimate(
             replace(
-                spread.step(source, is_decided),
+                spread.step(source, is_decided or is_last),
                 details={"motions": float(len(self._motions)), "cost": float(motion.costs.mean())},
             ),
             [replace(one, scan=base.compensated(one.scan, k, motion.motion)) for k, one in enumerate(self._frames)],
             spread.poses[chosen],
             is_decided,
+            is_last,
         )
         return self.last
 
@@ -170,6 +179,15 @@ class StartSearch:
         if len(self._frames) < _DROPPING_SCANS:
             return found
         return [one for one in found if one.rise_over_scatter(found[0]) < _DROPPED_RATIO]
+
+    def _is_observed(self, problem: JointProblem, found: JointMotion) -> bool:
+        """Return whether costs rise on both sides of the motion, along the direction that constrains it least."""
+        last_s = float(problem.points.times_s.max())
+        weakest = np.linalg.eigh(found.covariance[3:6, 3:6])[1][:, -1]
+        aside = np.r_[np.zeros(3), weakest * PROBE_STEP_M / last_s, np.zeros(3)]
+        stride = max(1, len(problem.points.times_s) // _JUDGED)
+        there = (problem.with_stride(stride).solve(found.motion + side * aside, 0.0, 0) for side in (-1, 1))
+        return all(one.rise_over_scatter(found) > _DROPPED_RATIO for one in there)
 
     def _distinct(self, found: list[JointMotion]) -> list[JointMotion]:
         """Return minima that put the last scan at different places, the lowest cost first."""

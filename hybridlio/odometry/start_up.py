@@ -22,7 +22,7 @@ from hybridlio.odometry.start_search import StartSearch
 from hybridlio.record import plain_values
 from hybridlio.record.record import Record
 from hybridlio.sources.recent_points import repeats_pattern
-from hybridlio.sources.scan_matching import ScanMatching
+from hybridlio.sources.scan_matching import LOST_COST, ScanMatching
 
 _log = logging.getLogger(__name__)
 
@@ -69,7 +69,10 @@ def start_backend(pipeline: Pipeline, second: Frame) -> State:
 def measure_step(
     pipeline: Pipeline, frame: Frame, initial: RelativePose, before: State, seconds: dict[str, float]
 ) -> tuple[Frame, RelativePose]:
-    """Return the compensated frame and the step to it: of the search while the start is undecided, else refined.
+    """Return the compensated frame and the step to it: of the search of the start, if there is one, else refined.
+
+    Lidars that do not repeat their pattern start by the search. Those that do, start by two scans; if these leave a
+    direction open, such as the vertical between walls, or do not fit each other, the search goes along and mends it.
 
     Args:
         pipeline: its residual source refines.
@@ -78,46 +81,56 @@ def measure_step(
         before: the backend's state at the scan before.
         seconds: gets the time spent.
     """
-    is_first_step = pipeline.state is None
-    if is_first_step:
-        pipeline.start_search = start_search(pipeline, frame)
-    if pipeline.start_search is not None:
-        found = _searched(pipeline, pipeline.start_search, frame, seconds)
+    residual, is_first_step = pipeline.residual, pipeline.state is None
+    repeats = not is_first_step or repeats_pattern(pipeline.first.scan, frame.scan)
+    if not repeats and isinstance(residual, ScanMatching):
+        pipeline.start_search = _search(pipeline, residual, leads=True)
+    search = pipeline.start_search
+    if search is not None and search.leads:
+        found = _searched(pipeline, search, frame, seconds)
         if found is not None:
             return found
     answer = pipeline.refine(frame, initial, before, seconds)
-    return repeat_first_step(pipeline, frame, answer, before) if is_first_step else answer
+    if is_first_step:
+        answer = repeat_first_step(pipeline, frame, answer, before)
+        is_open = len(answer[1].degenerate) > 0 or answer[1].details.get("cost", 0.0) > LOST_COST
+        if is_open and isinstance(residual, ScanMatching):
+            pipeline.start_search = _search(pipeline, residual, leads=False)
+    if pipeline.start_search is not None:
+        return _searched(pipeline, pipeline.start_search, frame, seconds) or answer
+    return answer
 
 
-def start_search(pipeline: Pipeline, second: Frame) -> StartSearch | None:
-    """Return a search of the start if the lidar does not repeat its pattern; None where two scans decide it."""
-    residual, first = pipeline.residual, pipeline.first
-    if not isinstance(residual, ScanMatching) or repeats_pattern(first.scan, second.scan):
-        return None
-    return StartSearch(first, residual.settings, pipeline.calibration, pipeline.imu_noise)
+def _search(pipeline: Pipeline, residual: ScanMatching, leads: bool) -> StartSearch:
+    return StartSearch(pipeline.first, residual.settings, pipeline.calibration, pipeline.imu_noise, leads)
 
 
 def restore_search(pipeline: Pipeline, state: Mapping[str, Any] | None) -> None:
     """Restore an unfinished search from its stored attributes; the residual source is restored already."""
     if state is not None and isinstance(pipeline.residual, ScanMatching):
-        settings = pipeline.residual.settings
-        pipeline.start_search = StartSearch(pipeline.first, settings, pipeline.calibration, pipeline.imu_noise)
+        pipeline.start_search = _search(pipeline, pipeline.residual, leads=False)
         plain_values.restore(pipeline.start_search, state)
 
 
 def _searched(
     pipeline: Pipeline, search: StartSearch, frame: Frame, seconds: dict[str, float]
 ) -> tuple[Frame, RelativePose] | None:
-    """Return the search's answer, and give its scans to scan matching when it ends; None if it ends without one."""
+    """Return the search's answer, and give its scans to scan matching when it ends; None if it has no answer.
+
+    A search that does not lead answers only when it has decided.
+    """
     assert pipeline.start is not None
     assert isinstance(pipeline.residual, ScanMatching)
     with timed(seconds, "residual"):
         found = search.add(frame, pipeline.start, pipeline.residual.name)
-        if found is None or found.is_decided:
+        if found is None or found.is_decided or found.is_last:
             pipeline.start_search = None
-            if search.last is not None:
-                pipeline.residual.start_from(search.last.frames, search.last.poses)
-    return None if found is None else (found.frames[-1], found.relative)
+            last = search.last if search.leads else found
+            if last is not None and (search.leads or last.is_decided):
+                pipeline.residual.start_from(last.frames, last.poses)
+    if found is None or not (search.leads or found.is_decided):
+        return None
+    return found.frames[-1], found.relative
 
 
 def repeat_first_step(

@@ -32,7 +32,7 @@ from hybridlio.sources.thinned_scan import ThinnedScan, thin
 # 10 m away by 0.2 m, two of the default kernels.
 _UNKNOWN_ROTATION_SIGMA_RAD = 0.02
 _LEVER_M = 10.0  # half of a scan's points are nearer; turns a rotation's uncertainty into a displacement
-_LOST_COST = 0.6  # mean cost of the points, 0 to 1; well above that of any scan that is placed correctly
+LOST_COST = 0.6  # mean cost of the points, 0 to 1; well above that of any scan that is placed correctly
 # A new map starts after this number of scans in a row that have enough points and do not fit. A passing occlusion lasts
 # less than half a second at 10 Hz; bridging longer adds more error than a new map, which starts at the bridges' error.
 _LOST_SCANS = 5
@@ -250,7 +250,7 @@ class ScanMatching:
         observed = register_with_degeneracy(
             self._problem(scan), start, coarse_kernel_m(settings.registration), is_start_vague=True
         )
-        fits = observed.registration.matched >= settings.min_matched and observed.registration.cost < _LOST_COST
+        fits = observed.registration.matched >= settings.min_matched and observed.registration.cost < LOST_COST
         return observed if fits else None
 
     def _search_motion(self, scan: ThinnedScan, start: Array, initial: RelativePose, dt_s: float) -> Array:
