@@ -129,7 +129,7 @@ ConfigFile = Annotated[
 
 
 _TOPIC_HELP = {
-    "lidar": "Topic of the point clouds.",
+    "lidar": "Topic of the point clouds; give it several times to merge lidars.",
     "imu": "Topic of the inertial data; `none` to use none.",
     "gps": "Topic of the GPS fixes; `none` to use none.",
     "reference": "Topic of reference poses; `none` to use none.",
@@ -147,6 +147,7 @@ def with_topic_options(command: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(command)
     def run(**kwargs: Any) -> None:
         names = {name: kwargs.pop(_topic_parameter(name)) for name in _TOPIC_HELP}
+        names["lidar"] = ",".join(names["lidar"]) if names["lidar"] else None
         command(**kwargs, topics=BagTopics(**names))
 
     signature = inspect.signature(command, eval_str=True)
@@ -163,8 +164,9 @@ def _topic_parameter(name: str) -> str:
 
 def _topic_option(name: str, text: str) -> inspect.Parameter:
     option = typer.Option(option_of(name), metavar="NAME", help=text, rich_help_panel="Bags")
+    kind = list[str] | None if name == "lidar" else str | None
     return inspect.Parameter(
-        _topic_parameter(name), inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[str | None, option]
+        _topic_parameter(name), inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[kind, option]
     )
 
 

@@ -23,7 +23,7 @@ from hybridlio.datasets.transform_forms import HOW_TO_WRITE, parse_transform
 
 _KEYS = (
     *("T_imu_lidar", "T_camera_lidar", "lidar", "antenna_imu_m", "imu_time_offset_s", "imu_noise", "rate_hz"),
-    *("columns", "point_times", "vehicle", "frames", "imu_frame", "lidar_frame"),
+    *("columns", "point_times", "vehicle", "frames", "imu_frame", "lidar_frame", "lidars"),
     "sigmas",
 )
 _LIDAR_KEYS = ("model", "min_range_m", "max_range_m")
@@ -47,6 +47,7 @@ class StatedCalibration:
         rate_hz: scans per second, for a folder without stamps.
         layout: the columns of ``.bin`` scans.
         format: what is stated about the points.
+        lidars: poses of further lidars in the first one's frame, by their topics.
         keys: the keys that are in the file; ``T_imu_lidar`` also where frames state it.
     """
 
@@ -57,6 +58,7 @@ class StatedCalibration:
     rate_hz: float | None = None
     layout: BinLayout | None = None
     format: StatedFormat = field(default_factory=StatedFormat)
+    lidars: dict[str, Array] = field(default_factory=dict)
     keys: frozenset[str] = frozenset()
 
 
@@ -75,6 +77,8 @@ def read_calibration_yaml(path: Path, needs_imu: bool = False) -> StatedCalibrat
     * ``imu_noise``: noise densities by the names of :class:`hybridlio.core.sensors.ImuNoise`;
     * ``frames``, ``imu_frame`` and ``lidar_frame``: in place of ``T_imu_lidar``, a list of transforms between frames as
       in a TF tree, each ``parent``, ``child`` and the child's pose in the parent, and the names of the sensors' frames;
+    * ``lidars``: of a bag with several lidars that are merged, the pose of each further one in the first one's frame,
+      by its topic, in any form of a transform;
     * ``vehicle``: a box in the lidar frame, corners ``min`` and ``max`` in metres, whose points are left out;
     * ``sigmas``: standard deviations as ``hybridlio calibrate`` writes them, for the reader's information alone;
     * ``rate_hz``: scans per second, for a folder without a file of stamps;
@@ -127,6 +131,7 @@ def _stated(content: dict[str, Any]) -> StatedCalibration:
         rate_hz=read("rate_hz", lambda key, value: _number(key, value, 0, MAX_RATE_HZ), None),
         layout=read("columns", lambda _, value: stated_layout(value), None),
         format=StatedFormat(read("point_times", _point_times, None), limits_m, read("vehicle", _vehicle, None)),
+        lidars=read("lidars", _lidars, {}),
         keys=frozenset(stated),
     )
 
@@ -203,6 +208,12 @@ def _lidar(key: str, value: Any) -> tuple[LidarModel | None, tuple[float, float]
         return model, None
     stated = {name: float(parts[name]) for name in _LIDAR_KEYS[1:] if name in parts}
     return None if model is None else replace(model, **stated), (low, high)  # type: ignore[arg-type]
+
+
+def _lidars(key: str, value: Any) -> dict[str, Array]:
+    if not isinstance(value, dict):
+        raise DataError(f"{key}: expected a mapping of topics to transforms, got {value!r}")
+    return {str(name): parse_transform(f"{key}: {name}", part) for name, part in value.items()}
 
 
 def _imu_noise(key: str, value: Any) -> ImuNoise:

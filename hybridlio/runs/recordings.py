@@ -186,6 +186,11 @@ def _parse_entry(entry: Any, place: str) -> Recording:
         raise DataError(f"{place}: {error}") from None
 
 
+def _topic_text(name: Any) -> str:
+    """Return a topic's name; several, as a list of lidars, are separated by commas."""
+    return ",".join(map(str, name)) if isinstance(name, list) else str(name)
+
+
 def _parse_topics(value: Any, place: str) -> BagTopics:
     known = [f.name for f in fields(BagTopics)]
     if value is None:
@@ -193,7 +198,7 @@ def _parse_topics(value: Any, place: str) -> BagTopics:
     if not isinstance(value, dict) or any(key not in known for key in value):
         raise DataError(f"{place}: {_TOPICS} {value!r}: give a mapping with keys of {', '.join(known)}")
     try:
-        return BagTopics(**{key: None if name is None else str(name) for key, name in value.items()})
+        return BagTopics(**{key: None if name is None else _topic_text(name) for key, name in value.items()})
     except ConfigError as error:
         raise DataError(f"{place}: {error}") from None
 

@@ -14,7 +14,8 @@ class BagTopics:
     """Topics and frames that the user names; None to choose by type, ``none`` to use no such topic.
 
     Attributes:
-        lidar, imu, gps, reference: names of topics.
+        lidar: name of the topic of clouds, or of several, separated by commas, whose scans are merged.
+        imu, gps, reference: names of topics.
         imu_frame, lidar_frame: names of frames, in place of those in the messages' headers.
 
     Raises:
@@ -29,11 +30,18 @@ class BagTopics:
     lidar_frame: str | None = None
 
     def __post_init__(self) -> None:
-        if self.lidar == NONE:
+        if NONE in self.lidars:
             raise ConfigError("--lidar-topic: odometry needs a lidar; give the name of its topic")
         for option in fields(self):
             if getattr(self, option.name) == "":
                 raise ConfigError(f"{option_of(option.name)}: the name is empty")
+        if "" in self.lidars or len(set(self.lidars)) < len(self.lidars):
+            raise ConfigError(f"--lidar-topic {self.lidar}: give different names")
+
+    @property
+    def lidars(self) -> tuple[str, ...]:
+        """Names of the lidars' topics, the first one first; none to choose by type."""
+        return () if self.lidar is None else tuple(name.strip() for name in self.lidar.split(","))
 
 
 NO_CHOICE = BagTopics()

@@ -69,6 +69,24 @@ class Mounting:
             antenna = None if T_imu_gps is None else T_imu_gps[:3, 3]
         return Calibration(T_imu_lidar, given.T_camera_lidar, antenna)
 
+    def lidar_other(self, frame: str, name: str, stated: StatedCalibration) -> Array:
+        """Return ``T_first_other`` of another lidar: what ``calibration.yaml`` states for its topic, or by the frames.
+
+        Raises:
+            DataError: neither gives it.
+        """
+        given = stated.lidars.get(name)
+        T = given if given is not None else self.find(self.lidar_frame, frame)
+        if T is None:
+            raise DataError(
+                f"{self.bag.path}: no fixed transform between the lidars' frames {self.lidar_frame!r} and {frame!r}; "
+                f"write the pose of {name} in the first lidar's frame to {calibration_file(self.bag.path)}:\n"
+                f"lidars:\n  {name}: {{translation: [0.0, 1.2, 0.0], roll_pitch_yaw_deg: [0, 0, 90]}}"
+            )
+        if given is None and frame == self.lidar_frame:
+            self.notes.add(f"{name} has the frame of the first lidar, {frame!r}: its points are taken as they are")
+        return T
+
     def body_lidar(self, body_frame: str, topic: Topic, calibration: Calibration) -> Array:
         """Return ``T_body_lidar`` of the frame whose poses a reference topic gives; what is assumed is noted."""
         found = self.find(body_frame, self.lidar_frame) if body_frame else None

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
-from hybridlio.core.sensors import Calibration, ImuSamples
+from hybridlio.core.sensors import Calibration, ImuSamples, Scan
 from hybridlio.core.tables import counted
 from hybridlio.core.trajectory import Trajectory
-from hybridlio.datasets.calibration_yaml import read_calibration_yaml
+from hybridlio.datasets.calibration_yaml import StatedCalibration, read_calibration_yaml
 from hybridlio.datasets.gps_csv import note_fixes
 from hybridlio.datasets.imu_mounting import note_mounting, on_scans_clock
 from hybridlio.datasets.kitti.vertical_angle import raised
+from hybridlio.datasets.merged_lidars import MergedScans, OtherLidar, nearest_scans
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.reference import poses_at
 from hybridlio.datasets.rosbag import measurements
@@ -27,7 +28,7 @@ from hybridlio.datasets.rosbag.heads import Message
 from hybridlio.datasets.rosbag.known import known_bag
 from hybridlio.datasets.rosbag.measurements import Log
 from hybridlio.datasets.rosbag.scans import BagScans
-from hybridlio.datasets.rosbag.topics import TRANSFORM_TYPES, choose
+from hybridlio.datasets.rosbag.topics import OTHER_LIDAR, TRANSFORM_TYPES, choose
 from hybridlio.datasets.rosbag.transforms import FrameTree
 from hybridlio.datasets.rosbag.wire import Header, read_header, read_imu
 from hybridlio.datasets.sequence import Sequence
@@ -111,6 +112,7 @@ def _open(path: Path, wanted: BagTopics, vertical_angle_deg: float | None) -> Se
     mounting = Mounting(bag, contents.tree, wanted, frames, notes, known)
     scans = _scans(bag, chosen["lidar"], contents.logs["lidar"], notes)
     scans.learn(stated.format, notes)
+    others = _other_scans(bag, chosen, contents, stated, notes)
     imu = _imu(chosen.get("imu"), contents.logs, notes)
     calibration = mounting.calibration(stated, has_imu=len(imu) > 0, has_gps="gps" in chosen)
     if len(imu):
@@ -123,7 +125,7 @@ def _open(path: Path, wanted: BagTopics, vertical_angle_deg: float | None) -> Se
     return Sequence(
         name=notes.name,
         stamps_ns=scans.stamps_ns,
-        load_scan=raised(scans, vertical_angle_deg),
+        load_scan=_with_others(raised(scans, vertical_angle_deg), scans, others, mounting, stated, vertical_angle_deg),
         imu=imu,
         calibration=calibration,
         reference=reference,
@@ -149,7 +151,8 @@ def _read(bag: Bag, chosen: dict[str, Topic], notes: Notes) -> _Contents:
     contents = _Contents({kind: Log() for kind in chosen})
     kinds = {topic.name: kind for kind, topic in chosen.items()}
     static = [t.name for t in bag.topics.values() if t.type in TRANSFORM_TYPES and t.name.endswith("_static")]
-    messages = bag.messages_and_heads([*kinds, *static], [chosen["lidar"].name])
+    clouds = [topic.name for kind, topic in chosen.items() if kind == "lidar" or kind.startswith(OTHER_LIDAR)]
+    messages = bag.messages_and_heads([*kinds, *static], clouds)
     for name, received_ns, raw in _until_damage(bag, messages, contents.logs["lidar"], notes):
         if name not in kinds:
             contents.tree.add(bag.decode(name, raw))
@@ -206,6 +209,40 @@ def _scans(bag: Bag, topic: Topic, log: Log, notes: Notes) -> BagScans:
     note_gaps(stamps[rows], topic.name, notes, SCAN_GAP_FACTOR)
     received = np.array(log.received_ns, dtype=np.int64)
     return BagScans(bag.path, topic.name, stamps[rows], rows, received, any(log.header_ns), bag)
+
+
+def _other_scans(
+    bag: Bag, chosen: dict[str, Topic], contents: _Contents, stated: StatedCalibration, notes: Notes
+) -> dict[str, BagScans]:
+    """Return the scans of further lidars by the kinds of their topics."""
+    found = {}
+    for kind, topic in chosen.items():
+        if kind.startswith(OTHER_LIDAR):
+            found[kind] = _scans(bag, topic, contents.logs[kind], notes)
+            found[kind].learn(replace(stated.format, vehicle=None), notes)
+    return found
+
+
+def _with_others(
+    load: Callable[[int], Scan],
+    first: BagScans,
+    others: dict[str, BagScans],
+    mounting: Mounting,
+    stated: StatedCalibration,
+    vertical_angle_deg: float | None,
+) -> Callable[[int], Scan]:
+    """Return the loader of scans, merged with those of further lidars if there are any."""
+    lidars = [
+        OtherLidar(
+            scans.topic,
+            raised(scans, vertical_angle_deg),
+            scans.stamps_ns,
+            mounting.lidar_other(mounting.frames[kind], scans.topic, stated),
+            nearest_scans(first.stamps_ns, scans.stamps_ns, scans.topic, mounting.notes),
+        )
+        for kind, scans in others.items()
+    ]
+    return MergedScans(load, tuple(lidars), stated.format.vehicle) if lidars else load
 
 
 def _imu(topic: Topic | None, logs: dict[str, Log], notes: Notes) -> ImuSamples:

@@ -24,6 +24,7 @@ TYPES: dict[str, frozenset[str]] = {
         }
     ),
 }
+OTHER_LIDAR = "lidar "
 TRANSFORM_TYPES = frozenset({"tf2_msgs/TFMessage", "tf/tfMessage"})
 _PACKETS = frozenset({"velodyne_msgs/VelodyneScan", "ouster_ros/PacketMsg", "ouster_sensor_msgs/PacketMsg"})
 
@@ -31,11 +32,19 @@ _PACKETS = frozenset({"velodyne_msgs/VelodyneScan", "ouster_ros/PacketMsg", "ous
 def choose(bag: Bag, wanted: BagTopics, notes: Notes) -> dict[str, Topic]:
     """Return the topics to use, by kind: ``lidar``, and of ``imu``, ``gps`` and ``reference`` those that there are.
 
+    Further lidars that the user names are of kinds that begin with :data:`OTHER_LIDAR`.
+
     Raises:
         DataError: a wanted topic does not exist or has another type, there is no lidar, or there are several lidars or
             IMUs; the message lists topics, and the option to choose one.
     """
-    found = {kind: _choose(bag, kind, getattr(wanted, kind), notes) for kind in TYPES}
+    first, *others = wanted.lidars or (None,)
+    found = {kind: _choose(bag, kind, first if kind == "lidar" else getattr(wanted, kind), notes) for kind in TYPES}
+    for name in others:
+        topic = _choose(bag, "lidar", name, notes)
+        if topic in found.values():
+            raise DataError(f"{bag.path}: --lidar-topic: {topic.name if topic else name} is named twice")
+        found[f"{OTHER_LIDAR}{name}"] = topic
     return {kind: topic for kind, topic in found.items() if topic is not None}
 
 
@@ -52,7 +61,8 @@ def _choose(bag: Bag, kind: str, name: str | None, notes: Notes) -> Topic | None
         return known
     if len(fitting) > 1 and kind in ("lidar", "imu"):
         raise DataError(
-            f"{bag.path}: {len(fitting)} {kind} topics; choose one, for example {option} {_most(fitting).name}\n"
+            f"{bag.path}: {len(fitting)} {kind} topics; choose one, for example {option} {_most(fitting).name}"
+            + (", or several to merge them\n" if kind == "lidar" else "\n")
             + table(fitting)
         )
     if len(fitting) > 1:

@@ -21,7 +21,9 @@ class TestChoice:
         with pytest.raises(DataError) as caught:
             open_sequence(bag)
         first, *rows = str(caught.value).splitlines()
-        assert first.endswith("small.bag: 2 lidar topics; choose one, for example --lidar-topic /points")
+        assert first.endswith(
+            "small.bag: 2 lidar topics; choose one, for example --lidar-topic /points, or several to merge them"
+        )
         assert [row.split() for row in rows] == [
             ["/filtered", "sensor_msgs/PointCloud2", "2", "2.8", "Hz"],
             ["/points", "sensor_msgs/PointCloud2", "4", "8.3", "Hz"],
@@ -246,3 +248,21 @@ def test_commands_take_the_options(small: Any, tmp_path: Path) -> None:
     refused = CliRunner().invoke(app, ["odometry", str(bag), "--imu-topic", "/points", "-o", str(tmp_path / "run")])
     assert refused.exit_code == 2
     assert "--imu-topic /points: its type is sensor_msgs/PointCloud2" in refused.output
+
+
+def test_commands_take_several_lidars(small: Any) -> None:
+    from typer.testing import CliRunner
+
+    from hybridlio.commands.app import app
+
+    bag = small.write(small.standard(), small.clouds("/other"))
+    shown = CliRunner().invoke(app, ["info", str(bag), "--lidar-topic", "/points", "--lidar-topic", "/other"])
+    assert shown.exit_code == 0, shown.output
+    assert "60 points a scan" in shown.output
+    assert "/other has the frame of the first lidar" in " ".join(shown.output.split())
+
+
+def test_one_topic_is_not_merged_with_itself(small: Any) -> None:
+    bag = small.write(small.standard())
+    with pytest.raises(DataError, match="--lidar-topic: /points is named twice"):
+        open_sequence(bag, topics=BagTopics(lidar="/points,points"))
