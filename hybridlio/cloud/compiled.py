@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
+from functools import cache
 from typing import Any, TypeVar, cast
+
+_log = logging.getLogger(__name__)
+
+_ANNOUNCEMENT = "compiling loops for this machine, which takes some 20 s after an installation; later runs load them"
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -18,7 +24,27 @@ def compiled(function: Function) -> Function:
     """
     from numba import njit
 
+    _announce_compilation()
     try:
         return cast(Function, njit(cache=True, nogil=True, error_model="numpy")(function))
     except RuntimeError:  # no folder to keep the code in can be written
         return cast(Function, njit(nogil=True, error_model="numpy")(function))
+
+
+@cache
+def _announce_compilation() -> None:
+    """Log once in a process that loops are being compiled, as Numba is silent for ten seconds and more."""
+    from numba.core import event
+
+    class Announcer(event.Listener):  # type: ignore[misc]
+        is_announced = False
+
+        def on_start(self, _event: object) -> None:
+            if not self.is_announced:
+                _log.warning(_ANNOUNCEMENT, extra={"kind": "once"})
+            self.is_announced = True
+
+        def on_end(self, _event: object) -> None:
+            pass
+
+    event.register("numba:compile", Announcer())

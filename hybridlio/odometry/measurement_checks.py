@@ -7,12 +7,13 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hybridlio.core.errors import DataError
+from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.geodesy import GeodeticPoint
 from hybridlio.core.sensors import NS_PER_S, GpsFix, Scan
 from hybridlio.odometry.imu_buffer import Values
 
 _LATEST_NS = 2**62  # far from the limit of int64; any clock in nanoseconds since 1970 is below
+_LONGEST_WAIT_S = 30.0  # of a stream: half the time for which IMU samples are kept
 _LARGEST_OFFSET_NS = NS_PER_S  # of a point from its scan's stamp: no lidar turns slower than once a second
 
 
@@ -88,3 +89,13 @@ def checked_fix(
 
 def _short(values: object) -> str:
     return " ".join(f"{values!r:.60}".split())
+
+
+def check_wait(name: str, wait_s: float) -> None:
+    """Check a time that a stream waits for measurements.
+
+    Raises:
+        ConfigError: it is not between 0 and 30 s.
+    """
+    if not 0 <= wait_s <= _LONGEST_WAIT_S:
+        raise ConfigError(f"OdometryStream: {name} must be between 0 and {_LONGEST_WAIT_S:g} s, got {wait_s}")

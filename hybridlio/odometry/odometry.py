@@ -39,6 +39,7 @@ class Odometry:
             have come.
 
     Attributes:
+        chosen: initial-pose source, residual source and backend, each by name or as an object.
         keeps_record: whether :meth:`record` may be called.
         last_scan: the last frame's scan, motion compensated to its stamp; None before the second frame.
 
@@ -58,8 +59,8 @@ class Odometry:
         if not isinstance(config, Config):
             raise ConfigError(f"config must be a Config, got {config!r}; hybridlio.load_config reads one from a file")
         self._config = config
-        self._chosen = (initial_pose or config.initial_pose, residual or config.residual, backend or config.backend)
-        check_names(*self._chosen)
+        self.chosen = (initial_pose or config.initial_pose, residual or config.residual, backend or config.backend)
+        check_names(*self.chosen)
         self._pipeline: Pipeline | None = None  # made at the first frame, which brings the calibration
         self._recorder = Recorder()
         self._keyframes = LoopKeyframeSelector(config.keyframes)
@@ -208,7 +209,7 @@ class Odometry:
 
     def _make_pipeline(self, first: Frame) -> Pipeline:
         setup = Setup.from_frame(self._config, first)
-        implementations = make_implementations(self._chosen, setup)
+        implementations = make_implementations(self.chosen, setup)
         return Pipeline(first, setup, *implementations)
 
     def _state_before(self, frame: Frame, pipeline: Pipeline) -> State:

@@ -15,16 +15,16 @@ from hybridlio.core.geodesy import GeodeticPoint
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise
 from hybridlio.odometry.estimate import Estimate
 from hybridlio.odometry.frame_assembly import FrameAssembler
-from hybridlio.odometry.measurement_checks import checked_fix, checked_scan, checked_stamp, checked_vector
+from hybridlio.odometry.measurement_checks import check_wait, checked_fix, checked_scan, checked_stamp, checked_vector
 from hybridlio.odometry.odometry import Odometry
 from hybridlio.odometry.pose_prediction import LatestPrediction, PredictedPose
 from hybridlio.odometry.stream_counts import StreamCounts
+from hybridlio.odometry.warm_up import warm_up
 from hybridlio.record.record import Record
 
 _log = logging.getLogger(__name__)
 
 _LONGEST_BEHIND_NS = NS_PER_S  # beyond the lag: a robot that drives by poses older than this is blind
-_LONGEST_S = 30.0  # of lag and reordering: half the time for which IMU samples are kept
 
 
 class OdometryStream:
@@ -39,7 +39,7 @@ class OdometryStream:
     rather than fall more than a second (and the lag) behind.
 
     All methods may be called from several threads. Memory is bounded, unless ``odometry`` keeps a record. A stream
-    whose estimation failed raises the error again at every further call.
+    whose estimation failed raises the error again at every further call. The first stream takes seconds to load.
 
     Args:
         calibration: the extrinsics; None if there is no IMU. Scans then wait for nothing.
@@ -66,14 +66,14 @@ class OdometryStream:
         lag_s: float = 0.5,
         reorder_s: float = 0.0,
     ) -> None:
-        for name, value in (("lag_s", lag_s), ("reorder_s", reorder_s)):
-            if not 0 <= value <= _LONGEST_S:
-                raise ConfigError(f"OdometryStream: {name} must be between 0 and {_LONGEST_S:g} s, got {value}")
+        check_wait("lag_s", lag_s)
+        check_wait("reorder_s", reorder_s)
         if calibration is not None and not isinstance(calibration, Calibration):
             raise ConfigError(f"OdometryStream: calibration must be a Calibration or None, got {calibration!r:.40}")
         if odometry is None:
-            without_imu = "constant-velocity" if calibration is None else None
-            odometry = Odometry(initial_pose=without_imu, keep_record=False)
+            initial_pose = "constant-velocity" if calibration is None else None
+            odometry = Odometry(initial_pose=initial_pose, keep_record=False)
+        warm_up(odometry)
         self.odometry = odometry
         self._calibration, self._on_estimate = calibration, on_estimate
         self._lag_ns, reorder_ns = round(lag_s * NS_PER_S), round(reorder_s * NS_PER_S)
