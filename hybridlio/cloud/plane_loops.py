@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.cloud.compiled import compiled
 from hybridlio.core.arrays import Array
 
+_ROUNDING = 1e-17  # of the diagonal: smaller entries beside it change nothing in double precision
 _SWEEPS = 12  # four or five make all products of 3 x 3 matrices diagonal to rounding
 
 
@@ -17,62 +20,68 @@ def principal_axes(groups: Array) -> tuple[Array, Array]:
 
     The axes ``(M, 3, 3)`` are columns.
     """
-    squares, axes = np.empty((len(groups), 3)), np.empty((len(groups), 3, 3))
-    scatter = np.empty((3, 3))
+    squares, axes = np.empty((len(groups), 3)), np.zeros((len(groups), 3, 3))
+    scatter, mean = np.empty((3, 3)), np.empty(3)
     count = groups.shape[1]
     for i in range(len(groups)):
-        mean = np.zeros(3)
-        for k in range(count):
-            mean += groups[i, k] / count
-        scatter[:] = 0.0
-        for k in range(count):
-            for a in range(3):
-                for b in range(a, 3):
+        for a in range(3):
+            mean[a] = 0.0
+            for k in range(count):
+                mean[a] += groups[i, k, a]
+            mean[a] /= count
+        for a in range(3):
+            for b in range(3):
+                scatter[a, b] = 0.0
+                for k in range(count):
                     scatter[a, b] += (groups[i, k, a] - mean[a]) * (groups[i, k, b] - mean[b])
         _diagonalise(scatter, axes[i])
-        _sort(scatter, axes[i])
         for a in range(3):
             squares[i, a] = max(scatter[a, a], 0.0) / count
+        _sort(squares[i], axes[i])
     return squares, axes
 
 
 @compiled
 def _diagonalise(matrix: Array, axes: Array) -> None:
-    """Turn the upper triangle of a symmetric ``(3, 3)`` matrix to diagonal form by Jacobi's rotations."""
-    axes[:] = np.eye(3)
+    """Turn a symmetric ``(3, 3)`` matrix to diagonal form by Jacobi's rotations; ``axes`` are zeros before."""
+    for a in range(3):
+        axes[a, a] = 1.0
     for _ in range(_SWEEPS):
-        if matrix[0, 1] == 0.0 and matrix[0, 2] == 0.0 and matrix[1, 2] == 0.0:
+        settled = True
+        for p in range(2):
+            for q in range(p + 1, 3):
+                off, size = matrix[p, q], abs(matrix[p, p]) + abs(matrix[q, q])
+                if abs(off) <= _ROUNDING * size:
+                    continue
+                settled = False
+                theta = (matrix[q, q] - matrix[p, p]) / (2 * off)
+                tangent = 1 / (abs(theta) + math.sqrt(theta * theta + 1))
+                if theta < 0:
+                    tangent = -tangent
+                c = 1 / math.sqrt(tangent * tangent + 1)
+                _rotate(matrix, p, q, c, tangent * c)
+                _rotate(matrix.T, p, q, c, tangent * c)
+                _rotate(axes, p, q, c, tangent * c)
+        if settled:
             return
-        for p, q, r in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
-            off = matrix[p, q]
-            if abs(off) <= 1e-17 * (abs(matrix[p, p]) + abs(matrix[q, q])):
-                matrix[p, q] = 0.0
-                continue
-            theta = (matrix[q, q] - matrix[p, p]) / (2 * off)
-            t = 1 / (abs(theta) + np.sqrt(theta * theta + 1))
-            if theta < 0:
-                t = -t
-            c = 1 / np.sqrt(t * t + 1)
-            s = t * c
-            matrix[p, p] -= t * off
-            matrix[q, q] += t * off
-            matrix[p, q] = 0.0
-            pr, qr = (min(p, r), max(p, r)), (min(q, r), max(q, r))
-            with_p, with_q = matrix[pr[0], pr[1]], matrix[qr[0], qr[1]]
-            matrix[pr[0], pr[1]], matrix[qr[0], qr[1]] = c * with_p - s * with_q, s * with_p + c * with_q
-            for a in range(3):
-                along_p, along_q = axes[a, p], axes[a, q]
-                axes[a, p], axes[a, q] = c * along_p - s * along_q, s * along_p + c * along_q
 
 
 @compiled
-def _sort(matrix: Array, axes: Array) -> None:
-    """Order a diagonal ``(3, 3)`` matrix and the columns of ``axes`` by ascending entries."""
-    for first, second in ((0, 1), (1, 2), (0, 1)):
-        if matrix[first, first] > matrix[second, second]:
-            matrix[first, first], matrix[second, second] = matrix[second, second], matrix[first, first]
-            for a in range(3):
-                axes[a, first], axes[a, second] = axes[a, second], axes[a, first]
+def _rotate(matrix: Array, p: int, q: int, cosine: float, sine: float) -> None:
+    """Rotate two columns of a ``(3, 3)`` matrix into each other."""
+    for a in range(3):
+        first, second = matrix[a, p], matrix[a, q]
+        matrix[a, p], matrix[a, q] = cosine * first - sine * second, sine * first + cosine * second
+
+
+@compiled
+def _sort(values: Array, axes: Array) -> None:
+    """Order three values and the columns of ``axes`` ``(3, 3)`` by ascending values."""
+    for end in range(2, 0, -1):
+        for a in range(end):
+            if values[a] > values[a + 1]:
+                values[a], values[a + 1] = values[a + 1], values[a]
+                _rotate(axes, a, a + 1, 0.0, 1.0)
 
 
 @compiled

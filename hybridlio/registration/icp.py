@@ -19,7 +19,7 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.registration.information import free_directions, scale_of
+from hybridlio.registration.information import free_basis, least_share, scale_of
 from hybridlio.registration.point_to_point import MixedMatches, MixedNeighbours
 from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Neighbours, PlaneMatches, Surface
@@ -135,7 +135,7 @@ class _Descent:
         self, settings: RegistrationSettings, pose: Array, kernel_m: float, fixed: Array | None, normal_noise: float
     ) -> None:
         self.pose, self.kernel_m, self._settings = pose, kernel_m, settings
-        self._free = free_directions(normal_noise, fixed)
+        self._basis, self._least_share = free_basis(fixed), least_share(normal_noise, fixed)
         self._steps = 0
         self._matches: PlaneMatches | MixedMatches
         self._lever_arms_m: Array
@@ -147,7 +147,7 @@ class _Descent:
 
         settings = self._settings
         self._matches, self._lever_arms_m = matches, matches.lever_arms_m
-        free = self._free._replace(scale=scale_of(self._lever_arms_m))
+        free = loops.Free(scale_of(self._lever_arms_m)[:, None] * self._basis, self._least_share)
         limits = loops.Limits(settings.kernel_m, settings.max_iterations)
         self._followed = found = loops.follow(matches.rows, free, limits, self.kernel_m, self._steps)
         self.kernel_m, self._steps = found.kernel_m, found.steps

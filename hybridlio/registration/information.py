@@ -24,16 +24,13 @@ reference.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.motion_limits import MEASUREMENT_FLOOR_SIGMAS
-
-if TYPE_CHECKING:
-    from hybridlio.registration.loops import Free
 
 
 class NormalNoise(NamedTuple):
@@ -171,21 +168,22 @@ def newton_step(
     """
     from hybridlio.registration import loops  # late: compiled
 
-    free = free_directions(normal_noise, fixed, _mean_lever(hessian) if lever_arms_m is None else lever_arms_m)
-    reduced = loops.newton_step(np.ascontiguousarray(hessian), np.ascontiguousarray(gradient), free)
-    return np.asarray(free.scale * reduced * min(1.0, limit_m / max(float(np.linalg.norm(reduced)), 1e-12)))
+    scale = scale_of(_mean_lever(hessian) if lever_arms_m is None else lever_arms_m)
+    free = loops.Free(scale[:, None] * free_basis(fixed), least_share(normal_noise, fixed))
+    step = loops.newton_step(np.ascontiguousarray(hessian), np.ascontiguousarray(gradient), free)
+    return np.asarray(step * min(1.0, limit_m / max(float(np.linalg.norm(step / scale)), 1e-12)))
 
 
-def free_directions(normal_noise: float, fixed: Array | None, lever_arms_m: Array | None = None) -> Free:
-    """Return the directions of a step for compiled loops; the arguments are those of :func:`newton_step`."""
-    from hybridlio.registration import loops  # late: compiled
+def free_basis(fixed: Array | None) -> Array:
+    """Return an orthonormal basis ``(6, K)`` of the directions that are not fixed, in scaled units."""
+    if fixed is None or not fixed.shape[1]:
+        return np.eye(6)
+    return np.ascontiguousarray(np.linalg.svd(fixed)[0][:, fixed.shape[1] :])
 
-    scale = scale_of(np.ones(3) if lever_arms_m is None else lever_arms_m)
-    if fixed is None:
-        return loops.Free(scale, np.eye(6), _STRONG_RATIO * normal_noise)
-    count = fixed.shape[1]
-    basis = np.linalg.svd(fixed)[0][:, count:] if count else np.eye(6)
-    return loops.Free(scale, np.ascontiguousarray(basis), -np.inf)
+
+def least_share(normal_noise: float, fixed: Array | None) -> float:
+    """Return the share of the information that a direction must have in a step of :func:`newton_step`."""
+    return _STRONG_RATIO * normal_noise if fixed is None else -np.inf
 
 
 def scale_of(lever_arms_m: Array) -> Array:

@@ -40,17 +40,15 @@ class Rows(NamedTuple):
 
 
 class Free(NamedTuple):
-    """The directions in which a pose may move, in the units of
-    :func:`hybridlio.registration.information.scaled_spectrum`.
+    """The directions in which a pose may move.
 
     Attributes:
-        scale: ``(6,)`` by which a vector in these units is multiplied to become a tangent vector (rad, m).
-        basis: ``(6, K)`` orthonormal.
-        least_share: directions with a smaller share of the information than this are left out.
+        directions: ``(6, K)`` tangent vectors (rad, m), orthonormal in the units of
+            :func:`hybridlio.registration.information.scaled_spectrum`.
+        least_share: principal directions with a smaller share of the information than this are left out.
     """
 
-    scale: Array
-    basis: Array
+    directions: Array
     least_share: float
 
 
@@ -128,14 +126,28 @@ def _add(hessian: Array, gradient: Array, row: Array, weight: float, distance: f
 
 @compiled
 def newton_step(hessian: Array, gradient: Array, free: Free) -> Array:
-    """Return the step ``(6,)`` within the strong ones of the free directions, in scaled units."""
-    scaled = hessian * free.scale.reshape(6, 1) * free.scale
-    values, vectors = np.linalg.eigh(free.basis.T @ scaled @ free.basis)
+    """Return the step ``(6,)`` within the strong ones of the free directions."""
+    count = free.directions.shape[1]
+    reduced, slope = np.zeros((count, count)), np.zeros(count)
+    for a in range(count):
+        for i in range(6):
+            slope[a] += free.directions[i, a] * gradient[i]
+            for b in range(count):
+                for j in range(6):
+                    reduced[a, b] += free.directions[i, a] * hessian[i, j] * free.directions[j, b]
+    values, vectors = np.linalg.eigh(reduced)
     least = free.least_share * (hessian[3, 3] + hessian[4, 4] + hessian[5, 5])
-    along = vectors.T @ (free.basis.T @ (free.scale * gradient))
-    for k in range(len(values)):
-        along[k] = along[k] / max(values[k], 1e-12) if values[k] >= least else 0.0
-    return -(free.basis @ (vectors @ along))
+    step = np.zeros(6)
+    for k in range(count):
+        if values[k] < least:
+            continue
+        along = 0.0
+        for a in range(count):
+            along += vectors[a, k] * slope[a]
+        for a in range(count):
+            for i in range(6):
+                step[i] -= free.directions[i, a] * vectors[a, k] * along / max(values[k], 1e-12)
+    return step
 
 
 class Limits(NamedTuple):
@@ -179,10 +191,9 @@ def follow(rows: Rows, free: Free, limits: Limits, kernel_m: float, steps: int) 
     sums = system(rows, way, kernel_m, limits.kernel_m)
     enough = rows.planes.shape[1] + rows.points.shape[2] >= _MIN_MATCHES
     while True:
-        step = np.zeros(6)
-        if enough:
-            step = free.scale * newton_step(sums.hessian, sums.gradient, free)
-        way += step
+        step = newton_step(sums.hessian, sums.gradient, free) if enough else np.zeros(6)
+        for i in range(6):
+            way[i] += step[i]
         steps += 1
         is_narrow = kernel_m == limits.kernel_m
         kernel_m = max(limits.kernel_m, kernel_m / 2)
@@ -196,12 +207,22 @@ def follow(rows: Rows, free: Free, limits: Limits, kernel_m: float, steps: int) 
 
 
 @compiled
+def _largest(xi: Array) -> tuple[float, float]:
+    """Return the largest component of the rotation and of the translation."""
+    turn, shift = 0.0, 0.0
+    for i in range(3):
+        turn, shift = max(turn, abs(xi[i])), max(shift, abs(xi[i + 3]))
+    return turn, shift
+
+
+@compiled
 def _rematch_ratio(xi: Array) -> float:
-    turn, shift = np.abs(xi[:3]).max() / _REMATCH_ROTATION_RAD, np.abs(xi[3:]).max() / _REMATCH_TRANSLATION_M
-    return float(max(turn, shift))
+    """Return the size of a tangent vector over that at which matches have to be made again."""
+    turn, shift = _largest(xi)
+    return max(turn / _REMATCH_ROTATION_RAD, shift / _REMATCH_TRANSLATION_M)
 
 
 @compiled
 def _is_small(step: Array) -> bool:
-    turn, shift = np.abs(step[:3]).max(), np.abs(step[3:]).max()
-    return bool(turn < _ROTATION_CONVERGED_RAD and shift < _TRANSLATION_CONVERGED_M)
+    turn, shift = _largest(step)
+    return turn < _ROTATION_CONVERGED_RAD and shift < _TRANSLATION_CONVERGED_M
