@@ -14,9 +14,11 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
 from hybridlio.graph.calibrated_measurements import CalibratedMeasurements
+from hybridlio.graph.marginal_factors import marginal_factor
 from hybridlio.graph.model import coordinates as co
-from hybridlio.graph.model.graph_data import GraphData
+from hybridlio.graph.model.graph_data import GraphData, PosesByKey
 from hybridlio.graph.model.keys import Key, check_key, list_keys
+from hybridlio.graph.model.new_factors import check_start, new_measurement
 from hybridlio.graph.model.noise import NoiseInput, make_noise
 from hybridlio.graph.views.gtsam_graph import from_gtsam, to_gtsam
 
@@ -34,11 +36,7 @@ class WholeGraph(CalibratedMeasurements):
         Raises:
             GraphError: unknown key.
         """
-        try:
-            listed = list(keys)
-        except TypeError:
-            raise GraphError(f"subgraph: expected keys, got {type(keys).__name__}") from None
-        kept = set(self._data.known_keys(*listed, what="subgraph"))
+        kept = set(self._data.known_keys(*_listed(keys, "subgraph"), what="subgraph"))
         return self._of(_part(self._data, kept))
 
     def remove_pose(self, key: Key) -> None:
@@ -51,6 +49,58 @@ class WholeGraph(CalibratedMeasurements):
         rest = _part(self._data, set(self._data.keys) - {known})
         self._data.is_replaced = True
         self._data = rest
+
+    def marginalise(self, keys: Collection[Key], solution: PosesByKey) -> int | None:
+        """Remove poses, and keep what their factors say about the others as one linear factor of GTSAM's.
+
+        It joins all poses that shared a factor with them. Factors are linearised at the solution, from which the other
+        poses start afterwards; away from it the marginal is an approximation. It cannot be saved. Online solvers of
+        this graph then refuse to update.
+
+        Args:
+            keys: of the poses to remove.
+            solution: of this graph.
+
+        Returns:
+            The id of the new factor; None where no other pose shared a factor with them.
+
+        Raises:
+            GraphError: unknown key, a pose that the solution lacks, no pose would stay, or a factor of the poses that
+                also concerns velocities, biases, landmarks or calibration variables.
+            DataError: not a solution.
+        """
+        gone = self._data.known_keys(*_listed(keys, "marginalise"), what="marginalise")
+        place = {key: k for k, key in enumerate(check_start(self._data, solution).keys)}
+        missing = [key for key in self._data.keys if key not in place]
+        if missing:
+            raise GraphError(f"marginalise: the solution has no pose {list_keys(missing)}")
+        if len(set(gone)) == len(self._data):
+            raise GraphError("marginalise: no pose would stay")
+        coordinates = solution.coordinates[[place[key] for key in self._data.keys]]
+        marginal = marginal_factor(self._data, gone, coordinates)
+        rest = _part(self._data, set(self._data.keys) - set(gone))
+        rest.start_from(solution)
+        self._data.is_replaced = True
+        self._data = rest
+        return None if marginal is None else rest.add_factor(marginal)
+
+    def set_measurement(self, factor_id: int, measured: ArrayLike) -> int:
+        """Replace what a factor measures; its noise stays, and the factor gets a new id, which is returned.
+
+        Args:
+            factor_id: of a factor.
+            measured: in the form in which the factor was added: a pose ``(4, 4)`` of a between-factor, a sensor's step
+                or a prior; of GPS the position, whose lever arm stays; of an attitude the direction in the body frame;
+                a velocity, a point, biases ``(6,)``; one number of altitude and heading; bearing and range.
+
+        Raises:
+            GraphError: unknown id, or a factor of samples, of a user's code or of GTSAM's.
+            DataError: as for a new factor.
+        """
+        factor = self._data.factors[self._data.known_factor(factor_id)]
+        changed = replace(factor, measured=new_measurement(factor, measured, self._data.dimension))
+        self._data.remove(factor_id)
+        return self._data.add_factor(changed)
 
     def set_noise(
         self, factor_id: int, covariance: ArrayLike | None = None, *, information: ArrayLike | None = None,
@@ -135,6 +185,13 @@ class WholeGraph(CalibratedMeasurements):
 
 
 _IN_WORLD = ("prior", "gps", "attitude", "velocity", "altitude", "heading")  # they hold in the other graph's world
+
+
+def _listed(keys: Collection[Key], what: str) -> list[Key]:
+    try:
+        return list(keys)
+    except TypeError:
+        raise GraphError(f"{what}: expected keys, got {type(keys).__name__}") from None
 
 
 def _moved(coordinates: Array, T: Array) -> Array:

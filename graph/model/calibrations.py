@@ -58,7 +58,7 @@ def calibration_variable(
     """
     if not isinstance(name, str) or not name:
         raise GraphError(f"a calibration variable needs a name, got {shown(name)}")
-    if kind not in CALIBRATION_KINDS:
+    if not isinstance(kind, str) or kind not in CALIBRATION_KINDS:
         raise GraphError(f"{name}: unknown kind {shown(kind)}; choose one of {', '.join(CALIBRATION_KINDS)}")
     if dimension == 2 and kind in _IN_SPACE:
         raise GraphError(f"{name}: {kind} needs a graph in space, PoseGraph(dimension=3); this one is planar")

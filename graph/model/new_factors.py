@@ -15,7 +15,15 @@ from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.calibrations import CalibrationNames, chosen, of_kind
 from hybridlio.graph.model.graph_data import GraphData, PosesByKey
 from hybridlio.graph.model.keys import Key, check_key
-from hybridlio.graph.model.measurements import SCALARS, VECTOR_NOISE_SIZE, Factor, Kind, factor_label
+from hybridlio.graph.model.measurements import (
+    CODE,
+    SCALARS,
+    STEPS,
+    VECTOR_NOISE_SIZE,
+    Factor,
+    Kind,
+    factor_label,
+)
 from hybridlio.graph.model.noise import NoiseInput, RobustLike, make_noise, make_robust
 
 
@@ -179,6 +187,33 @@ def _bearing_range(measured: tuple[ArrayLike, ...], dimension: int, name: str) -
         check_direction(bearing, name)
         bearing = bearing / np.linalg.norm(bearing)
     return np.concatenate([bearing, distance])
+
+
+def new_measurement(factor: Factor, measured: ArrayLike, dimension: co.Dimension) -> Array:
+    """Return another measurement of a factor, as :class:`Factor` holds it.
+
+    Raises:
+        GraphError: a factor of samples, of a user's code or of GTSAM's.
+        DataError: a measurement of another shape, or not finite.
+    """
+    name, old = factor.label, factor.measured
+    if factor.kind in ("imu", *CODE):
+        raise GraphError(f"{name}: samples and code are no measurement to replace; remove it and add another")
+    if factor.kind in (*STEPS, "prior"):
+        return co.from_matrix(measured, dimension, name)
+    if factor.kind == "gps":
+        return np.concatenate([check_vector(measured, dimension, name), np.zeros(3 - dimension), old[3:]])
+    if factor.kind == "attitude":
+        check_direction(measured, name)
+        return np.concatenate([old[:3], check_vector(measured, 3, name)])
+    if factor.kind == "bearing-range":
+        if not isinstance(measured, tuple | list) or len(measured) != 2:
+            raise DataError(f"{name}: expected bearing and range, got {measured!r}")
+        return _bearing_range((measured[0], measured[1]), dimension, name)
+    values = check_vector(np.atleast_1d(as_floats(measured, name)), len(old), name)
+    if factor.kind == "point" and not values.any():
+        raise DataError(f"{name}: the point lies at the pose itself, so that it has no bearing")
+    return values
 
 
 def check_start(data: GraphData, poses: PosesByKey) -> PosesByKey:
