@@ -27,6 +27,8 @@ from hybridlio.graph.solve.solution import Solution
 from hybridlio.localization.joins import RunJoin, join_runs
 from hybridlio.localization.run_places import RunPlaces
 from hybridlio.record.record import Record
+from hybridlio.smoothing.loop_closure import find_loops
+from hybridlio.smoothing.loops import Loop
 
 _FIRST_SIGMA = 1e-6  # rad, m: the first pose of the first run is the world; a covariance must be positive definite
 # From the last keyframe of one run to the first of the next, rad and m. GNC checks loops against a chain through all
@@ -50,6 +52,7 @@ class Merged:
 
     trajectories: tuple[Trajectory | None, ...]
     joins: tuple[RunJoin, ...]
+    loops: tuple[tuple[Loop, ...], ...]
     solution: Solution
     first_keys: tuple[int | None, ...]
     _graph: GraphData
@@ -64,11 +67,11 @@ class Merged:
         write_graph(self._graph, path, self.solution)
 
     def to_json_dict(self) -> dict[str, Any]:
-        """Return the joins of each pair, and the runs that are not joined."""
+        """Return the joins of each pair, the loops of each run, and the runs that are not joined."""
         pairs = [
             {"runs": [one.earlier, one.later], "joins": len(one.joins), "rejected": one.rejected} for one in self.joins
         ]
-        return {"pairs": pairs, "unjoined": self.unjoined}
+        return {"pairs": pairs, "loops": [len(loops) for loops in self.loops], "unjoined": self.unjoined}
 
 
 def merge(
@@ -76,13 +79,14 @@ def merge(
 ) -> Merged:
     """Join runs by the places that they share, and optimise them together.
 
-    Every pair of runs is searched for joins. Those that agree enter one graph with the odometry of all runs, in which
-    graduated non-convexity rejects wrong ones. A run that no join reaches stays out, and is said.
+    Every pair of runs is searched for joins, and every run for loops of its own. Those that agree enter one graph with
+    the odometry of all runs, in which graduated non-convexity rejects wrong ones. A run that no join reaches stays out,
+    and is said.
 
     Args:
         records: of the runs, with keyframes; the first one's first scan is the world.
         trajectories: their poses, such as smoothed ones; by default those of the records.
-        progress: called with the stage, pairs of runs done and pairs in all.
+        progress: called with the stage, pairs of runs, or keyframes of a run, done and in all.
 
     Raises:
         ConfigError: fewer than two runs.
@@ -102,12 +106,19 @@ def merge(
     worlds = _worlds(runs, found)
     keys = _first_keys(runs, worlds)
     graph, ids = _graph(runs, found, worlds, keys)
+    loops = {n: find_loops(replace(records[n], online=runs[n].trajectory), None, progress).loops for n in worlds}
+    loop_ids = {n: [_add_loop(graph, runs[n], keys[n], one) for one in of_run] for n, of_run in loops.items()}
     settings = Settings("gnc", "given", _MAX_ITERATIONS, _TOLERANCE, lag=1)  # gnc has no lag
     solution = on_deep_stack(len(graph), lambda: solve_batch(graph, settings, silent))
     kept = [_kept(one, ids.get(n, []), solution) for n, one in enumerate(found)]
     still = _worlds(runs, kept)
     placed = [_trajectory(run, keys[n], solution) if n in still else None for n, run in enumerate(runs)]
-    return Merged(tuple(placed), tuple(kept), solution, tuple(keys.get(n) for n in range(len(runs))), graph)
+    closed = tuple(
+        tuple(one for one, i in zip(loops.get(n, ()), loop_ids.get(n, []), strict=True) if _counts(solution, i))
+        for n in range(len(runs))
+    )
+    first_keys = tuple(keys.get(n) for n in range(len(runs)))
+    return Merged(tuple(placed), tuple(kept), closed, solution, first_keys, graph)
 
 
 def _worlds(runs: Sequence[RunPlaces], joins: Sequence[RunJoin]) -> dict[int, Array]:
@@ -180,6 +191,11 @@ def _add_between(graph: GraphData, i: int, j: int, T_i_j: Array, covariance: Arr
     return graph.add_factor(between_factor(graph, (i, j), T_i_j, NoiseInput(covariance), None))
 
 
+def _add_loop(graph: GraphData, run: RunPlaces, key: int, loop: Loop) -> int:
+    i, j = (key + _number(run, row) for row in (loop.earlier, loop.later))
+    return _add_between(graph, i, j, loop.pose, loop.covariance)
+
+
 def _number(run: RunPlaces, row: int) -> int:
     """Return the number of the keyframe at a row."""
     return int(np.searchsorted(run.keyframes.rows, row))
@@ -187,8 +203,12 @@ def _number(run: RunPlaces, row: int) -> int:
 
 def _kept(join: RunJoin, ids: list[int], solution: Solution) -> RunJoin:
     """Return the joins of a pair that the solution did not reject."""
-    good = tuple(one for one, i in zip(join.joins, ids, strict=False) if solution.weight(i) >= _KEPT_WEIGHT)
+    good = tuple(one for one, i in zip(join.joins, ids, strict=False) if _counts(solution, i))
     return replace(join, joins=good, rejected=join.rejected + len(join.joins) - len(good))
+
+
+def _counts(solution: Solution, factor_id: int) -> bool:
+    return solution.weight(factor_id) >= _KEPT_WEIGHT
 
 
 def _trajectory(run: RunPlaces, key: int, solution: Solution) -> Trajectory:

@@ -59,3 +59,6 @@ def _print_pairs(names: list[str], merged: Merged) -> None:
     for pair in merged.joins:
         joins = f"{counted(len(pair.joins), 'join')}, {pair.rejected} rejected"
         print_result(f"{names[pair.earlier]} and {names[pair.later]}: {joins}")
+    for name, loops in zip(names, merged.loops, strict=True):
+        if loops:
+            print_result(f"{name}: {counted(len(loops), 'loop')} of its own")

@@ -11,9 +11,11 @@ from mapped_towns import MappedTown, TownDrive
 from hybridlio.core import se3
 from hybridlio.core.errors import ConfigError
 from hybridlio.evaluation.consistency import pose_consistency
+from hybridlio.localization import merge as merging
 from hybridlio.localization.joins import join_runs
 from hybridlio.localization.merge import Merged, merge
 from hybridlio.localization.run_places import RunPlaces
+from hybridlio.smoothing.loops import Loop, LoopSearch
 
 
 @pytest.fixture(scope="module")
@@ -88,3 +90,27 @@ def test_false_joins_are_outvoted(town: MappedTown, begun_elsewhere: TownDrive, 
 def test_one_run_alone_is_refused(town: MappedTown):
     with pytest.raises(ConfigError, match="two runs or more"):
         merge([town.record])
+
+
+def test_loops_of_a_run_count_and_false_ones_do_not(
+    town: MappedTown, begun_elsewhere: TownDrive, monkeypatch: pytest.MonkeyPatch
+):
+    rows = RunPlaces.of(town.record).keyframes.rows
+    true = se3.between(town.drive.truth[rows[0]], town.drive.truth[rows[-1]])
+    near = np.diag([1e-6] * 3 + [1e-4] * 3)
+    right = [Loop(int(rows[0]), int(rows[-1]), true, near, 1.0, 0.0), Loop(int(rows[1]), int(rows[-1]),
+             se3.between(town.drive.truth[rows[1]], town.drive.truth[rows[-1]]), near, 1.0, 0.0)]  # fmt: skip
+    false = Loop(int(rows[0]), int(rows[-2]), true @ se3.exp([0, 0, 0.5, 3, 3, 0]), near, 1.0, 0.0)
+
+    def found(record, settings, progress):
+        of_first = len(record.online) == len(town.record.online)
+        return LoopSearch(1, 1, 1, (*right, false) if of_first else (), (), {})
+
+    monkeypatch.setattr(merging, "find_loops", found)
+    merged = merge([town.record, begun_elsewhere.record()])
+    assert merged.loops == (tuple(right), ())
+    assert merged.to_json_dict()["loops"] == [2, 0]
+    first = merged.trajectories[0]
+    assert first is not None
+    off = se3.log(se3.between(se3.between(first.poses[rows[0]], first.poses[rows[-1]]), true))
+    assert np.linalg.norm(off[3:]) < 0.03
