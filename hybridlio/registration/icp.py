@@ -74,6 +74,17 @@ class Registration:
     converged: bool
 
     @property
+    def diagnostics(self) -> dict[str, float]:
+        """Numbers that say how well it went, by name."""
+        return {
+            "matched": self.matched,
+            "iterations": float(self.iterations),
+            "converged": float(self.converged),
+            "sigma_m": self.sigma_m,
+            "cost": self.cost,
+        }
+
+    @property
     def fit(self) -> Fit:
         """How well the points lie on the surface at the result."""
         return Fit(self.cost, self.matched)

@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hybridlio.cloud.kd_tree import build_tree
+from hybridlio.cloud.kd_tree import build_tree, threads_for
 from hybridlio.cloud.plane_fitting import MIN_NEIGHBOURS
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Index
@@ -152,7 +152,8 @@ class JointProblem:
         moved, settings = self.points.moved(motion), self.settings
         judged = np.arange(0, len(moved), self.stride)
         tree = build_tree(moved, settings.threads)
-        nearest, squares = tree.batch_knn_search(moved[judged], min(_NEAREST, len(moved)), num_threads=settings.threads)
+        threads = threads_for(len(judged), settings.threads)
+        nearest, squares = tree.batch_knn_search(moved[judged], min(_NEAREST, len(moved)), num_threads=threads)
         nearest = np.minimum(nearest.astype(np.int64), len(moved) - 1)
         is_other = self.points.scans[nearest] != self.points.scans[judged, None]
         is_near = is_other & (squares < settings.max_distance_m**2)

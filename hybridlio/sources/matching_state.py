@@ -21,6 +21,7 @@ class PathPoint:
         bridged: whether the pose is a prediction, because the scan could not be matched.
         bridge_covariance: ``(6, 6)`` that the predictions since the last matched scan have added up to.
         map_changed: whether the map gets a keyframe between the last matched scan and the next one.
+        weak_covariance: ``(6, 6)`` of the pose relative to the map along directions that scans constrain weakly.
     """
 
     T_map_lidar: Array
@@ -28,11 +29,18 @@ class PathPoint:
     bridged: bool = False
     bridge_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
     map_changed: bool = False
+    weak_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
+
+    def predicted_covariance(self, initial: RelativePose) -> Array:
+        """Return the covariance ``(6, 6)`` relative to the map of the next scan placed by its initial pose."""
+        return se3.compose_covariance(self.bridge_covariance + self.weak_covariance, initial.pose, initial.covariance)
 
     def bridged_by(self, initial: RelativePose) -> PathPoint:
         """Return the next scan's point if that scan is placed by its initial pose."""
         covariance = se3.compose_covariance(self.bridge_covariance, initial.pose, initial.covariance)
-        return PathPoint(self.T_map_lidar @ initial.pose, None, True, covariance, self.map_changed)
+        return PathPoint(
+            self.T_map_lidar @ initial.pose, None, True, covariance, self.map_changed, self.weak_covariance
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +83,9 @@ class MatchingState:
         twist = se3.log(se3.between(T_map_previous, T_map_lidar)) / dt_s
         return cls(PathPoint(T_map_lidar, twist, map_changed=True), PathPoint(T_map_previous), keyframe=keyframe)
 
-    def matched(self, T_map_lidar: Array, dt_s: float, is_degenerate: bool, is_vague: bool) -> MatchingState:
+    def matched(
+        self, T_map_lidar: Array, dt_s: float, is_degenerate: bool, is_vague: bool, weak_covariance: Array | None = None
+    ) -> MatchingState:
         """Return the state after a scan that was matched.
 
         Args:
@@ -83,12 +93,15 @@ class MatchingState:
             dt_s: time since the last scan.
             is_degenerate: whether the scan leaves a direction unconstrained.
             is_vague: whether the initial pose is too uncertain to fill in for such a direction.
+            weak_covariance: ``(6, 6)`` of the pose along weak directions; None if there are none.
         """
+        weak = np.zeros((6, 6)) if weak_covariance is None else weak_covariance
         last = self.doubted or (None if self.current.bridged else self.current)
         twist = None
         if last is not None and not is_degenerate:
             twist = se3.log(se3.between(last.T_map_lidar, T_map_lidar)) / dt_s
-        return MatchingState(PathPoint(T_map_lidar, twist), self.current, adrift=is_degenerate and is_vague)
+        found = PathPoint(T_map_lidar, twist, weak_covariance=weak)
+        return MatchingState(found, self.current, adrift=is_degenerate and is_vague)
 
     def bridged(self, initial: RelativePose, first_keyframe: Array | None = None) -> MatchingState:
         """Return the state after a scan that could not be matched, placed by its initial pose.

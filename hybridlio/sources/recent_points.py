@@ -30,6 +30,11 @@ class RecentPoints:
         self._recent: list[tuple[Array, Array]] = []
 
     @property
+    def repeats(self) -> bool:
+        """Whether the lidar repeats its pattern, as far as is known."""
+        return self._repeats is not False
+
+    @property
     def is_filling(self) -> bool:
         """Whether scans fill each other's gaps, and there are still few of them."""
         return self._repeats is False and len(self._recent) < _SCANS

@@ -18,7 +18,6 @@ from hybridlio.core.motion_limits import (
 )
 from hybridlio.core.sensors import NS_PER_S, Frame, Scan
 from hybridlio.registration.degeneracy import ObservedRegistration, RegistrationProblem, register_with_degeneracy
-from hybridlio.registration.icp import Registration
 from hybridlio.registration.local_map import LocalMap
 from hybridlio.registration.motion_search import best_start, coarse_kernel_m, fits_better, motions
 from hybridlio.sources import map_errors
@@ -160,8 +159,13 @@ class ScanMatching:
         self, scan: ThinnedScan, initial: RelativePose, observed: ObservedRegistration, dt_s: float
     ) -> RelativePose:
         """Move the state on to the pose found and return the step to it."""
-        pose, before = observed.registration.pose, self._state.current
-        self._state = self._state.matched(pose, dt_s, bool(len(observed.degenerate)), _is_vague(initial))
+        pose, before, weak = observed.registration.pose, self._state.current, np.zeros((6, 6))
+        # A spinning lidar sees the same few trunks from scan to scan, so that its minima err alike: weighed so, the
+        # drift in an open field is a third larger.
+        if initial.from_imu and not self._recent.repeats:
+            predicted = before.predicted_covariance(initial)
+            pose, weak = observed.weighed_with(before.T_map_lidar @ initial.pose, predicted)
+        self._state = self._state.matched(pose, dt_s, bool(len(observed.degenerate)), _is_vague(initial), weak)
         self._recent.add(scan.points, pose)
         if self.settings.target == "last-scan" or self._state.adrift:
             self._state = self._state.keyframe_pending(scan.points)
@@ -178,7 +182,7 @@ class ScanMatching:
             source=self.name,
             drift=drift,
             degenerate=observed.degenerate,
-            details=_details(observed.registration, len(scan.points)),
+            details={"points": float(len(scan.points)), **observed.registration.diagnostics},
         )
 
     def _bridge(self, scan: ThinnedScan, initial: RelativePose, observed: ObservedRegistration | None) -> RelativePose:
@@ -199,7 +203,7 @@ class ScanMatching:
             ok=False,
             drift=drift,
             from_imu=initial.from_imu,
-            details=_details(observed.registration, points) if observed else {"points": float(points)},
+            details={"points": float(points), **(observed.registration.diagnostics if observed else {})},
         )
 
     @property
@@ -287,14 +291,3 @@ class ScanMatching:
 def _is_vague(pose: RelativePose) -> bool:
     """Whether a map of scans at such poses would show every object several times."""
     return pose.translation_sigma_m > VAGUE_TRANSLATION_SIGMA_M
-
-
-def _details(found: Registration, points: int) -> dict[str, float]:
-    return {
-        "points": float(points),
-        "matched": found.matched,
-        "iterations": float(found.iterations),
-        "converged": float(found.converged),
-        "sigma_m": found.sigma_m,
-        "cost": found.cost,
-    }
