@@ -5,13 +5,21 @@ from the IMU. With the gyroscope's bias ``b`` and a small rotation ``φ`` betwee
 
     ``g_k(δ) - b·Δt_k = Exp(φ)·u_k + e_k``.
 
-The errors ``e_k`` are those of the lidar's poses: a drift that adds up and a scatter that the next step takes back, so
-neighbouring steps are anticorrelated. Both are estimated from the residuals
-(:class:`~hybridlio.calibration.step_noise.StepNoise`). The offset of least weighted squares is the maximum of the
-likelihood, and the inverse of the normal matrix is its covariance. Errors of registration may also agree over many
-steps, on one wall or in one bend. The covariance is therefore the larger one of this and of the estimate that holds for
-any errors with a limited memory (Newey, West, "A simple, positive semi-definite, heteroskedasticity and autocorrelation
-consistent covariance matrix", Econometrica 55, 1987).
+The errors ``e_k`` are the gyroscope's noise and those of the lidar's poses: a drift that adds up and a scatter that the
+next step takes back, so neighbouring steps are anticorrelated. Both are estimated from the residuals
+(:class:`~hybridlio.calibration.step_noise.StepNoise`).
+
+The derivative of ``g_k`` by ``δ`` is a difference of two of the gyroscope's rates, and in calm motion holds as much
+noise as signal. Least squares would take the noise for information, and halve the standard deviation. The residuals are
+therefore made orthogonal to an instrument that is free of this noise (instrumental variables; Söderström, Stoica,
+"System Identification", 1989, chapter 8): the derivative that the lidar's own turns before and after a step give,
+``(u_{k-2} - 8 u_{k-1} + 8 u_{k+1} - u_{k+2}) / 12 Δt``. It is independent of the scatter in step ``k`` too, as it is
+antisymmetric.
+
+Errors of registration may also agree over many steps, on one wall or in one bend. The covariance is therefore the
+larger one of that of independent errors and of the estimate that holds for any errors with a limited memory (Newey,
+West, "A simple, positive semi-definite, heteroskedasticity and autocorrelation consistent covariance matrix",
+Econometrica 55, 1987).
 
 Axes of the lidar about which a step was not measured are left out: on open ground a scan's yaw stays where the
 registration began, and would show the motion that was proposed, not the lidar's.
@@ -168,18 +176,20 @@ class _Fit:
             if whole.sum() < _MIN_STEPS:
                 return None
             kept, joined, noise = self._weights(x, whole)
-            J = noise.whitened(joined, self._jacobian(x, kept))
+            J = self._jacobian(x, kept)
+            Z = noise.whitened(joined, self._instruments(J, kept))
+            J = noise.whitened(joined, J)
             residuals = noise.whitened(joined, self._residuals(x, kept)[:, :, None])
-            scores = (J * residuals).sum(axis=1)
-            normal = np.einsum("nai,naj->ij", J, J) + np.diag(self._prior)
+            scores = (Z * residuals).sum(axis=1)
+            normal = np.einsum("nai,naj->ij", Z, J) + np.diag(self._prior)
             gradient = scores.sum(axis=0) + self._prior * np.r_[0.0, x[1:]]
-            step = np.linalg.solve(normal + 1e-9 * np.diag(np.diag(normal)), gradient)
+            step = np.linalg.lstsq(normal, gradient, rcond=None)[0]
             step[0] = np.clip(step[0], -2 * _GRID_S, 2 * _GRID_S)
             x = x - step
             x[0] = np.clip(x[0], -largest_s, largest_s)
             if abs(step[0]) < _SETTLED_S:
                 break
-        sigmas = self._sigmas(normal, scores, kept)
+        sigmas = self._sigmas(normal, Z, scores, kept)
         at_zero = np.r_[0.0, x[1:]]
         return ClockOffset(
             float(x[0]), float(sigmas[0]), x[1:4], x[4:], sigmas[4:], int(kept.sum()),
@@ -187,14 +197,17 @@ class _Fit:
             float(np.sqrt(self._u[kept].var(axis=0).sum())), self._stated_rotation_ratio(x, kept),
         )  # fmt: skip
 
-    def _sigmas(self, normal: Array, scores: Array, kept: Mask) -> Array:
-        """Return the standard deviations ``(7,)``: of the weighted fit, or of errors that agree over some steps.
+    def _sigmas(self, normal: Array, instruments: Array, scores: Array, kept: Mask) -> Array:
+        """Return the standard deviations ``(7,)``: of independent errors, or of errors that agree over some steps.
 
         Args:
-            normal: ``(7, 7)`` normal matrix.
-            scores: ``(M, 7)`` derivatives of the steps' parts of the cost.
+            normal: ``(7, 7)`` products of instruments and derivatives.
+            instruments: ``(M, 3, 7)`` whitened.
+            scores: ``(M, 7)`` products of instruments and residuals.
             kept: ``(N,)`` the ``M`` steps.
         """
+        if not instruments[:, :, 0].any():
+            return np.full(7, np.inf)
         at = np.zeros((len(kept), 7))
         at[kept] = scores
         spread = at.T @ at + np.diag(self._prior)
@@ -202,7 +215,8 @@ class _Fit:
             product = at[lag:].T @ at[:-lag]
             spread += (1 - lag / (_MEMORY_STEPS + 1)) * (product + product.T)
         inverse = np.linalg.pinv(normal)
-        variances = np.maximum(np.diag(inverse), np.diag(inverse @ spread @ inverse))
+        independent = np.einsum("nai,naj->ij", instruments, instruments) + np.diag(self._prior)
+        variances = np.max([np.diag(inverse @ meat @ inverse.T) for meat in (independent, spread)], axis=0)
         variances[0] += _COMPENSATION_S**2
         return np.asarray(np.sqrt(variances))
 
@@ -236,6 +250,22 @@ class _Fit:
         turned = self._u[rows] @ se3.so3_exp(x[4:]).T
         J[:, :, 4:] = self._R.T @ se3.hat(turned)  # Exp(φ + dφ)·u ≈ Exp(φ)·u - hat(Exp(φ)·u)·dφ
         return np.asarray(J * self._measured[rows, :, None])
+
+    def _instruments(self, J: Array, rows: Mask) -> Array:
+        """Return the derivatives ``(M, 3, 7)`` with the offset's replaced by those of the lidar's turns.
+
+        They are 0 where a turn before or after is missing, an outlier, or not measured about the axis.
+        """
+        u = self._turns.rotvecs / self._turns.spans_s[:, None]
+        known = self._turns.measured & rows[:, None]
+        joined = np.r_[False, self._turns.joined, False]  # before each step, and after the last one
+        slopes, whole = np.zeros_like(u), np.zeros(u.shape, bool)
+        slopes[2:-2] = (u[:-4] - 8 * u[1:-3] + 8 * u[3:-1] - u[4:]) / 12
+        chain = joined[1:-4] & joined[2:-3] & joined[3:-2] & joined[4:-1]
+        whole[2:-2] = known[:-4] & known[1:-3] & known[3:-1] & known[4:] & chain[:, None]
+        Z = J.copy()
+        Z[:, :, 0] = -(slopes * whole)[rows] * self._turns.measured[rows]
+        return Z
 
     def _stated_rotation_ratio(self, x: Array, rows: Mask) -> float:
         stated, estimated = (self._variances(y, rows) for y in (np.r_[x[:4], np.zeros(3)], x))

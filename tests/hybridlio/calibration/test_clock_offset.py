@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybridlio.calibration.clock_offset import LEAST_OFFSET_S, ClockOffset, find_clock_offset
+from hybridlio.calibration.clock_offset import _COMPENSATION_S, LEAST_OFFSET_S, ClockOffset, find_clock_offset
 from hybridlio.calibration.turns import GyroPath, Turns
 from hybridlio.core import se3
 from hybridlio.core.sensors import ImuSamples
@@ -23,11 +23,20 @@ def rates(times_s: np.ndarray, planar: float = 0.1) -> np.ndarray:
 
 
 def recording(
-    rng: np.random.Generator, offset_s: float, seconds: float = 20.0, bias: float = 0.003, planar: float = 0.1
+    rng: np.random.Generator,
+    offset_s: float,
+    seconds: float = 20.0,
+    bias: float = 0.003,
+    planar: float = 0.1,
+    noise_rad_s: float = 1e-3,
+    share: float = 1.0,
 ) -> tuple[Turns, ImuSamples]:
-    """Return noisy turns of a lidar at 10 Hz, and a gyroscope at 100 Hz whose stamps are early by ``offset_s``."""
+    """Return noisy turns of a lidar at 10 Hz, and a gyroscope at 100 Hz whose stamps are early by ``offset_s``.
+
+    ``noise_rad_s`` is that of a sample, and ``share`` scales the motion.
+    """
     fine = np.arange(-1, seconds + 1, 2e-3)
-    true = ImuSamples(np.round(fine * 1e9).astype(np.int64), rates(fine, planar), np.zeros((len(fine), 3)))
+    true = ImuSamples(np.round(fine * 1e9).astype(np.int64), share * rates(fine, planar), np.zeros((len(fine), 3)))
     ends = np.arange(0, seconds, 0.1)
     R = [np.eye(3)]
     path = GyroPath(true, 0)
@@ -37,7 +46,7 @@ def recording(
     poses = se3.make(scattered @ MOUNTING, np.zeros(3))  # of the lidar
     imu = true.between(int(-0.9e9), int((seconds + 0.9) * 1e9))
     rows = slice(0, None, 5)
-    gyro = imu.gyro_rad_s[rows] + bias + rng.normal(0, 1e-3, imu.gyro_rad_s[rows].shape)
+    gyro = imu.gyro_rad_s[rows] + bias + rng.normal(0, noise_rad_s, imu.gyro_rad_s[rows].shape)
     stamps = imu.stamps_ns[rows] - round(offset_s * 1e9)
     turns = Turns.of(Trajectory(np.round(ends * 1e9).astype(np.int64), poses))
     return turns, ImuSamples(stamps, gyro, np.zeros_like(gyro))
@@ -71,10 +80,23 @@ def test_offset_rotation_and_bias_have_the_covariance_that_is_stated():
         tilt = se3.so3_exp(np.array([0.01, -0.02, 0.015]))
         result = found(*recording(rng, 0.02), R=tilt @ MOUNTING)
         back = se3.so3_log(se3.so3_exp(result.rotation_rad) @ tilt)
-        squares.append(np.r_[(result.offset_s - 0.02) / result.sigma_s, back / result.rotation_sigma_rad] ** 2)
+        sigma_s = np.sqrt(result.sigma_s**2 - _COMPENSATION_S**2)  # these turns come from no compensated scans
+        squares.append(np.r_[(result.offset_s - 0.02) / sigma_s, back / result.rotation_sigma_rad] ** 2)
     means = np.mean(squares, axis=0)
     assert (means > 0.4).all()
     assert (means < 1.9).all()
+
+
+@pytest.mark.parametrize("share", [0.1, 0.05])
+def test_the_noise_of_a_gyroscope_in_calm_motion_is_not_taken_for_information(share: float):
+    """With rates as small as the noise of a sample, least squares gives a third of the standard deviation."""
+    errors, sigmas = [], []
+    for seed in range(20):
+        result = found(*recording(np.random.default_rng(seed), 0.02, noise_rad_s=0.01, share=share))
+        errors.append(result.offset_s - 0.02)
+        sigmas.append(result.sigma_s)
+    assert 0.4 < np.mean(np.square(errors) / np.square(sigmas)) < 1.9
+    assert np.median(sigmas) > 1e-3
 
 
 def test_errors_that_agree_over_many_steps_are_in_the_standard_deviation():
