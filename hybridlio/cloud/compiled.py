@@ -36,7 +36,7 @@ def _announce_compilation() -> None:
     """Log once in a process that loops are being compiled, as Numba is silent for ten seconds and more."""
     from numba.core import event
 
-    class Announcer(event.Listener):  # type: ignore[misc]
+    class Announcer(event.Listener):
         is_announced = False
 
         def on_start(self, _event: object) -> None:
@@ -47,4 +47,4 @@ def _announce_compilation() -> None:
         def on_end(self, _event: object) -> None:
             pass
 
-    event.register("numba:compile", Announcer())
+    event.register("numba:compile", Announcer())  # type: ignore[no-untyped-call]

@@ -86,6 +86,11 @@ def voxel_labels(points: Floats, voxel_size_m: float) -> tuple[NDArray[np.int64]
     return rank.take(labels), len(order)
 
 
+def voxel_count(points: Floats, voxel_size_m: float) -> int:
+    """Return the number of voxels that hold any of the finite points ``(N, 3)``."""
+    return len(_unordered_keys(points, voxel_size_m)[1])
+
+
 def label_means(values: Floats, labels: NDArray[np.int64], count: int) -> Floats:
     """Return the mean ``(M, C)`` of the values ``(N, C)`` of each of ``count`` labels, which must all occur."""
     from hybridlio.cloud import voxel_loops  # late: compiled
@@ -131,7 +136,7 @@ def _size_for(points: Floats, count: int, tolerance: int, start_size_m: float) -
     fine: tuple[float, float] | None = None  # (log side, log of found / wanted) with too many voxels
     coarse: tuple[float, float] | None = None  # the same with too few
     while not (fine and coarse and coarse[0] - fine[0] < _BRACKET_CLOSED):
-        found = _count(points, size)
+        found = voxel_count(points, size)
         if abs(found - count) < best_miss:
             best, best_miss = size, abs(found - count)
         if best_miss <= tolerance or (found < count and size <= _FINEST_M) or (found > count and size >= _COARSEST_M):
@@ -150,6 +155,12 @@ def _size_for(points: Floats, count: int, tolerance: int, start_size_m: float) -
 
 def _unordered_labels(points: Floats, voxel_size_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Label points ``(N, 3)`` by their voxel, in any order; return also the labels ``(M,)`` in the voxels' order."""
+    labels, keys = _unordered_keys(points, voxel_size_m)
+    return labels, np.argsort(keys)
+
+
+def _unordered_keys(points: Floats, voxel_size_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Label points ``(N, 3)`` by their voxel, in any order; return also the voxels' keys ``(M,)``."""
     from hybridlio.cloud import voxel_loops  # late: compiled
 
     if not (math.isfinite(voxel_size_m) and voxel_size_m > 0):
@@ -159,8 +170,7 @@ def _unordered_labels(points: Floats, voxel_size_m: float) -> tuple[NDArray[np.i
         return np.empty(0, np.int64), np.empty(0, np.int64)
     low, high = voxel_loops.extent(points, side_m)
     nx, ny, _ = _cell_counts(low, high, voxel_size_m)
-    labels, keys = voxel_loops.label(points, side_m, low, ny, nx)
-    return labels, np.argsort(keys)
+    return voxel_loops.label(points, side_m, low, ny, nx)
 
 
 def _checked(points: ArrayLike, normals: ArrayLike | None) -> tuple[Floats, Floats | None]:
@@ -185,10 +195,6 @@ def _cell_counts(low: Floats, high: Floats, voxel_size_m: float) -> tuple[int, i
     if nx * ny * nz >= 1 << 62:
         raise ConfigError(f"voxels of {voxel_size_m} m are too small: the cloud's box holds {nx} x {ny} x {nz} of them")
     return nx, ny, nz
-
-
-def _count(points: Floats, voxel_size_m: float) -> int:
-    return voxel_labels(points, voxel_size_m)[1]
 
 
 def _unit(vectors: NDArray[np.float32] | NDArray[np.float64]) -> Floats:

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from hybridlio.cloud.voxel import voxel_average, voxel_pick
+from hybridlio.cloud.voxel import voxel_average, voxel_count, voxel_pick
 from hybridlio.core.arrays import Array, Floats, Mask
 from hybridlio.core.sensors import Scan
 from hybridlio.registration.local_map import LocalMap
@@ -62,15 +62,14 @@ def _pick_source(points: Array, scan: Scan, settings: ScanMatchingSettings) -> A
     Averages over few measured points are noisier, so more of them are needed for the same precision.
     """
     side_m, finest_m = settings.source_voxel_m, settings.map_voxel_m / 2
-    picked = voxel_pick(points, side_m)
     if len(scan) < _AMPLE * settings.least_measured:
         measured_per_point = np.count_nonzero(
             _in_range(np.einsum("ij,ij->i", scan.points, scan.points), settings)
         ) / max(len(points), 1)
-        while measured_per_point * len(picked) < settings.least_measured and side_m > finest_m:
+        single = points.astype(np.float32)  # what voxels are found of
+        while side_m > finest_m and measured_per_point * voxel_count(single, side_m) < settings.least_measured:
             side_m *= _VOXEL_SHRINKAGE
-            picked = voxel_pick(points, side_m)
-    return points.take(picked, axis=0)
+    return points.take(voxel_pick(points, side_m), axis=0)
 
 
 def _in_range(range2: Array | Floats, settings: ScanMatchingSettings) -> Mask:

@@ -81,8 +81,8 @@ def test_the_count_is_met_within_its_tolerance(seed, count, tolerance):
 
 def test_the_search_for_a_side_takes_few_passes(monkeypatch):
     passes = []
-    counted = voxel._count
-    monkeypatch.setattr(voxel, "_count", lambda *a: passes.append(1) or counted(*a))
+    counted = voxel.voxel_count
+    monkeypatch.setattr(voxel, "voxel_count", lambda *a: passes.append(1) or counted(*a))
     voxel_to_count(street(0))
     assert len(passes) <= 8
 
