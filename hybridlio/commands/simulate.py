@@ -106,10 +106,13 @@ def simulate(
     """
     from hybridlio.simulation.choices import Scene
 
-    common = {"seconds": seconds, "seed": seed, "scene": scene, "lidar": lidar, "start_moving": not start_at_rest}
+    common = {
+        "seconds": seconds, "seed": seed, "scene": scene, "lidar": lidar, "start_moving": not start_at_rest,
+        "drive_seed": drive_seed,
+    }  # fmt: skip
     road = {
         "length_m": length_m, "speed_m_s": speed, "driving": driving, "gps": gps, "loops": loops, "poses": poses,
-        "poses_frame": poses_frame, "motion_distortion": distortion, "drive_seed": drive_seed,
+        "poses_frame": poses_frame, "motion_distortion": distortion,
         "rain_mm_h": rain, "dust_per_km": dust,
     }  # fmt: skip
     body = {"platform": platform, "imu": imu, "people": people}

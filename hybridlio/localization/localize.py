@@ -116,12 +116,10 @@ def localize(
         progress: called after each scan.
 
     Raises:
-        DataError: the map cannot be read, or needs a start.
+        DataError: the map cannot be read.
         EstimationError: the recording's place in the map was not found.
     """
     prior = prior if isinstance(prior, PriorMap) else open_prior_map(prior)
-    if start is None:
-        prior.require_places()
     config = adapt_config(sequence, config or Config())
     followed = MapOdometry(Odometry(config=config), prior, start, settings)
     run = run_odometry(sequence, followed, progress)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,11 +17,14 @@ from hybridlio.localization.fusion import UncertainPose
 from hybridlio.localization.map_matching import MapMatch, MapMatchingSettings, match_with_map
 from hybridlio.localization.prior_map import PriorMap
 from hybridlio.localization.recent_path import RecentPath
+from hybridlio.localization.view_places import ViewPlaces
 from hybridlio.record.loop_keyframes import LoopKeyframeSettings
 from hybridlio.smoothing.loop_verification import VerificationSettings
+from hybridlio.smoothing.places import levelling_rotations
 from hybridlio.smoothing.step_uncertainty import drift_of
+from hybridlio.sources.scene_scale import scale_of, scaled
 from hybridlio.sources.settings import ScanMatchingSettings
-from hybridlio.sources.thinned_scan import thin
+from hybridlio.sources.thinned_scan import ThinnedScan, thin
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,22 @@ class LocalizationSettings:
         check_positive(self, "odometry_scale", "sure_m")
         check_setting(self, "inlier_share", 0 < self.inlier_share < 1, "above 0 and below 1")
 
+    def at_scale(self, scale: float) -> LocalizationSettings:
+        """Return the settings for scenes of a scale: below 1, in rooms, lengths shrink."""
+        thinning, keyframes, confirmation = scaled(self.thinning, scale), self.keyframes, self.confirmation
+        return replace(
+            self,
+            matching=replace(self.matching, scale=scale, registration=thinning.registration),
+            thinning=thinning,
+            keyframes=replace(keyframes, spacing_m=scale * keyframes.spacing_m, voxel_m=scale * keyframes.voxel_m),
+            confirmation=replace(
+                confirmation,
+                distance_m=scale * confirmation.distance_m,
+                max_difference_m=scale * confirmation.max_difference_m,
+            ),
+            sure_m=scale * self.sure_m,
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class MapPose:
@@ -83,16 +102,26 @@ class Localizer:
     """
 
     def __init__(self, prior: PriorMap, settings: LocalizationSettings | None = None) -> None:
-        self.settings = settings or LocalizationSettings()
-        self._prior = prior
-        self._confirmation = Confirmation(self.settings.confirmation)
-        self._path = RecentPath(self.settings.keyframes, VerificationSettings().reach_m)
+        self._use(prior, settings or LocalizationSettings())
+        self._scale: float | None = None  # of the scene, by the first scan
         self._bound = chi_square_quantile(self.settings.inlier_share, 6)
         self._last: UncertainPose | None = None
         self._last_pose: Array | None = None
         self._is_given = False  # the user vouches for a given start, until the map holds
         self._travelled_m = 0.0
         self._held_at_m = -np.inf
+
+    def _use(self, prior: PriorMap, settings: LocalizationSettings) -> None:
+        self._prior, self.settings = prior, settings
+        self._views = ViewPlaces(prior.surface, prior.up, settings.matching)
+        self._confirmation = Confirmation(settings.confirmation)
+        self._path = RecentPath(settings.keyframes, settings.matching.scale * VerificationSettings().reach_m)
+
+    def _begin(self, scan: Scan) -> None:
+        """Take map and settings that suit the scene of the first scan."""
+        self._scale = scale_of(thin(scan, self.settings.thinning).view_m)
+        if self._scale < 1.0:
+            self._use(self._prior.at_scale(self._scale), self.settings.at_scale(self._scale))
 
     def start(self, at: UncertainPose, pose: Array) -> None:
         """Begin at a pose in the map.
@@ -112,17 +141,18 @@ class Localizer:
             step: the odometry's step from the last scan.
             up: ``(3,)`` in the odometry's world.
         """
+        if self._scale is None:
+            self._begin(scan)
         predicted = self._predict(pose, step)
         is_keyframe = self._path.add(scan, pose, step)
-        match = None
+        match, thinned = None, thin(scan, self.settings.thinning)
         if predicted is not None:
-            thinned = thin(scan, self.settings.thinning)
             is_vague = predicted.sigma_m > self.settings.sure_m
             match = match_with_map(self._prior.surface, thinned, predicted, self.settings.matching, is_vague)
             self._last, held = self._corrected(predicted, match, pose)
             if held:
                 return self._hold(self._last, match)
-        if is_keyframe and self._is_lost and (found := self._recognised(pose, up)) is not None:
+        if is_keyframe and self._is_lost and (found := self._recognised(thinned, pose, up)) is not None:
             return self._hold(found, match)
         return None if self._last is None else MapPose(self._last, False, match)
 
@@ -161,13 +191,16 @@ class Localizer:
         vote = Vote(found.pose @ se3.inverse(pose), pose, self._travelled_m, found.covariance)
         return self._confirmation.add(vote)
 
-    def _recognised(self, pose: Array, up: Array) -> UncertainPose | None:
+    def _recognised(self, scan: ThinnedScan, pose: Array, up: Array) -> UncertainPose | None:
         """Return the pose in the map by place recognition, once confirmed."""
-        if self._prior.places is None:
-            return None
+        return next((one for one in self._candidates(scan, pose, up) if self._confirmed(one, pose)), None)
+
+    def _candidates(self, scan: ThinnedScan, pose: Array, up: Array) -> list[UncertainPose]:
+        """Return where the scan, a keyframe, may be: by the places of the map, or by its views."""
+        places = self._prior.places
+        if places is None:
+            match = self._views.recognise(scan, levelling_rotations(pose[None], up)[0])
+            return [] if match is None else [match.found]
         around = self._path.places(up)
-        for one in self._prior.places.recognise(around, len(around) - 1):
-            found = UncertainPose(self._prior.places.poses[one.place] @ one.verdict.pose, one.verdict.covariance)
-            if self._confirmed(found, pose):
-                return found
-        return None
+        found = places.recognise(around, len(around) - 1)
+        return [UncertainPose(places.poses[one.place] @ one.verdict.pose, one.verdict.covariance) for one in found]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
@@ -40,6 +40,7 @@ class MapMatchingSettings:
             in question: ground fits ground anywhere. From 40 wrong starts the least cost was 0.73, from right ones at
             most 0.23 (simulated towns 9501 and 9502).
         covariance_scale: factor on the covariance of independent residuals, as in scan matching.
+        scale: of the scene; in rooms below 1, and starts of a search are as much nearer to each other.
         map_sigmas: errors of the map at one place, in rad and m, of which a scan's points see the same ones.
         registration: kernel, distances, limits.
 
@@ -54,11 +55,12 @@ class MapMatchingSettings:
     min_matched_above: float = 0.7
     max_cost_above: float = 0.5
     covariance_scale: float = 5.0
+    scale: float = 1.0
     map_sigmas: tuple[float, float] = (2e-4, 0.005)
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
 
     def __post_init__(self) -> None:
-        check_positive(self, "covariance_scale")
+        check_positive(self, "covariance_scale", "scale")
         check_not_negative(self, "min_points", "min_above_ground")
         check_fraction(self, "min_matched", "max_cost", "min_matched_above", "max_cost_above")
 
@@ -99,9 +101,9 @@ def match_with_map(
     surface = map_surface.around(predicted.pose[:3, 3])
     if surface is None or len(scan.points) < settings.min_points:
         return None
-    start, kernel_start_m = predicted.pose, _kernel_start_m(predicted, settings.registration)
+    start, kernel_start_m = predicted.pose, _kernel_start_m(predicted, settings)
     if kernel_start_m >= settings.registration.max_distance_m:
-        start = _search(surface, scan, predicted, settings.registration)
+        start = _search(surface, scan, predicted, settings)
     problem = RegistrationProblem(surface, scan.source, settings.registration, scan.points)
     observed = register_with_degeneracy(problem, start, kernel_start_m)
     found = observed.registration
@@ -111,20 +113,23 @@ def match_with_map(
     return MapMatch(UncertainPose(found.pose, covariance), found.matched, found.cost, holds)
 
 
-def _kernel_start_m(predicted: UncertainPose, settings: RegistrationSettings) -> float:
-    sideways_m = _LEVER_M * float(np.sqrt(predicted.covariance[:3, :3].trace()))
-    return min(max(settings.kernel_m, predicted.sigma_m, sideways_m), settings.max_distance_m)
+def _kernel_start_m(predicted: UncertainPose, settings: MapMatchingSettings) -> float:
+    sideways_m = settings.scale * _LEVER_M * float(np.sqrt(predicted.covariance[:3, :3].trace()))
+    registration = settings.registration
+    return min(max(registration.kernel_m, predicted.sigma_m, sideways_m), registration.max_distance_m)
 
 
-def _search(surface: Surface, scan: ThinnedScan, predicted: UncertainPose, settings: RegistrationSettings) -> Array:
+def _search(surface: Surface, scan: ThinnedScan, predicted: UncertainPose, settings: MapMatchingSettings) -> Array:
     """Return the best start within twice the standard deviations of a prediction."""
     sigmas = np.sqrt(np.diag(predicted.covariance))
-    reach = np.minimum(2 * sigmas[[2, 3, 4]], _SEARCHED)
-    counts = np.minimum(2 * np.ceil(reach / _SEARCH_STEPS).astype(int) + 1, _MAX_STEPS)
+    lengths = np.array([1.0, settings.scale, settings.scale])
+    reach = np.minimum(2 * sigmas[[2, 3, 4]], lengths * _SEARCHED)
+    counts = np.minimum(2 * np.ceil(reach / (lengths * _SEARCH_STEPS)).astype(int) + 1, _MAX_STEPS)
     grids = (np.linspace(-most, most, count) for most, count in zip(reach, counts, strict=True))
     starts = [predicted.pose @ se3.exp(np.array([0, 0, yaw, x, y, 0])) for yaw, x, y in product(*grids)]
     few, sparse = scan.source[::_JUDGED_STRIDE], scan.source[::_SPARSE]
-    found = refine_best(surface, few, sparse, starts, settings, _SEARCH)
+    search = replace(_SEARCH, kernel_m=settings.scale * _SEARCH.kernel_m)
+    found = refine_best(surface, few, sparse, starts, settings.registration, search)
     return min(found, key=lambda one: one.cost).pose
 
 

@@ -13,7 +13,6 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.files import UNREADABLE_NPZ, user_path
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.points.point_files import SUFFIXES, read_columns
-from hybridlio.localization.map_surface import MapSurface
 from hybridlio.localization.prior_map import PriorMap
 from hybridlio.localization.run_places import RunPlaces
 from hybridlio.record.loop_keyframes import LoopKeyframes
@@ -26,7 +25,7 @@ def open_prior_map(path: str | Path) -> PriorMap:
     """Open a map: a run folder (smoothed or not), or a ``.ply``, ``.pcd``, ``.las``, ``.laz`` or ``.npz`` file.
 
     A run folder's map consists of its keyframes, which also are the places by which a run is found in it. A file has
-    points only, with z up; a run in it needs a start.
+    points only; its floors tell which way is up, and views of it its places.
 
     Raises:
         DataError: there is no run or no readable file of points.
@@ -34,7 +33,7 @@ def open_prior_map(path: str | Path) -> PriorMap:
     path = user_path(path)
     if path.is_dir():
         return map_of_run(path)
-    return PriorMap(MapSurface(_points(path)))
+    return PriorMap.of(_points(path))
 
 
 def map_of_run(folder: Path) -> PriorMap:
@@ -64,7 +63,7 @@ def map_of_record(record: Record, trajectory: Trajectory | None = None) -> Prior
     run = RunPlaces.of(record, trajectory)
     keyframes = run.keyframes
     points = [se3.transform(pose, keyframes.points(k)) for k, pose in enumerate(run.map_places.poses)]
-    return PriorMap(MapSurface(np.concatenate(points)), run.map_places, up_of(record))
+    return PriorMap.of(np.concatenate(points), run.map_places, up_of(record))
 
 
 def _points(path: Path) -> Array:

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hybridlio.cloud.voxel import voxel_pick
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError, EstimationError
 from hybridlio.core.sensors import Scan
 from hybridlio.localization.fusion import UncertainPose
 from hybridlio.localization.prior_map import PriorMap
+from hybridlio.localization.viewpoints import GROUND_RADIUS_M, ground_m
 from hybridlio.smoothing.places import levelling_rotations
 
 Start = Sequence[float]  # x, y (metres) and yaw (radians) in the map frame
@@ -20,9 +20,6 @@ Start = Sequence[float]  # x, y (metres) and yaw (radians) in the map frame
 # What a click on a map gives: some metres and degrees. Height and inclination come from ground and gravity.
 _POSITION_SIGMA_M, _YAW_SIGMA_RAD = 1.5, np.deg2rad(5.0)
 _HEIGHT_SIGMA_M, _TILT_SIGMA_RAD = 0.5, np.deg2rad(2.0)
-_GROUND_RADIUS_M = 10.0  # about the start; a lidar of 16 beams on a car sees its first ring of the ground at 7 m
-_GROUND_PERCENTILE = 10.0  # of the heights there: below cars and kerbs, above stray points
-_GROUND_VOXEL_M = 0.3  # so that near rings do not outnumber the others
 
 
 def check_start(start: Start) -> tuple[float, float, float]:
@@ -56,20 +53,12 @@ def start_pose(prior: PriorMap, scan: Scan, up: Array, start: Start) -> Uncertai
     T_level_lidar, T_level_map = (levelling_rotations(np.eye(4)[None], one)[0] for one in (up, prior.up))
     turned = se3.make(se3.so3_exp([0.0, 0.0, yaw]), np.zeros(3)) @ T_level_lidar
     pose = se3.inverse(T_level_map) @ turned
-    own = _ground_m(se3.transform(T_level_lidar, scan.points.astype(np.float64)), np.zeros(2))
+    own = ground_m(se3.transform(T_level_lidar, scan.points.astype(np.float64)), np.zeros(2))
     at = np.array([x, y, 0.0])
-    there = _ground_m(prior.surface.points, at[:2])
+    there = ground_m(prior.surface.points, at[:2])
     if np.isnan(there) or np.isnan(own):
         where = "map" if np.isnan(there) else "scan"
-        raise EstimationError(f"the {where} has no points within {_GROUND_RADIUS_M:g} m of the start ({x:g}, {y:g})")
+        raise EstimationError(f"the {where} has no points within {GROUND_RADIUS_M:g} m of the start ({x:g}, {y:g})")
     pose[:3, 3] = [x, y, there - own]
     sigmas = np.array([_TILT_SIGMA_RAD] * 2 + [_YAW_SIGMA_RAD] + [_POSITION_SIGMA_M] * 2 + [_HEIGHT_SIGMA_M])
     return UncertainPose(pose, se3.rotate_covariance(np.diag(sigmas**2), se3.inverse(T_level_lidar)))
-
-
-def _ground_m(points: Array, xy: Array) -> float:
-    """Return the height of the ground about a position ``(2,)``; NaN without points."""
-    near = points[np.hypot(*(points[:, :2] - xy).T) < _GROUND_RADIUS_M]
-    if not len(near):
-        return float("nan")
-    return float(np.percentile(near[voxel_pick(near, _GROUND_VOXEL_M), 2], _GROUND_PERCENTILE))

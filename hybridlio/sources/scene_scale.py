@@ -119,6 +119,13 @@ class SceneScale:
         return True
 
 
+def scale_of(view_m: float) -> float:
+    """Return the scale, at most 1, of the scene of one scan by its view, rounded to a step; 1 without a view."""
+    if not view_m > 0:
+        return 1.0
+    return float(_STEP ** -min(max(round(math.log(_STREET_VIEW_M / view_m, _STEP)), 0), _STEPS))
+
+
 class _Smoothed:
     """A running mean that forgets."""
 

@@ -76,8 +76,6 @@ def localize(
     frames = common.range_of(frames, None, n_scans)
     recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle, topics, rate).every(every)
     prior = open_prior_map(map_)
-    if place is None:
-        prior.require_places()
     recording = common.check_data(recording, check)
     with new_run_folder(recording.name, out, overwrite, data) as folder:
         with progress("localising") as report:

@@ -25,6 +25,8 @@ class PlatformConfig(BaseModel):
         seconds: duration.
         seed: of scene, motion, mounts and noise.
         people: number of people who walk around the sensor.
+        drive_seed: of motion, mounts and noise, by default ``seed``. Another one is another walk or ride
+            through the same scene.
         start_moving: start in motion instead of standing for the first second.
     """
 
@@ -37,6 +39,7 @@ class PlatformConfig(BaseModel):
     seconds: float = Field(default=DEFAULT_SECONDS, ge=0.5, le=3600.0, allow_inf_nan=False)
     seed: int = Field(default=1, ge=0)
     people: int = Field(default=0, ge=0, le=1000)
+    drive_seed: int | None = Field(default=None, ge=0)
     start_moving: bool = True
 
     @model_validator(mode="before")
@@ -59,4 +62,10 @@ class PlatformConfig(BaseModel):
     @property
     def name(self) -> str:
         """The name of the recording's folder."""
-        return f"{self.scene}-{self.platform}-{self.lidar}-{self.seed}"
+        again = "" if self.drive_seed is None else f"-{self.drive_seed}"
+        return f"{self.scene}-{self.platform}-{self.lidar}-{self.seed}{again}"
+
+    @property
+    def own_seed(self) -> int:
+        """Seed of what differs between two rides through one scene."""
+        return self.seed if self.drive_seed is None else self.drive_seed

@@ -71,7 +71,7 @@ class PlatformRecording:
         """Simulate the IMU's samples, with errors."""
         lead = round(_LEAD_S * IMU_RATE_HZ)
         ticks = np.arange(-lead, round(self.scan_times_s[-1] * IMU_RATE_HZ) + lead + 1)
-        rng = np.random.default_rng([self.config.seed, RandomStream.IMU])
+        rng = np.random.default_rng([self.config.own_seed, RandomStream.IMU])
         noise = IMU_GRADES[self.config.imu]
         gyro, accel = add_noise(*ideal_imu(self.path, ticks / IMU_RATE_HZ), noise, IMU_RATE_HZ, rng)
         return ImuSamples(START_NS + ticks * (NS_PER_S // IMU_RATE_HZ), gyro, accel)
@@ -82,7 +82,7 @@ class PlatformRecording:
         pattern = scanner.sweep(start_s)
         times = start_s + pattern.column_offset_ns / NS_PER_S
         hits = first_hits(self.rays, self.people, pattern, self.lidar_poses(times), times)
-        rng = np.random.default_rng([self.config.seed, RandomStream.SCAN, index])
+        rng = np.random.default_rng([self.config.own_seed, RandomStream.SCAN, index])
         return measure(hits, pattern, scanner.model, int(self.scan_stamps_ns[index]), True, rng)
 
 
@@ -92,14 +92,14 @@ def plan(config: PlatformConfig) -> PlatformRecording:
     length = body.speed_m_s * (config.seconds + 4 * _MARGIN_S)
     scene = SCENES[config.scene].build(np.random.default_rng([config.seed, RandomStream.SCENE]), length)
     times = times_of(config.seconds, _LEAD_S + _MARGIN_S)
-    motion = np.random.default_rng([config.seed, RandomStream.MOTION])
+    motion = np.random.default_rng([config.own_seed, RandomStream.MOTION])
     mount = body_poses(scene, body, times, config.start_moving, motion)
-    T_mount_lidar, T_mount_imu = _mounts(body, np.random.default_rng([config.seed, RandomStream.MOUNT]))
+    T_mount_lidar, T_mount_imu = _mounts(body, np.random.default_rng([config.own_seed, RandomStream.MOUNT]))
     rate_hz = SCANNERS[config.lidar].model.rate_hz
     scans = np.arange(max(round(config.seconds * rate_hz), 2)) / rate_hz
     T_imu_lidar = se3.between(T_mount_imu, T_mount_lidar)
     path, rays = SmoothPath.through(times, mount @ T_mount_imu), scene.rays()
-    people = people_around(rays, path, config.seconds, config.people, config.seed)
+    people = people_around(rays, path, config.seconds, config.people, config.own_seed)
     return PlatformRecording(config, scene, path, T_imu_lidar, scans, rays, people)
 
 
