@@ -2,8 +2,12 @@
 
 The scans are compensated for motion by the calibration that is to be found, and a wrong one bends the path that they
 give. So odometry and smoothing with the calibration as variables are repeated, each time with the calibration of the
-last round. The error of the clocks falls slowly (to 0.4 of itself in each round in a simulated office, to 0.85 on
-a simulated campus), so the start matters: the check of a recording finds the clocks within a millisecond.
+last round.
+
+A round does not show all of an error of the clock, because the scans that it is compared with were compensated by the
+same clock: between 0.15 and 0.6 of it in simulated scenes. So what a round finds is divided by that share, which is the
+slope between rounds at different clocks (secant method). Its standard deviation is divided too, and else would claim
+two to seven times too much. Where the rounds' clocks are too close for a slope, one round is made beside them.
 """
 
 from __future__ import annotations
@@ -28,9 +32,13 @@ from hybridlio.runs.recording_check import compare_imu
 from hybridlio.runs.run import run_odometry
 from hybridlio.smoothing.calibration import OF_GPS, OF_IMU, Calibrated, CalibrationPriors, Parameter
 
-_MOST_ROUNDS = 5
+_NEWEST = 3  # rounds that give the slope: earlier ones had another mounting
+_MOST_ROUNDS = 6  # one of them beside the others, for the share of an error that a round shows
 _SETTLED = 0.5  # standard deviations by which a round may still change a parameter and be the last
-_LARGEST_RATIO = 0.9  # of two rounds' changes that is extrapolated: the sum to come is then nine times the last
+_LEAST_SHARE = 0.1  # of a clock's error that a round shows: less cannot be told from noise
+# Beside the clock that a round found: ten times its usual standard deviation, so that the slope is known to a tenth,
+# and a twentieth of the time between two scans, over which motion hardly changes.
+_PROBE_S = 5e-3
 _CLOCK = "gps_clock"  # which is found anew in every round
 _LEAST_SCANS = 100  # ten seconds; fewer seldom determine a rotation to a degree
 
@@ -79,7 +87,9 @@ class _Search:
         self._priors, self._config, self._report = priors, config, report
         self._stated_offset_s = sequence.imu_time_offset_s or 0.0  # the reader has applied it
         self._offset_s = 0.0  # added to the stamps of the samples since
-        self._last_found_s = 0.0
+        self._rounds: list[tuple[float, float]] = []  # clock of a round, and the change that it found
+        self._best_s = 0.0  # the clock that the rounds so far mean
+        self._share = 1.0  # of a clock's error that a round shows
         self._found: Calibrated | None = None
 
     def start(self) -> None:
@@ -98,6 +108,7 @@ class _Search:
             self._offset_s = offset.offset_s  # which check.imu has
         elif offset is not None and offset.is_determined and "time_offset" in self._priors.names:
             self._move(offset.offset_s)
+        self._best_s = self._offset_s
 
     def round(self, number: int) -> bool:
         """Run odometry and smoothing once; return whether the calibration has settled."""
@@ -114,16 +125,38 @@ class _Search:
         smoothed = smooth(record, gps=uses_gps, calibrate=self._priors)
         found: Calibrated = smoothed.found["calibration"]
         self._now = replace(self._now, calibration=found.calibration)
-        found_s = found.imu_time_offset_s
-        move_s = found_s + _to_come(self._last_found_s, found_s)
-        self._move(move_s)
-        self._last_found_s = found_s
-        moves = {one.name: one.change for one in found.parameters if one.name != _CLOCK}
-        if "time_offset" in moves:
-            moves["time_offset"] = np.array([move_s])
-        self._found = replace(found, parameters=tuple(self._against_stated(one, moves) for one in found.parameters))
         sigmas = {one.name: one.sigmas for one in found.parameters}
-        return all(bool((np.abs(move) <= _SETTLED * sigmas[name]).all()) for name, move in moves.items())
+        moves = {one.name: one.change for one in found.parameters if one.name != _CLOCK}
+        is_probed = True
+        if "time_offset" in moves:
+            is_probed = self._take_clock(found.imu_time_offset_s, float(sigmas["time_offset"][0]))
+            moves["time_offset"] = np.array([self._offset_s - self._best_s])
+            self._best_s = self._offset_s
+            found = replace(found, parameters=tuple(map(self._widened, found.parameters)))
+            sigmas["time_offset"] = sigmas["time_offset"] / self._share
+        self._found = replace(found, parameters=tuple(self._against_stated(one, moves) for one in found.parameters))
+        settled = all(bool((np.abs(move) <= _SETTLED * sigmas[name]).all()) for name, move in moves.items())
+        if settled and not is_probed and number < _MOST_ROUNDS - 1:
+            self._move(_PROBE_S)
+            return False
+        return settled and is_probed
+
+    def _take_clock(self, found_s: float, sigma_s: float) -> bool:
+        """Move to the clock that a round's finding means; return whether rounds at different clocks show its share."""
+        self._rounds.append((self._offset_s, found_s))
+        clocks, changes = np.array(self._rounds[-_NEWEST:]).T
+        is_probed = bool(np.ptp(clocks) > _PROBE_S / 2 and np.ptp(clocks) > 10 * sigma_s)
+        if is_probed:
+            slope = -float(np.polyfit(clocks, changes, 1)[0])
+            self._share = float(np.clip(slope, _LEAST_SHARE, 1.0))
+        self._move(found_s / self._share)
+        return is_probed
+
+    def _widened(self, found: Parameter) -> Parameter:
+        """Return the clock with the variance of what a round finds, divided by the share that it shows."""
+        if found.name != "time_offset":
+            return found
+        return replace(found, covariance=found.covariance / self._share**2)
 
     def result(self) -> Calibrated:
         """Return what the last round found."""
@@ -147,12 +180,6 @@ class _Search:
         moved_by = moves.get(found.name, np.zeros_like(found.change))
         spread = found.covariance + np.outer(moved_by, moved_by)
         return replace(found, change=np.asarray(total), covariance=spread)
-
-
-def _to_come(before: float, now: float) -> float:
-    """Return the sum of all further changes, if they shrink by the ratio of the last two (Aitken)."""
-    ratio = now / before if before else 0.0
-    return now * ratio / (1 - ratio) if 0 < ratio < _LARGEST_RATIO else 0.0
 
 
 def _silent(stage: str, done: int, total: int) -> None:

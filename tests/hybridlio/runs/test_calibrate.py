@@ -13,7 +13,9 @@ from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.sensors import ImuSamples
 from hybridlio.datasets.calibration_yaml import read_calibration_yaml
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.smoothing.calibration import Calibrated
+from hybridlio.odometry.config import Config
+from hybridlio.runs.calibrate import _Search
+from hybridlio.smoothing.calibration import OF_IMU, Calibrated, CalibrationPriors, Parameter
 
 OFFSET_S = 0.03  # to add to the samples' stamps
 
@@ -64,3 +66,17 @@ def test_a_recording_without_what_is_needed_is_refused(wrong: Sequence):
         hl.calibrate(dataclasses.replace(wrong, imu=ImuSamples.empty()))
     with pytest.raises(ConfigError, match="lever_arm needs GPS fixes"):
         hl.calibrate(wrong, ("lever_arm",))
+
+
+@pytest.mark.parametrize("share", [0.15, 0.4, 1.0])
+def test_a_round_that_shows_a_share_of_the_clocks_error_is_divided_by_it(wrong: Sequence, share: float):
+    """Compensation by a wrong clock hides a part of its error; the rounds' slope shows which."""
+    search, true_s, sigma_s = _Search(wrong, CalibrationPriors(OF_IMU), Config(), lambda *_: None), 0.003, 1e-4
+    found = Parameter("time_offset", np.zeros(1), np.array([[sigma_s**2]]), 0.1, np.empty((0, 1)))
+    for beside_s in (0.0, 0.0, 5e-3):  # two rounds near one another, and one beside the clock that they mean
+        search._take_clock(share * (true_s - search._offset_s), sigma_s)
+        search._move(beside_s)
+    assert search._take_clock(share * (true_s - search._offset_s), sigma_s)
+    assert search._share == pytest.approx(share, rel=0.01)
+    assert search._offset_s == pytest.approx(true_s, abs=1e-8)
+    assert search._widened(found).sigmas[0] == pytest.approx(sigma_s / share, rel=0.01)
