@@ -165,10 +165,14 @@ class Pipeline:
             self.initial_pose.correct(frame, step)
 
     def lidar_pose(self, state: State) -> tuple[Array, Array]:
-        """Return the state's lidar pose ``(4, 4)`` in the first scan's frame, and its covariance ``(6, 6)``."""
+        """Return the state's lidar pose ``(4, 4)`` in the first scan's frame, and its covariance ``(6, 6)``.
+
+        The covariance is the graph's, and what the gate doubts.
+        """
         T_imu_lidar = self.calibration.T_imu_lidar
         T_lidar_imu = se3.inverse(T_imu_lidar)
         covariance = se3.rotate_covariance(state.covariance[:6, :6], T_lidar_imu)
+        covariance = covariance + np.diag(np.r_[np.zeros(3), np.full(3, self.gate.doubt_m2)])
         return T_lidar_imu @ state.T_world_imu @ T_imu_lidar, covariance
 
     def inertial_state(self, state: State) -> InertialState | None:

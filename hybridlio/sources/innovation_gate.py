@@ -8,6 +8,9 @@ A difference alone does not tell which side is wrong. The scans do, because each
 if the path that they found is smooth while the IMU contradicts two steps of it in a row, the IMU is wrong. If the path
 jumps, or moves on beside its jump as the IMU predicts, the scan is. Scans that leave a direction unconstrained, as
 those of a narrow lidar on open ground do, drift smoothly and are no judges of the IMU.
+
+Where neither is shown to be right, because scans that are believed without the IMU move abruptly and contradict it
+grossly, as after a false start, the position is doubted: see :attr:`InnovationGate.doubt_m2`.
 """
 
 from __future__ import annotations
@@ -119,6 +122,10 @@ class InnovationGate:
 
     Args:
         takes_back: whether the residual source can take a scan back, so that the path continues by the bridge.
+
+    Attributes:
+        doubt_m2: variance of the position, per axis, by which poses may be wrong beside what the graph knows: scans and
+            IMU have contradicted each other, and neither was shown to be right.
     """
 
     def __init__(self, takes_back: bool = True) -> None:
@@ -126,6 +133,9 @@ class InnovationGate:
         self._steps = 0
         self._rejected_in_a_row = 0
         self._undecided = False
+        self._accepted_in_a_row = 0
+        self.doubt_m2 = 0.0
+        self._unconfirmed_m = 0.0  # length of the path since the IMU last confirmed it
         self._motion = MotionChange()
         self._determined_in_a_row = 0  # scans until now that constrain every direction
         # the last scan, where it was found, in the pose that the source's path has for it; None if they are the same
@@ -160,6 +170,9 @@ class InnovationGate:
             relative, result = measured, GateResult("IMU left out", nis)
         else:
             relative, result = self._tested(measured, own, predicted, bridge, dt_s)
+        self._note_path(own, result)
+        if result.verdict in ("untested", "IMU left out") and self._is_doubtful(own, predicted, dt_s):
+            self.doubt_m2, self._unconfirmed_m = self.doubt_m2 + self._unconfirmed_m**2, 0.0
         if measured.ok and result.verdict in _MOVES_ON:
             # the IMU confirms the path: then the step to this scan is from the bridge, not from a scan found wrongly
             step = measured.pose if result.verdict == "accepted" else own.pose
@@ -168,6 +181,23 @@ class InnovationGate:
         taken_back = result.takes_back and self._takes_back
         self._found = se3.between(bridge.pose, measured.pose) if taken_back else None
         return relative, result
+
+    def _note_path(self, own: RelativePose, result: GateResult) -> None:
+        """Add the step to the path that the IMU has not confirmed; it confirms the path by agreeing for a while."""
+        self._accepted_in_a_row = self._accepted_in_a_row + 1 if result.verdict == "accepted" else 0
+        self._unconfirmed_m += float(np.linalg.norm(own.pose[:3, 3])) if own.ok else 0.0
+        if self._accepted_in_a_row >= WARM_UP_STEPS:
+            self._unconfirmed_m = 0.0
+
+    def _is_doubtful(self, own: RelativePose, predicted: RelativePose | None, dt_s: float) -> bool:
+        """Whether scans that are believed without the IMU contradict it grossly, and move abruptly at that.
+
+        So they do after a false start, whose speed changes with every scan. The path since the IMU last confirmed it
+        may then be wrong by all its length.
+        """
+        if predicted is None or not _comparable(own, predicted) or not self._motion.is_abrupt(own.pose, dt_s):
+            return False
+        return normalised_innovation_squared(own, predicted) > GROSS_NIS
 
     def _tested(
         self,

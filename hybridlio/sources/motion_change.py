@@ -31,6 +31,12 @@ class MotionChange:
         usual = np.maximum(self._usual_squared, (_PRIOR * dt_s) ** 2)
         return bool((self._change(pose, dt_s) <= _SIGMAS**2 * usual).all())
 
+    def is_abrupt(self, pose: Array, dt_s: float) -> bool:
+        """Return whether the step changes the velocity by more than platforms do, whatever was usual so far."""
+        if self._twist is None:
+            return False
+        return bool(self._change(pose, dt_s)[1] > (_SIGMAS * ACCELERATION_SIGMA_M_S2 * dt_s) ** 2)
+
     def learn(self, pose: Array, dt_s: float, is_typical: bool) -> None:
         """Take the step as the last one; if ``is_typical``, its change too counts as usual."""
         if self._twist is not None and is_typical:

@@ -12,6 +12,7 @@ from walks import errors_of, estimated, squared_position_errors, walk
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.sensors import Frame, Scan
 from hybridlio.datasets.sequence import Sequence
+from hybridlio.odometry import start_up
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.estimate import Estimate
 from hybridlio.simulation.platforms.config import PlatformConfig
@@ -76,3 +77,14 @@ def test_a_false_fit_of_two_scans_is_mended_by_the_next() -> None:
     errors_m = [np.linalg.norm(error[3:]) for error in errors_of(estimates, recording.reference)]
     assert max(errors_m[:3]) > 0.3
     assert max(errors_m[4:]) < 0.05
+
+
+def test_a_false_start_that_the_imu_contradicts_is_not_claimed_to_be_sure(
+    frames: list[Frame], recording: Sequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(start_up, "repeats_pattern", lambda *_: True)  # so that two scans decide, falsely
+    monkeypatch.setattr(start_up, "LOST_COST", 1.0)
+    estimates = estimated(frames)
+    errors = errors_of(estimates, recording.reference)
+    assert np.linalg.norm(errors[-1][3:]) > 1
+    assert squared_position_errors(estimates, errors)[-1] < 3

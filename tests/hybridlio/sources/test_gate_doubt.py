@@ -1,0 +1,62 @@
+"""Scans that move abruptly against the IMU make the path doubtful that the IMU has not confirmed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hybridlio.core import se3
+from hybridlio.core.estimates import RelativePose
+from hybridlio.sources.innovation_gate import WARM_UP_STEPS, InnovationGate
+
+DT_S = 0.1
+COVARIANCE = np.diag(np.r_[np.full(3, 1e-3), np.full(3, 0.01)] ** 2)
+
+
+def step_of(length_m: float, from_imu: bool = False) -> RelativePose:
+    pose = se3.exp(np.array([0.0, 0.0, 0.0, length_m, 0.0, 0.0]))
+    return RelativePose(pose, COVARIANCE, "imu" if from_imu else "scans", from_imu=from_imu)
+
+
+def gate_after(steps: int) -> InnovationGate:
+    """Return a gate after some steps of a metre in which scans and IMU agree."""
+    gate = InnovationGate()
+    for _ in range(steps):
+        gate.apply(step_of(1.0), step_of(1.0, True), step_of(1.0, True), DT_S)
+    return gate
+
+
+def contradicted(gate: InnovationGate, found_m: float, left_out: bool = False) -> None:
+    gate.apply(step_of(found_m), step_of(1.0, True), step_of(1.0, True), DT_S, left_out)
+
+
+def test_a_start_that_changes_its_speed_against_the_imu_may_be_wrong_by_its_length() -> None:
+    gate = gate_after(3)
+    contradicted(gate, 3.0)
+    assert gate.doubt_m2 == (3 * 1.0 + 3.0) ** 2
+
+
+def test_the_same_path_is_doubted_once() -> None:
+    gate = gate_after(3)
+    contradicted(gate, 3.0)
+    doubt_m2 = gate.doubt_m2
+    contradicted(gate, 1.0)  # back to the IMU's step
+    assert gate.doubt_m2 == doubt_m2
+
+
+def test_a_path_that_the_imu_has_confirmed_is_not_doubted() -> None:
+    gate = gate_after(2 * WARM_UP_STEPS + 1)
+    contradicted(gate, 3.0, left_out=True)
+    assert gate.doubt_m2 == 3.0**2
+
+
+def test_scans_that_move_on_smoothly_are_not_doubted_whatever_the_imu_says() -> None:
+    gate = InnovationGate()
+    for _ in range(3 * WARM_UP_STEPS):
+        gate.apply(step_of(1.0), step_of(3.0, True), step_of(3.0, True), DT_S, leaves_out_imu=True)
+    assert gate.doubt_m2 == 0
+
+
+def test_without_a_prediction_nothing_is_doubted() -> None:
+    gate = gate_after(3)
+    gate.apply(step_of(3.0), None, step_of(1.0), DT_S)
+    assert gate.doubt_m2 == 0
