@@ -1,6 +1,7 @@
-"""Make the picture of the README: the map and path of a simulated drive, and one scan.
+"""Make the pictures: of the README, the map and path of a simulated drive and one scan; and of a map file.
 
 python docs/make_pictures.py [FOLDER]
+python docs/make_pictures.py --map map.laz
 """
 
 from __future__ import annotations
@@ -71,11 +72,33 @@ def draw_scan(ax: Axes, scan: hl.Scan) -> None:
     ax.axis("off")
 
 
+def draw_map_file(path: Path) -> None:
+    """Draw a coloured ``.las`` or ``.laz`` map from above, by its colours, brighter where they are dark."""
+    import laspy
+
+    las = laspy.read(path)
+    points, colours = np.column_stack([las.x, las.y, las.z]), np.column_stack([las.red, las.green, las.blue])
+    centre, reach_m = np.median(points[:, :2], axis=0), np.percentile(np.ptp(points[:, :2], axis=0), 50) / 3
+    near = np.abs(points[:, :2] - centre).max(axis=1) < reach_m
+    order = np.flatnonzero(near)[np.argsort(points[near, 2])][::2]
+    figure, ax = plt.subplots(figsize=(9, 8), facecolor=BACKGROUND, layout="constrained")
+    shade = (colours[order] / np.iinfo(np.uint16).max) ** 0.5
+    ax.scatter(*points[order, :2].T, c=shade, s=0.25, lw=0, rasterized=True)
+    ax.set_aspect("equal")
+    ax.axis("off")
+    figure.savefig(IMAGES / "map.png", dpi=75, facecolor=BACKGROUND)
+
+
 def main() -> None:
-    """Simulate the drive, run odometry and save the picture."""
+    """Simulate the drive, run odometry and save the picture, or draw a map."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, nargs="?", help="for the simulated drive (default: a temporary folder)")
-    root = parser.parse_args().folder or Path(tempfile.mkdtemp(prefix="hybridlio-"))
+    parser.add_argument("--map", type=Path, help="a .las or .laz file to draw instead")
+    options = parser.parse_args()
+    if options.map is not None:
+        draw_map_file(options.map)
+        return
+    root = options.folder or Path(tempfile.mkdtemp(prefix="hybridlio-"))
     sequence = hl.open_sequence(hl.simulate(root, CONFIG))
     poses, cloud = run(sequence)
     figure, (above, below) = plt.subplots(

@@ -22,7 +22,7 @@ from hybridlio.evaluation.consistency import Anees
 from hybridlio.evaluation.drift import Drift
 from hybridlio.evaluation.evaluate import Evaluation
 from hybridlio.evaluation.metrics_table import format_metrics, metric_rows
-from hybridlio.evaluation.report_data import DrawnPath, Findings, ReportData, analyse, stretches
+from hybridlio.evaluation.report_data import DOUBTFUL, DrawnPath, Findings, ReportData, analyse, stretches
 from hybridlio.evaluation.trust import headline, statements
 
 __all__ = ["Findings", "ReportData", "analyse", "charts", "picture", "write_report"]
@@ -102,7 +102,7 @@ def _page(data: ReportData, findings: Findings) -> dict[str, Any]:
         "summary": summary,
         "statements": found,
         "doubtful": bool(data.reference_doubts),
-        "warnings": [*data.warnings, *findings.notes],
+        "warnings": [*(text for text in data.warnings if not text.startswith(DOUBTFUL)), *findings.notes],
         "stretches": _stretch_rows(data),
         "names": list(findings.evaluations),
         "metrics": metric_rows(format_metrics(e) for e in findings.evaluations.values()),

@@ -17,6 +17,8 @@ from hybridlio.evaluation.ate_rpe import Association, align, associate
 from hybridlio.evaluation.consistency import PoseConsistency
 from hybridlio.evaluation.evaluate import Evaluation, Steps, associated_step_errors, evaluate
 
+DOUBTFUL = "doubtful: "  # how the notes of a recording begin that put it in doubt
+
 
 @dataclass(frozen=True, eq=False)
 class ReportData:
@@ -94,6 +96,11 @@ class ReportData:
         for stage, seconds in self.timings_s.items():
             if np.ndim(seconds) != 1 or not len(seconds) or not np.isfinite(seconds).all():
                 raise DataError(f"report: timings_s[{stage!r}] must be one finite number of seconds per scan")
+
+    @property
+    def recording_doubts(self) -> list[str]:
+        """The warnings that put the recording itself in doubt."""
+        return [text.removeprefix(DOUBTFUL) for text in self.warnings if text.startswith(DOUBTFUL)]
 
     @property
     def flagged(self) -> dict[str, NDArray[np.int64]]:

@@ -30,6 +30,7 @@ class Statement:
 def statements(data: ReportData, findings: Findings) -> list[Statement]:
     """Return what is known about the trust that a run deserves, the gravest first."""
     found = [Statement("bad", doubt) for doubt in data.reference_doubts]
+    found += [Statement("doubtful", doubt) for doubt in data.recording_doubts]
     found += [*_flags(data), *_consistency(data, findings), *_uncertainty(data)]
     order: dict[Level, int] = {"bad": 0, "doubtful": 1, "good": 2}
     return sorted(found, key=lambda statement: order[statement.level])

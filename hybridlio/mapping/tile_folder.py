@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
 INDEX = "tiles.json"
+_TILE = re.compile(r"x[+-]\d{4,}_y[+-]\d{4,}\.\w+")  # a name of ours
 
 
 def write_tiles(
@@ -30,7 +32,9 @@ def write_tiles(
     crs: CRS | None = None,
     progress: Progress | None = None,
 ) -> int:
-    """Write each tile of a map to a file, and ``tiles.json``, which lists them with their extents, last.
+    """Write each tile of a map to a file, and then ``tiles.json``, which lists them with their extents.
+
+    Tiles of an earlier map in the folder that this one does not have are removed at the end.
 
     Args:
         folder: made if missing.
@@ -48,7 +52,7 @@ def write_tiles(
         ConfigError, DataError: as :func:`~hybridlio.mapping.files.write_map`.
     """
     make_folder(folder)
-    rows, total = [], 0
+    old, rows, total = _files_of(folder), [], 0
     for done, tile in enumerate(tiles.names, 1):
         points = tiles.points(tile)
         if len(points):
@@ -62,4 +66,15 @@ def write_tiles(
             progress("tiles", done, len(tiles.names))
     index = {"tile_m": tiles.tile_m, "crs": None if crs is None else crs.to_string(), "tiles": rows}
     write_atomically(folder / INDEX, json.dumps(index, indent=2) + "\n")
+    for name in old - {str(row["file"]) for row in rows}:
+        (folder / name).unlink(missing_ok=True)
     return total
+
+
+def _files_of(folder: Path) -> set[str]:
+    """Return the tiles that an earlier map wrote to a folder, as its index lists them; of its names no others."""
+    try:
+        tiles = json.loads((folder / INDEX).read_text(encoding="utf-8"))["tiles"]
+        return {name for name in (str(tile["file"]) for tile in tiles) if _TILE.fullmatch(name)}
+    except (OSError, ValueError, KeyError, TypeError):
+        return set()

@@ -52,6 +52,19 @@ def test_tiles_are_listed_with_their_extents(whole: np.ndarray, finished_run: Pa
     assert sum(map(len, read.values())) == len(whole)
 
 
+def test_a_smaller_map_leaves_no_tiles_of_a_larger_one_and_keeps_what_is_not_its_own(
+    finished_run: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "tiles"
+    ok("map", finished_run, "-o", folder, "--tiles", "ply", *COARSE)
+    (folder / "x+9999_y+9999.ply").write_text("of somebody else")
+    larger = {row["file"] for row in json.loads((folder / "tiles.json").read_text())["tiles"]}
+    ok("map", finished_run, "-o", folder, "--tiles", "ply", "--max-range", 10, *COARSE)
+    smaller = {row["file"] for row in json.loads((folder / "tiles.json").read_text())["tiles"]}
+    assert smaller < larger
+    assert {path.name for path in folder.glob("*.ply")} == smaller | {"x+9999_y+9999.ply"}
+
+
 def test_the_smoothed_poses_of_a_run_are_used_and_named(finished_run: Path, tmp_path: Path) -> None:
     run = shutil.copytree(finished_run, tmp_path / "run")
     out = ("-o", tmp_path / "map.ply", *COARSE)

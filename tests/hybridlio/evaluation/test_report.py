@@ -17,6 +17,7 @@ from hybridlio.evaluation.charts.plotly import Figure, thinned, thinned_peaks
 from hybridlio.evaluation.evaluate import Steps, evaluate
 from hybridlio.evaluation.metrics_table import format_metrics
 from hybridlio.evaluation.report import ReportData, analyse, charts, write_report
+from hybridlio.evaluation.trust import statements
 
 SIGMAS = [*np.radians([0.03, 0.03, 0.05]).tolist(), 0.02, 0.01, 0.02]
 
@@ -292,3 +293,11 @@ def test_the_error_for_arrays_of_wrong_shape_names_them(data: ReportData) -> Non
         dataclasses.replace(data, final_poses=data.estimate.poses)
     with pytest.raises(DataError, match=r"timings_s\['match'\]"):
         dataclasses.replace(data, timings_s={"match": np.array([0.1, np.nan])})
+
+
+def test_doubts_about_the_recording_are_points_to_check(data: ReportData, tmp_path: Path) -> None:
+    doubted = dataclasses.replace(data, warnings=["doubtful: the clocks disagree", "found: a column of times"])
+    found = statements(doubted, analyse(doubted))
+    assert [one.text for one in found if one.level == "doubtful"][:1] == ["the clocks disagree"]
+    write_report(tmp_path / "doubted.html", doubted)
+    assert (tmp_path / "doubted.html").read_text().count("the clocks disagree") == 1
