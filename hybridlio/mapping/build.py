@@ -149,6 +149,11 @@ def map_tiles(
 
 
 def _scans_and_poses(run: HasScansAndPoses | Sequence, trajectory: Trajectory | None) -> tuple[Sequence, Trajectory]:
+    if not isinstance(run, Sequence) and not (hasattr(run, "sequence") and hasattr(run, "trajectory")):
+        raise DataError(
+            f"a map is made of a run or of a recording with its poses, got {type(run).__name__}; `hybridlio map RUN` "
+            "takes a run folder, hl.open_sequence(path) opens a recording"
+        )
     sequence = run if isinstance(run, Sequence) else run.sequence
     if trajectory is None and isinstance(run, Sequence):
         raise DataError(f"{sequence.name}: give the trajectory of this recording")

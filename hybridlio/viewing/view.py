@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from hybridlio.core.files import user_path
 from hybridlio.core.progress import Progress
 from hybridlio.runs.run import Run
 from hybridlio.viewing.rerun_scene import RerunScene
@@ -37,7 +38,7 @@ def view(
         ConfigError: there is no display, or the file's name does not end in ``.rrd``.
         DataError: the run, the recording given, or the file's folder is wrong.
     """
-    with rerun_stream("hybridlio" if isinstance(run, Run) else Path(run).name, save) as stream:
+    with rerun_stream("hybridlio" if isinstance(run, Run) else user_path(run).name, save) as stream:
         scene = scene_of(run, data, scans)
         drawn = RerunScene(stream)
         drawn.notes(scene.name, (*scene.notes, *scene.left_out))

@@ -153,3 +153,8 @@ def test_poses_of_another_time_are_refused() -> None:
         build_map(room(), Trajectory(reference.stamps_ns + 10**12, reference.poses))
     with pytest.raises(DataError, match="give the trajectory"):
         build_map(room())
+
+
+def test_something_else_than_a_run_is_an_error_that_says_what_a_map_is_made_of() -> None:
+    with pytest.raises(DataError, match=r"a run or of a recording with its poses, got str.*hl\.open_sequence"):
+        build_map("run")  # type: ignore[arg-type]
