@@ -35,12 +35,33 @@ class PathPoint:
         """Return the covariance ``(6, 6)`` relative to the map of the next scan placed by its initial pose."""
         return se3.compose_covariance(self.bridge_covariance + self.weak_covariance, initial.pose, initial.covariance)
 
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of the position as the bridges have left it, all axes together."""
+        return float(np.sqrt(self.bridge_covariance[3:, 3:].trace()))
+
     def bridged_by(self, initial: RelativePose) -> PathPoint:
-        """Return the next scan's point if that scan is placed by its initial pose."""
-        covariance = se3.compose_covariance(self.bridge_covariance, initial.pose, initial.covariance)
+        """Return the next scan's point if that scan is placed by its initial pose.
+
+        The errors of predictions in a row come from one error of the velocity, and the graph may know them from the
+        samples as well. The covariance therefore holds for any correlation between them.
+        """
+        covariance = _sum_of_correlated(self.bridge_covariance, initial)
         return PathPoint(
             self.T_map_lidar @ initial.pose, None, True, covariance, self.map_changed, self.weak_covariance
         )
+
+
+def _sum_of_correlated(before: Array, step: RelativePose) -> Array:
+    """Return a covariance ``(6, 6)`` of a pose after a step that no correlation of the two exceeds.
+
+    For any t > 0, ``Cov(a + b) ≤ (1 + 1/t) Cov(a) + (1 + t) Cov(b)``; this t keeps the positions' trace smallest.
+    """
+    if not before.any():
+        return step.covariance
+    moved = se3.compose_covariance(before, step.pose, np.zeros((6, 6)))
+    t = float(np.sqrt(moved[3:, 3:].trace() / step.covariance[3:, 3:].trace()))
+    return np.asarray((1 + 1 / t) * moved + (1 + t) * step.covariance)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,6 @@ from hybridlio.core.estimates import RelativePose
 from hybridlio.core.motion_limits import (
     MEASUREMENT_FLOOR_SIGMAS,
     UNKNOWN_TRANSLATION_SIGMA_M,
-    VAGUE_TRANSLATION_SIGMA_M,
 )
 from hybridlio.core.sensors import NS_PER_S, Frame, Scan
 from hybridlio.registration.degeneracy import ObservedRegistration, RegistrationProblem, register_with_degeneracy
@@ -23,6 +22,7 @@ from hybridlio.registration.motion_search import best_start, coarse_kernel_m, fi
 from hybridlio.sources import map_errors
 from hybridlio.sources.matching_state import MatchingState, PathPoint
 from hybridlio.sources.recent_points import RecentPoints
+from hybridlio.sources.refinding import REFOUND_COST, has_vague_start, starts_within
 from hybridlio.sources.scene_scale import SceneScale
 from hybridlio.sources.settings import ScanMatchingSettings
 from hybridlio.sources.thinned_scan import ThinnedScan, thin
@@ -165,7 +165,7 @@ class ScanMatching:
         if initial.from_imu and not self._recent.repeats:
             predicted = before.predicted_covariance(initial)
             pose, weak = observed.weighed_with(before.T_map_lidar @ initial.pose, predicted)
-        self._state = self._state.matched(pose, dt_s, bool(len(observed.degenerate)), _is_vague(initial), weak)
+        self._state = self._state.matched(pose, dt_s, bool(len(observed.degenerate)), has_vague_start(initial), weak)
         self._recent.add(scan.points, pose)
         if self.settings.target == "last-scan" or self._state.adrift:
             self._state = self._state.keyframe_pending(scan.points)
@@ -234,17 +234,28 @@ class ScanMatching:
 
     def _register(self, scan: ThinnedScan, initial: RelativePose, dt_s: float) -> ObservedRegistration:
         """Register the scan to the map from wherever its motion is known best."""
-        start = self._state.current.T_map_lidar @ initial.pose
-        if initial.translation_sigma_m > UNKNOWN_TRANSLATION_SIGMA_M:
-            # the initial-pose source knows no motion, but this source may know the last one
-            continued = self._continue_motion(self._state.current, scan, dt_s)
-            if continued is not None:
+        start = (place := self._state.current.bridged_by(initial)).T_map_lidar
+        is_unknown = initial.translation_sigma_m > UNKNOWN_TRANSLATION_SIGMA_M
+        is_lost = self._state.current.bridged and place.sigma_m > coarse_kernel_m(self.settings.registration)
+        if is_lost and not is_unknown:
+            return self._continue_motion(self._state.last_found, scan, dt_s) or self._refind(scan, place)
+        if is_unknown:  # the initial-pose source knows no motion, but this source may know the last one
+            if (continued := self._continue_motion(self._state.current, scan, dt_s)) is not None:
                 return continued
             start = self._search_motion(scan, start, initial, dt_s)
         observed = self._register_from(start, scan, initial)
         if observed.registration.matched < self.settings.min_matched:  # a faulty IMU's initial pose is wrong
             return self._continue_motion(self._state.last_found, scan, dt_s) or observed
         return observed
+
+    def _refind(self, scan: ThinnedScan, place: PathPoint) -> ObservedRegistration:
+        """Register from the best start in the bridges' region; a scan that fits nowhere there has no matches."""
+        problem = self._problem(scan)
+        starts = starts_within(place.T_map_lidar, place.bridge_covariance, problem.settings.max_distance_m)
+        start = best_start(problem.surface, scan.source, scan.points, starts, problem.settings)
+        observed = register_with_degeneracy(problem, start, coarse_kernel_m(problem.settings), is_start_vague=True)
+        fits = observed.registration.cost < REFOUND_COST
+        return observed if fits else replace(observed, registration=replace(observed.registration, matched=0.0))
 
     def _continue_motion(self, last: PathPoint, scan: ThinnedScan, dt_s: float) -> ObservedRegistration | None:
         """Register from where the last motion leads; None if that is unknown or the scan does not fit there."""
@@ -254,8 +265,8 @@ class ScanMatching:
         observed = register_with_degeneracy(
             self._problem(scan), start, coarse_kernel_m(settings.registration), is_start_vague=True
         )
-        fits = observed.registration.matched >= settings.min_matched and observed.registration.cost < LOST_COST
-        return observed if fits else None
+        found = observed.registration
+        return observed if found.matched >= settings.min_matched and found.cost < LOST_COST else None
 
     def _search_motion(self, scan: ThinnedScan, start: Array, initial: RelativePose, dt_s: float) -> Array:
         """Return the best of several motions from ``start``: speeds ahead and, if the rotation is unknown, turns."""
@@ -268,7 +279,7 @@ class ScanMatching:
 
     def _register_from(self, start: Array, scan: ThinnedScan, initial: RelativePose) -> ObservedRegistration:
         """Register from ``start``, or from the proposed pose if the scan fits the map better there."""
-        problem, is_vague = self._problem(scan), _is_vague(initial)
+        problem, is_vague = self._problem(scan), has_vague_start(initial)
         surface, settings = problem.surface, problem.settings
         sideways_m = _LEVER_M * float(np.sqrt(initial.covariance[:3, :3].trace()))
         # beyond the distance within which points are matched, a wider kernel has no effect
@@ -286,8 +297,3 @@ class ScanMatching:
         assert surface is not None
         settings, only_keyframe = self.settings.registration, self._map.only_keyframe_pose
         return RegistrationProblem(surface, scan.source, settings, scan.points, only_keyframe)
-
-
-def _is_vague(pose: RelativePose) -> bool:
-    """Whether a map of scans at such poses would show every object several times."""
-    return pose.translation_sigma_m > VAGUE_TRANSLATION_SIGMA_M
