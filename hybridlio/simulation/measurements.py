@@ -15,6 +15,7 @@ from hybridlio.simulation.rig import IMU_RATE_HZ, SCAN_RATE_HZ, T_IMU_LIDAR
 from hybridlio.simulation.sensors.air import look_through
 from hybridlio.simulation.sensors.imu import add_noise, ideal_imu
 from hybridlio.simulation.sensors.lidar import RayPattern, first_hits, measure
+from hybridlio.simulation.world.rays import Hits
 
 IMU_PER_SCAN = IMU_RATE_HZ // SCAN_RATE_HZ
 LEAD_TICKS = IMU_RATE_HZ // 5  # IMU samples before the first scan's stamp and after the last: 0.2 s, more than a sweep
@@ -55,17 +56,36 @@ def scan_at(
         config: the drive's settings.
         lidar: replaces the lidar of ``config``.
     """
+    hits = hits_at(drive, index, pattern, config, lidar)
+    return measured_scan(hits, drive, index, pattern, config, lidar)
+
+
+def hits_at(
+    drive: Drive, index: int, pattern: RayPattern, config: SimulationConfig, lidar: LidarModel | None = None
+) -> Hits:
+    """Return what the rays of scan ``index`` hit, without noise; arguments are those of :func:`scan_at`."""
     stamp_s = float(drive.scan_times_s[index])
     offsets_s: Array = np.zeros(1)
     if config.motion_distortion:
         offsets_s = pattern.column_offset_ns / NS_PER_S
     poses = drive.path.poses(stamp_s + offsets_s) @ T_IMU_LIDAR
     scene = drive.world.scene_around(drive.path.poses(stamp_s)[0, :3, 3])
-    model = lidar or config.lidar_model
     hits = first_hits(scene, drive.cars, pattern, poses, stamp_s + offsets_s)
     if not drive.air.is_clear:
         rng = np.random.default_rng([config.own_seed, RandomStream.AIR, index])
-        look_through(drive.air, hits, pattern, poses, stamp_s, model, rng)
+        look_through(drive.air, hits, pattern, poses, stamp_s, lidar or config.lidar_model, rng)
+    return hits
+
+
+def measured_scan(
+    hits: Hits,
+    drive: Drive,
+    index: int,
+    pattern: RayPattern,
+    config: SimulationConfig,
+    lidar: LidarModel | None = None,
+) -> Scan:
+    """Return what the lidar reports of the hits of scan ``index``; the other arguments are those of :func:`scan_at`."""
     rng = np.random.default_rng([config.own_seed, RandomStream.SCAN, index])
-    stamp_ns = START_NS + round(stamp_s * NS_PER_S)
-    return measure(hits, pattern, model, stamp_ns, config.motion_distortion, rng)
+    stamp_ns = START_NS + round(float(drive.scan_times_s[index]) * NS_PER_S)
+    return measure(hits, pattern, lidar or config.lidar_model, stamp_ns, config.motion_distortion, rng)

@@ -25,7 +25,7 @@ from hybridlio.simulation.random_streams import RandomStream
 from hybridlio.simulation.sensors.imu import add_noise, ideal_imu
 from hybridlio.simulation.sensors.lidar import first_hits, measure
 from hybridlio.simulation.world.moving import MovingObject
-from hybridlio.simulation.world.rays import RayScene
+from hybridlio.simulation.world.rays import Hits, RayScene
 
 IMU_RATE_HZ = 200  # of the built-in IMUs of Livox; Ouster's run at 100 or 128
 _LEAD_S = 0.3  # inertial data before the first scan and after the last: more than a sweep
@@ -78,10 +78,19 @@ class PlatformRecording:
 
     def scan(self, index: int) -> Scan:
         """Simulate scan ``index``, with noise. The result does not depend on earlier scans."""
-        scanner, start_s = SCANNERS[self.config.lidar], float(self.scan_times_s[index])
-        pattern = scanner.sweep(start_s)
+        return self.measured(index, self.hits(index))
+
+    def hits(self, index: int) -> Hits:
+        """Return what the rays of scan ``index`` hit, without noise."""
+        start_s = float(self.scan_times_s[index])
+        pattern = SCANNERS[self.config.lidar].sweep(start_s)
         times = start_s + pattern.column_offset_ns / NS_PER_S
-        hits = first_hits(self.rays, self.people, pattern, self.lidar_poses(times), times)
+        return first_hits(self.rays, self.people, pattern, self.lidar_poses(times), times)
+
+    def measured(self, index: int, hits: Hits) -> Scan:
+        """Return what the lidar reports of the hits of scan ``index``."""
+        scanner = SCANNERS[self.config.lidar]
+        pattern = scanner.sweep(float(self.scan_times_s[index]))
         rng = np.random.default_rng([self.config.own_seed, RandomStream.SCAN, index])
         return measure(hits, pattern, scanner.model, int(self.scan_stamps_ns[index]), True, rng)
 
