@@ -32,6 +32,7 @@ _SUPPORT_VOXELS = 5.0  # a point with fewer than five others this near has no su
 # Scans compared for moving objects: one in this distance or time, so that a voxel within 40 m is seen by tens of scans;
 # all scans of a recording that has no more than a hundred.
 _COMPARE_EVERY_M, _COMPARE_EVERY_S, _COMPARE_ALL = 2.0, 1.0, 100
+_FAR_M = 10_000.0  # keys of voxels reach 100 km at 0.1 m, single precision keeps a millimetre at 10 km
 _ADDING, _COMPARING = "scans added", "scans compared"
 
 
@@ -65,6 +66,7 @@ class MapTiles:
     _tiles: VoxelTiles
     _settings: MapSettings
     _has_intensity: bool
+    _shift: Tile = (0, 0)  # of the tiles in memory, which lie near the origin
 
     @property
     def tile_m(self) -> float:
@@ -73,12 +75,12 @@ class MapTiles:
 
     def points(self, tile: Tile) -> PointMap:
         """Return the points of a tile, without those of moving objects if the settings say so."""
-        voxels = self._tiles.voxels(tile)
+        voxels = self._tiles.voxels((tile[0] - self._shift[0], tile[1] - self._shift[1]))
         if self._settings.remove_moving:
             voxels = voxels[~is_moving(voxels)]
         at, counts = self._tiles.grid.means(voxels), voxels["points"]
         return PointMap(
-            at,
+            at + self.tile_m * np.array([*self._shift, 0]),
             (voxels["intensity"] / np.maximum(counts, 1)).astype(np.float32) if self._has_intensity else None,
             self._normals(at, voxels["towards"]) if self._settings.normals else None,
             voxels["first_s"].copy(),
@@ -139,13 +141,35 @@ def map_tiles(
     """
     settings = settings or MapSettings()
     sequence, poses = _scans_and_poses(run, trajectory)
-    scans = _PosedScans(sequence, poses, frozenset(skip), settings)
-    voxels = VoxelTiles(VoxelGrid(settings.voxel_m, settings.tile_m), settings.max_resident_voxels)
+    grid = VoxelGrid(settings.voxel_m, settings.tile_m)
+    shift = _far_tiles(poses, grid.tile_m)
+    scans = _PosedScans(sequence, _shifted(poses, shift, grid.tile_m), frozenset(skip), settings)
+    voxels = VoxelTiles(grid, settings.max_resident_voxels)
     with contextlib.closing(voxels):
         _add_scans(scans, voxels, progress)
         if settings.remove_moving:
             _compare_scans(scans, voxels, progress)
-        yield MapTiles(voxels.tiles, scans.used, len(sequence) - scans.used, voxels, settings, scans.has_intensity)
+        names = [(i + shift[0], j + shift[1]) for i, j in voxels.tiles]
+        left_out = len(sequence) - scans.used
+        yield MapTiles(names, scans.used, left_out, voxels, settings, scans.has_intensity, shift)
+
+
+def _far_tiles(poses: Trajectory, tile_m: float) -> Tile:
+    """Return the tile that a path far from the origin begins in, as in UTM; else that of the origin."""
+    first = poses.poses[0, :2, 3]
+    if np.abs(first).max() < _FAR_M:
+        return 0, 0
+    i, j = np.floor(first / tile_m).astype(int).tolist()
+    return i, j
+
+
+def _shifted(poses: Trajectory, tiles: Tile, tile_m: float) -> Trajectory:
+    """Return a trajectory moved towards the origin by whole tiles."""
+    if tiles == (0, 0):
+        return poses
+    moved = poses.poses.copy()
+    moved[:, :2, 3] -= tile_m * np.array(tiles)
+    return Trajectory(poses.stamps_ns, moved, poses.covariances)
 
 
 def _scans_and_poses(run: HasScansAndPoses | Sequence, trajectory: Trajectory | None) -> tuple[Sequence, Trajectory]:

@@ -158,3 +158,14 @@ def test_poses_of_another_time_are_refused() -> None:
 def test_something_else_than_a_run_is_an_error_that_says_what_a_map_is_made_of() -> None:
     with pytest.raises(DataError, match=r"a run or of a recording with its poses, got str.*hl\.open_sequence"):
         build_map("run")  # type: ignore[arg-type]
+
+
+def test_a_map_far_from_the_origin_is_the_same_map_there() -> None:
+    poses, far = room().reference, np.array([456_000.0, 5_427_000.0, 110.0])
+    assert poses is not None
+    moved = poses.poses.copy()
+    moved[:, :3, 3] += far
+    here, there = build_map(room(), poses, KEEP), build_map(room(), Trajectory(poses.stamps_ns, moved), KEEP)
+    assert len(there) == pytest.approx(len(here), rel=0.02)
+    np.testing.assert_allclose(there.points.min(axis=0) - far, here.points.min(axis=0), atol=0.02)
+    np.testing.assert_allclose(there.points.mean(axis=0) - far, here.points.mean(axis=0), atol=0.02)
