@@ -1,11 +1,13 @@
 """Find offsets of the IMU's clock that are put into recordings, and measure what correcting them does to odometry.
 
-python benchmarks/clock_offsets.py DATA… [--offsets-ms -150 -50 -10 0 10 50 150] [--drift] [--scans 300]
+python benchmarks/clock_offsets.py DATA… [--offsets-ms -150 -50 -10 0 10 50 150] [--exact] [--drift] [--scans 300]
 
 Each recording's IMU stamps are moved by each offset in turn. The table has the offset that was found, its error and
 standard deviation, whether it was applied, and the processor time of the check. With `--drift` it also has the absolute
 trajectory error of odometry over the first scans, in percent of the path, with the offset uncorrected, corrected, and
-without any; this needs reference poses.
+without any; this needs reference poses. With `--exact` it also has the error and the standard deviation that are left
+where the reference's turns, all of them and about all axes, take the place of the lidar's: what the gyroscope's noise
+and the motion allow.
 """
 
 from __future__ import annotations
@@ -17,7 +19,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import hybridlio as hl
+from hybridlio.calibration.clock_offset import find_clock_offset
+from hybridlio.calibration.compensation import LARGEST_OFFSET_S
 from hybridlio.calibration.imu_check import moved
+from hybridlio.calibration.turns import Turns
 from hybridlio.runs.recording_check import check_recording, compare_imu, is_comparable
 from hybridlio.runs.run import run_odometry
 
@@ -33,7 +38,15 @@ def drift_percent(sequence: hl.Sequence, scans: int) -> float:
     return 100 * evaluation.ate_m / max(part.reference.length_m, 1e-9)
 
 
-def row(sequence: hl.Sequence, offset_ms: float, scans: int | None) -> str:
+def exact_cells(late: hl.Sequence, offset_ms: float) -> list[str]:
+    """Return error and standard deviation of the offset by the reference's turns."""
+    assert late.reference is not None
+    R = late.calibration.T_imu_lidar[:3, :3]
+    found = find_clock_offset(Turns.of(late.reference), late.imu, R, LARGEST_OFFSET_S, late.imu_noise)
+    return ["–", "–"] if found is None else [f"{1e3 * found.offset_s + offset_ms:+.2f}", f"{1e3 * found.sigma_s:.2f}"]
+
+
+def row(sequence: hl.Sequence, offset_ms: float, scans: int | None, exact: bool) -> str:
     """Return a row of the table for one recording with one offset."""
     late = replace(sequence, imu=moved(sequence.imu, 1e-3 * offset_ms))
     begin = time.process_time()
@@ -48,6 +61,8 @@ def row(sequence: hl.Sequence, offset_ms: float, scans: int | None) -> str:
         applied = "yes" if offset.is_significant else "no"
         cells += [f"{1e3 * offset.offset_s:+.2f}", f"{error_ms:+.2f}", f"{1e3 * offset.sigma_s:.2f}", applied]
     cells += ["; ".join([*found.doubtful, *found.wrong]) if found is not None else "", f"{spent:.1f}"]
+    if exact:
+        cells += exact_cells(late, offset_ms)
     if scans is not None:
         cells += [f"{drift_percent(one, scans):.3f}" for one in (late, check_recording(late), sequence)]
     return f"| {' | '.join(cells)} |"
@@ -58,16 +73,18 @@ def main() -> None:
     parser.add_argument("data", type=Path, nargs="+", help="recordings with an IMU whose clock agrees with the lidar's")
     parser.add_argument("--offsets-ms", type=float, nargs="+", default=OFFSETS_MS)
     parser.add_argument("--drift", action="store_true", help="also run odometry (minutes)")
+    parser.add_argument("--exact", action="store_true", help="also compare with the reference's turns")
     parser.add_argument("--scans", type=int, default=300, help="of each odometry run (default: %(default)s)")
     options = parser.parse_args()
     logging.disable(logging.WARNING)
     heads = ["recording", "offset, ms", "found, ms", "error, ms", "σ, ms", "applied", "doubts", "CPU s"]
+    heads += ["error, ms, exact turns", "σ, ms, exact turns"] if options.exact else []
     heads += ["ATE % uncorrected", "ATE % corrected", "ATE % right clock"] if options.drift else []
     print(f"| {' | '.join(heads)} |\n| {' | '.join(['---'] * len(heads))} |")
     for path in options.data:
         sequence = hl.open_sequence(path)
         for offset_ms in options.offsets_ms:
-            print(row(sequence, offset_ms, options.scans if options.drift else None), flush=True)
+            print(row(sequence, offset_ms, options.scans if options.drift else None, options.exact), flush=True)
 
 
 if __name__ == "__main__":

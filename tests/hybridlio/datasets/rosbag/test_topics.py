@@ -239,6 +239,19 @@ def test_a_batch_list_may_name_topics(small: Any) -> None:
         find_recordings([small.folder / "bad.yaml"])
 
 
+@pytest.mark.parametrize("lidars", ["[/points, /other]", "/points,/other"])
+def test_a_batch_list_may_name_several_lidars(small: Any, lidars: str) -> None:
+    from hybridlio.runs.recordings import find_recordings
+
+    small.write(small.standard(), small.clouds("/other"))
+    (small.folder / "list.yaml").write_text(
+        f"- path: small.bag\n  topics: {{lidar: '{lidars}'}}\n".replace("'[", "[").replace("]'", "]")
+    )
+    (recording,) = find_recordings([small.folder / "list.yaml"])
+    assert recording.topics.lidars == ("/points", "/other")
+    assert len(recording.open()[0].scan) == 60
+
+
 def test_commands_take_the_options(small: Any, tmp_path: Path) -> None:
     from typer.testing import CliRunner
 
