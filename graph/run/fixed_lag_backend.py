@@ -22,6 +22,10 @@ class FixedLagBackend(IncrementalBackend):
     Marginalised scans are not relinearised. Without loop closures that hardly matters: the newest state differs by less
     than a fiftieth of its standard deviation (tests/graph/run/test_fixed_lag_backend.py).
 
+    GTSAM's ``IncrementalFixedLagSmoother`` marginalises at every scan, and reorders all variables each time: 13.7 ms an
+    update, where this takes 2.6 ms, at most 0.010 standard deviations from the incremental backend, where this is 0.007
+    (``python benchmarks/fixed_lag.py --steps 300 --seeds 1``). So this marginalises by itself, some scans at a time.
+
     Args:
         steps: preintegrates the samples between scans.
         lag_scans: the least number of scans that stay in the graph.
