@@ -6,14 +6,15 @@ minimum: where odometry has drifted far, correct loops look as wrong as wrong on
 come first (Mangelson et al., "Pairwise consistent measurement set maximization", ICRA 2018; here among neighbours
 alone), those that span the fewest edges before the others. The searches run on a graph whose unbranched odometry is
 condensed, ten to fifty times faster where loops are few, which leaves time for alternatives: each cluster of loops
-taken as correct or as wrong. An alternative with another map that costs hardly more makes the result doubtful.
+taken as correct or as wrong. Loops that confirm one another are not independent, so that rejecting a whole cluster
+costs less than rejecting as many single loops: otherwise a few wrong loops that agree outweigh the correct ones of a
+map that has few. An alternative with another map that costs hardly more makes the result doubtful.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import gtsam
 import numpy as np
 
 from hybridlio.core.arrays import Array
@@ -28,7 +29,6 @@ from hybridlio.graph.outliers.search import all_at_once, nearest_first
 from hybridlio.graph.outliers.toggling import Alternatives, toggled
 from hybridlio.graph.outliers.weighted_solver import Found, WeightedSolver
 from hybridlio.graph.solve.initial_values import find_initial_values
-from hybridlio.graph.solve.linear_solver import poses_of
 from hybridlio.graph.solve.settings import IterationProgress
 
 # Chance that even one of all correct loops exceeds the bound. The usual bound of 1 % a loop rejects many of a large
@@ -89,11 +89,11 @@ def reject_outliers(data: GraphData, start: Array | None, report: IterationProgr
     chain = GraphOdometry(data, odometry, co.to_matrices(along))
     support = loop_support(loops, chain, bound)
     small = condense(trusted, loops, odometry, chain)
-    solver = WeightedSolver(small.trusted, small.loops, small.odometry, bound, report)
+    solver = WeightedSolver(small.trusted, small.loops, small.odometry, bound, report, support.cluster)
     found, complete = _search(solver, solver.values(start[small.kept]), support)
     best = min(found, key=lambda one: one.cost)
     doubts = _doubts(solver, found, support, complete)
-    values = whole.values(small.expand(poses_of(best.values, data.dimension)))
+    values = whole.values(small.expand(solver.coordinates(best.values)))
     return _rejection(whole, whole.found(values, best.correct), doubts)
 
 
@@ -102,7 +102,7 @@ def _rejection(solver: WeightedSolver, best: Found, doubts: tuple[str, ...]) -> 
     rejected = float(np.mean(~best.correct))
     if rejected > 0.5:
         doubts = (*doubts, f"{100 * rejected:.0f} % of the loops are rejected")
-    return Rejection(poses_of(best.values, solver.dimension), wrong, doubts)
+    return Rejection(solver.coordinates(best.values), wrong, doubts)
 
 
 def odometry_start(data: GraphData) -> Array | None:
@@ -113,7 +113,7 @@ def odometry_start(data: GraphData) -> Array | None:
         return None
 
 
-def _search(solver: WeightedSolver, start: gtsam.Values, support: LoopSupport) -> Alternatives:
+def _search(solver: WeightedSolver, start: Any, support: LoopSupport) -> Alternatives:
     """Return all sets of correct loops that the searches find."""
     found = [all_at_once(solver, start), nearest_first(solver, start, support, _GROWTHS[0])]
     as_stated = LoopSupport(1.0, np.zeros_like(support.supported), support.cluster)

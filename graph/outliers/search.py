@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import gtsam
+from typing import Any
+
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
@@ -20,14 +21,14 @@ _LARGEST_CHI2 = 1e4
 _SOURCES_AT_ONCE = 256  # rows of distances in memory: 100 MB for 50,000 poses
 
 
-def all_at_once(solver: WeightedSolver, start: gtsam.Values) -> Found:
+def all_at_once(solver: WeightedSolver, start: Any) -> Found:
     """Graduate over all loops together, from their joint solution, as the paper does."""
     candidates = np.ones(len(solver.loops.i), dtype=bool)
     values = solver.solve(start, candidates.astype(np.float64))
     return solver.found(*solver.graduate(values, candidates, solver.bound, GRADUATION))
 
 
-def nearest_first(solver: WeightedSolver, start: gtsam.Values, support: LoopSupport, growth: float) -> Found:
+def nearest_first(solver: WeightedSolver, start: Any, support: LoopSupport, growth: float) -> Found:
     """Take in loops in rounds, those that span the fewest edges first, so that odometry has not drifted far.
 
     A round graduates over the loops so far and those whose ends are at most a number of edges apart, along odometry and

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import gtsam
 import numpy as np
 
 from hybridlio.core.arrays import Index, Mask
@@ -38,7 +37,7 @@ class Move(NamedTuple):
     correct: bool
 
 
-def toggled(solver: WeightedSolver, start: gtsam.Values, cluster: Index, found: list[Found]) -> Alternatives:
+def toggled(solver: WeightedSolver, start: Any, cluster: Index, found: list[Found]) -> Alternatives:
     """Search again with each cluster taken as correct, or as wrong, in the order of what the best result leaves open.
 
     Groups, clusters of several loops, that are rejected come first: wrong loops seldom confirm one another.
@@ -95,7 +94,7 @@ def _other_moves(correct: Mask, cluster: Index) -> list[Move]:
     return [*(Move(k, True) for k in single), *(Move(k, False) for k in taken), *(Move(k, True) for k in taken)]
 
 
-def _around(solver: WeightedSolver, start: gtsam.Values, cluster: Mask, limit: float) -> Found | None:
+def _around(solver: WeightedSolver, start: Any, cluster: Mask, limit: float) -> Found | None:
     """Graduate over all loops with some held at full weight, as if they were known to be correct.
 
     Args:
@@ -111,7 +110,7 @@ def _around(solver: WeightedSolver, start: gtsam.Values, cluster: Mask, limit: f
     return solver.found(*solver.graduate(values, candidates, solver.bound, GRADUATION, held=cluster))
 
 
-def _without(solver: WeightedSolver, start: gtsam.Values, cluster: Mask, limit: float) -> Found | None:
+def _without(solver: WeightedSolver, start: Any, cluster: Mask, limit: float) -> Found | None:
     """Graduate over all loops but some, as if they were known to be wrong; arguments as for :func:`_around`."""
     if np.count_nonzero(cluster) * solver.bound > limit:
         return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridlio.core.arrays import Array
+from hybridlio.core.arrays import Array, Index, Mask
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.planar.edges import PlanarEdges, wrapped
@@ -24,11 +24,8 @@ class PlanarGaussNewton:
     """
 
     def __init__(self, data: GraphData, start: Array) -> None:
-        held = np.zeros(len(data) + 1, dtype=bool)
-        held[[data.index[key] for key in data.fixed]] = True
-        held[-1] = True
         self._edges = planar_edges(data)
-        self._system = PlanarSystem(self._edges, held)
+        self._system = PlanarSystem(self._edges, held_poses(data))
         self._poses = np.concatenate([start, np.zeros((1, 3))]).T.copy()
 
     def iterate(self) -> None:
@@ -57,8 +54,21 @@ def planar_edges(data: GraphData) -> PlanarEdges:
     """Return the relative poses of a graph, then its priors, as edges from one more pose."""
     priors = list(data.other_factors.values())
     ends = np.array([(len(data), data.index[f.keys[0]]) for f in priors], dtype=np.int64).reshape(-1, 2)
-    i, j = np.concatenate([data.edges.ends, ends]).T
     measured = np.concatenate([data.edges.measured, *(f.measured[None] for f in priors)])
     information = np.concatenate([data.edges.information, *(f.noise.information[None] for f in priors if f.noise)])
+    return as_planar(np.concatenate([data.edges.ends, ends]), measured, information)
+
+
+def as_planar(ends: Index, measured: Array, information: Array) -> PlanarEdges:
+    """Return edges from ends ``(M, 2)``, coordinates ``(M, 3)`` and information ``(M, 3, 3)`` of heading, x, y."""
+    i, j = ends.T
     in_order = information[:, _ORDER][:, :, _ORDER]
     return PlanarEdges(i.copy(), j.copy(), measured.T.copy(), np.ascontiguousarray(np.moveaxis(in_order, 0, 2)))
+
+
+def held_poses(data: GraphData) -> Mask:
+    """Return which poses ``(N + 1,)`` do not move: fixed ones, and the one more that priors start from."""
+    held = np.zeros(len(data) + 1, dtype=bool)
+    held[[data.index[key] for key in data.fixed]] = True
+    held[-1] = True
+    return held

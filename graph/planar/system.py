@@ -36,11 +36,12 @@ class PlanarSystem:
         i, j = place[edges.i], place[edges.j]
         self._free_i, self._free_j, self._both = i >= 0, j >= 0, (i >= 0) & (j >= 0)
         a, b, both = self._free_i, self._free_j, self._both
-        rows = np.concatenate([i[a], j[b], i[both], j[both]])
-        columns = np.concatenate([i[a], j[b], j[both], i[both]])
+        every = np.arange(len(self._order))  # for the damping
+        rows = np.concatenate([i[a], j[b], i[both], j[both], every])
+        columns = np.concatenate([i[a], j[b], j[both], i[both], every])
         self._pattern = _Pattern(rows, columns, len(self._order))
 
-    def step(self, poses: Array, information: Array | None = None) -> Array:
+    def step(self, poses: Array, information: Array | None = None, damping: float = 0.0) -> Array:
         """Return the Gauss-Newton step ``(3, N)`` of x y θ.
 
         Positions are unknowns in world, not in each pose's own frame: a chain of 5,000 poses then loses nothing to the
@@ -49,6 +50,7 @@ class PlanarSystem:
         Args:
             poses: ``(3, N)``.
             information: ``(3, 3, M)`` other than the edges' own, such as weighted ones.
+            damping: Levenberg's, added to the diagonal.
 
         Raises:
             RuntimeError: the system is singular.
@@ -60,7 +62,8 @@ class PlanarSystem:
         a, b, both = self._free_i, self._free_j, self._both
         cross = times(np.swapaxes(J_i, 0, 1), weighted_j)[..., both]
         at_i, at_j = times(np.swapaxes(J_i, 0, 1), weighted_i), times(np.swapaxes(J_j, 0, 1), weighted_j)
-        blocks = np.concatenate([at_i[..., a], at_j[..., b], cross, np.swapaxes(cross, 0, 1)], axis=2)
+        damped = np.broadcast_to(damping * np.eye(3)[..., None], (3, 3, len(self._order)))
+        blocks = np.concatenate([at_i[..., a], at_j[..., b], cross, np.swapaxes(cross, 0, 1), damped], axis=2)
         solver = self._pattern.factorise(blocks)
         gradient = self._gradient(weighted_i, weighted_j, edges.residuals(poses))[:, self._order]
         step = np.zeros_like(poses)
