@@ -8,7 +8,7 @@ import pytest
 from hybridlio.core import se3
 from hybridlio.graph import PoseGraph
 from hybridlio.graph.model.edge_arrays import edges_of
-from hybridlio.graph.outliers import descent
+from hybridlio.graph.outliers import weighted_solver as descent
 from hybridlio.graph.outliers.weighted_solver import _FURTHER_LOOP, WeightedSolver
 from hybridlio.graph.solve.settings import silent
 
