@@ -124,7 +124,7 @@ class GraphMachine(RuleBasedStateMachine):
         key, graph, before = self.known(key), self.graph, content(self.graph)
         T = self.noisy(truth(key), seed)
         add = {
-            "gps": lambda: graph.add_gps(key, T[:3, 3], 0.1),
+            "gps": lambda: graph.add_gps(key, T[: graph.dimension, 3], 0.1),
             "attitude": lambda: graph.add_gravity(key, T[2, :3], 0.01),
             "altitude": lambda: graph.add_altitude(key, T[2, 3], 0.1),
             "heading": lambda: graph.add_heading(key, float(np.arctan2(T[1, 0], T[0, 0])), 0.02),
@@ -135,7 +135,7 @@ class GraphMachine(RuleBasedStateMachine):
             number = add[kind]()
         except GraphError:
             assert graph.dimension == 2
-            assert kind in ("gps", "attitude", "altitude")
+            assert kind in ("attitude", "altitude")
             assert content(graph) == before
         else:
             self.ids[number] = {key}
