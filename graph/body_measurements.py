@@ -64,7 +64,9 @@ class BodyMeasurements:
             sigmas, covariance: exactly one of them, of east, north, up in metres.
             lever_arm_m, robust, calibration: as in :meth:`add_gps`.
         """
-        point = check_geodetic(latitude_deg, longitude_deg, altitude_m, factor_label("gps", (key,)))
+        label = factor_label("gps", (key,))
+        self._data.require_space(label)
+        point = check_geodetic(latitude_deg, longitude_deg, altitude_m, label)
         origin = self.origin or point
         position = enu_from_geodetic([point], origin)[0]
         number = self.add_gps(

@@ -27,7 +27,7 @@ from hybridlio.graph.outliers.condensed import condense
 from hybridlio.graph.outliers.loop_support import GraphOdometry, LoopSupport, loop_support
 from hybridlio.graph.outliers.search import all_at_once, nearest_first
 from hybridlio.graph.outliers.toggling import Alternatives, toggled
-from hybridlio.graph.outliers.weighted_solver import Found, WeightedSolver
+from hybridlio.graph.outliers.weighted_solver import Found, WeightedSolver, least
 from hybridlio.graph.solve.initial_values import find_initial_values
 from hybridlio.graph.solve.settings import IterationProgress
 
@@ -91,7 +91,7 @@ def reject_outliers(data: GraphData, start: Array | None, report: IterationProgr
     small = condense(trusted, loops, odometry, chain)
     solver = WeightedSolver(small.trusted, small.loops, small.odometry, bound, report, support.cluster)
     found, complete = _search(solver, solver.values(start[small.kept]), support)
-    best = min(found, key=lambda one: one.cost)
+    best = least(found)
     doubts = _doubts(solver, found, support, complete)
     values = whole.values(small.expand(solver.coordinates(best.values)))
     return _rejection(whole, whole.found(values, best.correct), doubts)
@@ -132,7 +132,7 @@ def _agreed(found: list[Found]) -> bool:
 
 
 def _doubts(solver: WeightedSolver, found: list[Found], support: LoopSupport, complete: bool) -> tuple[str, ...]:
-    best, doubts = min(found, key=lambda one: one.cost), []
+    best, doubts = least(found), []
     others = [
         one for one in found if _other_map(solver, best, one) and one.cost < best.cost + solver.bound * support.scale
     ]

@@ -8,7 +8,7 @@ import numpy as np
 
 from hybridlio.core.arrays import Index, Mask
 from hybridlio.graph.base.truncated_squares import GRADUATION
-from hybridlio.graph.outliers.weighted_solver import Found, WeightedSolver
+from hybridlio.graph.outliers.weighted_solver import Found, WeightedSolver, least
 
 # Poses and loops that all graduations together may pass over: a few seconds, and in graphs of some hundred poses and
 # loops every cluster.
@@ -51,7 +51,7 @@ def toggled(solver: WeightedSolver, start: Any, cluster: Index, found: list[Foun
     found, tried = list(found), set[Move]()
     left = max(_WORK // (solver.size + len(cluster)), _FEWEST)
     while True:
-        best = min(found, key=lambda one: one.cost)
+        best = least(found)
         groups = [move for move in _rejected_groups(best.correct, cluster) if move not in tried]
         if not left or not (groups or not _confirmed(best, found)):
             return Alternatives(found, not groups)

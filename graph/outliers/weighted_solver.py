@@ -167,11 +167,26 @@ class Found:
         values: the state, solved with the correct loops alone.
         correct: ``(M,)`` which loops are within the bound.
         cost: the truncated cost there.
+        full_cost: the same with every rejected loop counted as one that nothing confirms.
     """
 
     values: Any
     correct: Mask
     cost: float
+    full_cost: float
+
+
+def least(found: list[Found]) -> Found:
+    """Return the result of least cost among those that no other dominates.
+
+    One that keeps the same loops and more, and costs less in full, dominates: the discount on rejecting a cluster is to
+    weigh groups that contradict each other, not to reject loops that contradict nothing.
+    """
+
+    def is_dominated(one: Found) -> bool:
+        return any((other.correct >= one.correct).all() and other.full_cost < one.full_cost for other in found)
+
+    return min((one for one in found if not is_dominated(one)), key=lambda one: one.cost)
 
 
 class WeightedSolver:
@@ -276,4 +291,6 @@ class WeightedSolver:
             before, correct = correct, self.chi2(values) <= self.bound
             if np.array_equal(correct, before):
                 break
-        return Found(values, correct, self.cost(values))
+        rejected = int((~correct).sum())
+        full_cost = self.cost_with(values, correct) + self.bound * rejected
+        return Found(values, correct, self.cost(values), full_cost)

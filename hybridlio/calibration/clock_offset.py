@@ -90,13 +90,17 @@ class ClockOffset:
     @property
     def is_determined(self) -> bool:
         """Whether lidar and gyroscope measure one motion, and it fixes the offset better than to 3 ms."""
-        return self.unexplained < _LARGEST_UNEXPLAINED and self.sigma_s < LEAST_OFFSET_S
+        return self._is_one_motion and self.sigma_s < LEAST_OFFSET_S
 
     @property
     def is_significant(self) -> bool:
         """Whether the clocks differ: by more than chance explains, and by enough to matter."""
         least_s = max(LEAST_OFFSET_S, _SIGNIFICANT_SIGMAS * self.sigma_s)
-        return self.is_determined and abs(self.offset_s) > least_s and self.unexplained < self.unexplained_at_zero
+        return self._is_one_motion and abs(self.offset_s) > least_s and self.unexplained < self.unexplained_at_zero
+
+    @property
+    def _is_one_motion(self) -> bool:
+        return self.unexplained < _LARGEST_UNEXPLAINED
 
     @property
     def contradicts(self) -> bool:

@@ -13,14 +13,17 @@ from typing import Any
 
 import numpy as np
 
+from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.motion_limits import BRIDGED_ACCELERATION_SIGMA_M_S2
 from hybridlio.core.sensors import NS_PER_S, Frame, ImuSamples, Scan
 from hybridlio.core.start_state import start_state
 from hybridlio.odometry.pipeline import Pipeline, timed
-from hybridlio.odometry.start_search import StartSearch
+from hybridlio.odometry.start_search import StartEstimate, StartSearch
 from hybridlio.record import plain_values
 from hybridlio.record.record import Record
+from hybridlio.registration.cost_profile import PROBE_STEP_M
 from hybridlio.sources.recent_points import repeats_pattern
 from hybridlio.sources.scan_matching import LOST_COST, ScanMatching
 
@@ -97,7 +100,8 @@ def measure_step(
         if is_open and isinstance(residual, ScanMatching):
             pipeline.start_search = _search(pipeline, residual, leads=False)
     if pipeline.start_search is not None:
-        return _searched(pipeline, pipeline.start_search, frame, seconds) or answer
+        own = _pose_after(pipeline, before, answer[1])
+        return _searched(pipeline, pipeline.start_search, frame, seconds, own) or answer
     return answer
 
 
@@ -113,24 +117,41 @@ def restore_search(pipeline: Pipeline, state: Mapping[str, Any] | None) -> None:
 
 
 def _searched(
-    pipeline: Pipeline, search: StartSearch, frame: Frame, seconds: dict[str, float]
+    pipeline: Pipeline, search: StartSearch, frame: Frame, seconds: dict[str, float], own: Array | None = None
 ) -> tuple[Frame, RelativePose] | None:
     """Return the search's answer, and give its scans to scan matching when it ends; None if it has no answer.
 
-    A search that does not lead answers only when it has decided.
+    A search that does not lead answers only when it has decided, and for another minimum than the run's own pose
+    ``own`` ``(4, 4)`` of the scan in the frame of the first: in the same one, each scan's own match is the finer one.
     """
     assert pipeline.start is not None
     assert isinstance(pipeline.residual, ScanMatching)
     with timed(seconds, "residual"):
         found = search.add(frame, pipeline.start, pipeline.residual.name)
+        is_news = own is None or (found is not None and _is_elsewhere(found, own))
         if found is None or found.is_decided or found.is_last:
             pipeline.start_search = None
             last = search.last if search.leads else found
-            if last is not None and (search.leads or last.is_decided):
+            if last is not None and is_news and (search.leads or last.is_decided):
                 pipeline.residual.start_from(last.frames, last.poses)
-    if found is None or not (search.leads or found.is_decided):
+    if found is None or not is_news or not (search.leads or found.is_decided):
         return None
     return found.frames[-1], found.relative
+
+
+def _pose_after(pipeline: Pipeline, before: State, step: RelativePose) -> Array:
+    """Return the scan's pose in the frame of the first scan, by the run's own step."""
+    assert pipeline.start is not None
+    T_imu_lidar = pipeline.calibration.T_imu_lidar
+    T_first_before = se3.between(pipeline.start.T_world_imu @ T_imu_lidar, before.T_world_imu @ T_imu_lidar)
+    return T_first_before @ step.pose
+
+
+def _is_elsewhere(found: StartEstimate, own: Array) -> bool:
+    """Return whether the scan lies, by its median point, farther from a pose than two minima can be told apart."""
+    points = found.frames[-1].scan.points
+    apart = se3.transform(se3.between(found.poses[0], found.poses[-1]), points) - se3.transform(own, points)
+    return bool(np.median(np.linalg.norm(apart, axis=1)) > PROBE_STEP_M)
 
 
 def repeat_first_step(

@@ -320,7 +320,9 @@ def test_the_public_names_are_exactly_these():
         *("add_gps", "add_gps_geodetic", "add_attitude", "add_gravity"),
         *("landmarks", "add_landmark", "add_point_observation", "add_bearing_range"),
         *("add_factor", "add_gtsam_factor", "add_altitude", "add_heading", "add_body_velocity", "add_wheel_speed"),
-        *("copy", "subgraph", "remove_pose", "merge", "set_noise", "to_gtsam", "from_gtsam"),
+        *("calibrations", "add_calibration", "add_sensor_step"),
+        *("copy", "subgraph", "remove_pose", "marginalise", "merge", "set_measurement", "set_noise"),
+        *("to_gtsam", "from_gtsam"),
         *("initialise", "optimize", "online", "load", "load_report", "save"),
     }
 

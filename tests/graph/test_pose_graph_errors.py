@@ -158,8 +158,10 @@ def test_a_planar_graph_refuses_poses_and_factors_out_of_the_plane():
     tilted[2, 3] = 0.1
     with pytest.raises(DataError, match="z, roll or pitch is not zero"):
         graph.add_between(0, 1, tilted, sigmas=0.1)
-    with pytest.raises(GraphError, match="needs a graph in space"):
+    with pytest.raises(DataError, match="expected 2 finite numbers"):
         graph.add_gps(0, np.zeros(3), 0.1)
+    with pytest.raises(GraphError, match="needs a graph in space"):
+        graph.add_altitude(0, 0.0, 0.1)
 
 
 def test_an_empty_graph_is_refused():
