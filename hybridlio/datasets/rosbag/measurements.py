@@ -25,6 +25,7 @@ _MAX_DELAY_DIFFERENCE_S = 0.2  # between lidar and IMU; a sweep is stamped 0.1 s
 _MIN_SIGMA_M = 1e-3  # a fix declared exact still needs an invertible covariance
 _IMU_PARTS = {"angular velocity": slice(0, 3), "linear acceleration": slice(3, 6)}  # of the values of a message
 _DEFAULT_SIGMA_M = 5.0  # of a fix without covariance: that of satellite navigation without corrections
+_LATEST_NS = 2**63 - 1  # of a stamp as an int64
 
 
 @dataclass
@@ -43,7 +44,13 @@ class Log:
     values: array[float] = field(default_factory=lambda: array("d"))
 
     def add(self, header: Header, received_ns: int) -> None:
-        """Add a message's stamps."""
+        """Add a message's stamps.
+
+        Raises:
+            DataError: the time of receipt is no time of this age, as in a damaged file.
+        """
+        if received_ns > _LATEST_NS:
+            raise DataError(f"a message was received at {received_ns} ns, after the year 2262: the bag is damaged")
         if not self.header_ns:
             self.frame = header.frame
         self.header_ns.append(header.stamp_ns)

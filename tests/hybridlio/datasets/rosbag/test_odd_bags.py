@@ -10,6 +10,8 @@ import pytest
 
 from hybridlio.core.errors import DataError
 from hybridlio.datasets import open_sequence
+from hybridlio.datasets.rosbag.measurements import Log
+from hybridlio.datasets.rosbag.wire import Header
 
 
 def without(message: Any, *parts: str) -> None:
@@ -100,3 +102,16 @@ def test_an_mcap_file_of_another_system_is_not_called_damaged(tmp_path: Path) ->
     with pytest.raises(DataError, match="of another system, not of ROS 2") as refused:
         open_sequence(path)
     assert "damaged" not in str(refused.value)
+
+
+@pytest.mark.parametrize(("received_ns", "is_damaged"), [(2**63 - 1, False), (2**63, True), (2**64 - 1, True)])
+def test_a_time_of_receipt_that_no_stamp_can_hold_is_one_clear_error(received_ns: int, is_damaged: bool) -> None:
+    log = Log()
+    header = Header(1, "imu", 0, "<")
+    if not is_damaged:
+        log.add(header, received_ns)
+        assert len(log) == 1
+        return
+    with pytest.raises(DataError, match="after the year 2262"):
+        log.add(header, received_ns)
+    assert len(log) == 0
