@@ -238,12 +238,16 @@ class WeightedSolver:
 
         A cluster whose loops are rejected costs at most as much as :data:`_FURTHER_LOOP` says.
         """
+        cost, _ = self._costs(values)
+        return cost
+
+    def _costs(self, values: Any) -> tuple[float, float]:
+        """Return the truncated cost, and the same with every rejected loop counted in full."""
         chi2 = self.chi2(values)
-        sizes = np.bincount(self._cluster)
         rejected = np.bincount(self._cluster, chi2 > self.bound)
-        rejections = np.minimum(rejected, 1 + _FURTHER_LOOP * (sizes - 1)).sum()
-        kept = chi2[chi2 <= self.bound].sum()
-        return float(self._descent.trusted_chi2(values) + kept + self.bound * rejections)
+        limits = 1 + _FURTHER_LOOP * (np.bincount(self._cluster) - 1)
+        kept = self._descent.trusted_chi2(values) + chi2[chi2 <= self.bound].sum()
+        return float(kept + self.bound * np.minimum(rejected, limits).sum()), float(kept + self.bound * rejected.sum())
 
     def solve(self, values: Any, weights: Array, iterations: int = _ITERATIONS_PER_STEP) -> Any:
         """Return values after some iterations with loops of weights ``(M,)``.
@@ -291,6 +295,4 @@ class WeightedSolver:
             before, correct = correct, self.chi2(values) <= self.bound
             if np.array_equal(correct, before):
                 break
-        rejected = int((~correct).sum())
-        full_cost = self.cost_with(values, correct) + self.bound * rejected
-        return Found(values, correct, self.cost(values), full_cost)
+        return Found(values, correct, *self._costs(values))
