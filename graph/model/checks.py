@@ -28,6 +28,7 @@ _ROWS = {
     "body-velocity": [],
     "sensor-step": [],
 }  # motions that these measure by themselves
+_REPEATED = ("gps", "velocity")  # measured: a vector in world, then the lever arm if there is one
 
 
 def check_determined(data: GraphData) -> None:
@@ -85,7 +86,7 @@ def free_motions(data: GraphData, part: list[Key]) -> list[str]:
     factors = [f for f in data.other_factors.values() if f.keys[0] in inside and f.kind not in ("bias", *OBSERVATIONS)]
     if any(factor.kind in ("prior", "gtsam") for factor in factors):
         return []  # what a factor of GTSAM's leaves free, the solver finds
-    jacobian = np.vstack([np.zeros((1, 6)), *(_motion_jacobian(data, factor) for factor in factors)])
+    jacobian = np.vstack([np.zeros((1, 6)), *(_motion_jacobian(data, factor) for factor in _distinct(factors))])
     # rotations move a far position by metres: scaled down, so that both halves compare in the rank below
     reach = float(np.linalg.norm(jacobian[:, :3], axis=1).max())
     jacobian = jacobian / np.r_[np.full(3, max(reach, 1.0)), np.ones(3)]
@@ -94,6 +95,12 @@ def free_motions(data: GraphData, part: list[Key]) -> list[str]:
     unobserved = directions[int((sizes > _RANK_TOLERANCE * sizes.max()).sum()) :]
     shares = np.abs(unobserved).max(axis=0, initial=0.0)
     return [name for name, share in zip(names, shares, strict=True) if share > _NAMED_SHARE]
+
+
+def _distinct(factors: list[Factor]) -> list[Factor]:
+    """Return the factors without repetitions at one pose, whose noise would pass for another place or velocity."""
+    what = [(f.kind, f.keys[0], tuple(f.measured[3:])) if f.kind in _REPEATED else n for n, f in enumerate(factors)]
+    return list(dict(zip(what, factors, strict=True)).values())
 
 
 def _motion_jacobian(data: GraphData, factor: Factor) -> Array:
