@@ -21,6 +21,7 @@ from hybridlio.graph.model.keys import Key, check_key
 from hybridlio.graph.model.measurements import Factor
 from hybridlio.graph.model.new_factors import between_factor, check_start, check_vector, prior_factor
 from hybridlio.graph.model.noise import NoiseInput, RobustLike
+from hybridlio.graph.outliers.screened_solver import online_solver
 from hybridlio.graph.solve.batch import solve_batch
 from hybridlio.graph.solve.initial_values import find_initial_values
 from hybridlio.graph.solve.online_solver import OnlineSolver
@@ -31,6 +32,7 @@ from hybridlio.graph.solve.settings import (
     InitialName,
     IterationProgress,
     OnlineName,
+    OutlierTest,
     Settings,
     SolverName,
     silent,
@@ -208,7 +210,10 @@ class PoseGraph(WholeGraph):
         solve = solve_online if backend in ONLINE_SOLVERS else solve_batch
         return on_deep_stack(len(self), lambda: solve(self._data, settings, progress or silent))
 
-    def online(self, backend: OnlineName = "incremental", *, lag: int = 200, forget: bool = False) -> OnlineSolver:
+    def online(
+        self, backend: OnlineName = "incremental", *, lag: int = 200, forget: bool = False,
+        outliers: OutlierTest | None = None,
+    ) -> OnlineSolver:  # fmt: skip
         """Return a solver that follows this graph while it grows: its ``update()`` takes over what has changed.
 
         Args:
@@ -216,8 +221,14 @@ class PoseGraph(WholeGraph):
             lag: number of poses that ``fixed-lag`` keeps.
             forget: whether ``fixed-lag`` removes the factors of poses that leave the lag from the graph, and keeps
                 their last estimates as initial values, so that the graph stays small too.
+            outliers: ``chi2`` tests each new loop and GPS fix against the estimate and both covariances; ``gnc`` also
+                decides on all loops anew as they become more (``incremental`` only). ``solver.rejected`` has the ids
+                of the factors that are left out.
+
+        Raises:
+            ConfigError: an unknown name, a lag that is not positive, or ``gnc`` with ``fixed-lag``.
         """
-        return OnlineSolver(self._data, backend, lag, forget)
+        return online_solver(self._data, backend, lag, forget, outliers)
 
     # files
 

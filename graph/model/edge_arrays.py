@@ -85,6 +85,12 @@ def edges_of(data: GraphData) -> Edges:
     return Edges(table.ids, i, j, co.to_matrices(table.measured), table.information, consecutive)
 
 
+def consecutive(i: Key, j: Key) -> bool:
+    """Whether two keys follow each other on one robot."""
+    (robot, a), (other, b) = ((-1, key) if isinstance(key, int) else key for key in (i, j))
+    return robot == other and abs(a - b) == 1
+
+
 def joins_consecutive(keys: list[Key], ends: Index) -> Mask:
     """Return which edges ``(M, 2)`` join consecutive keys of one robot."""
     pairs = [(-1, key) if isinstance(key, int) else key for key in keys]

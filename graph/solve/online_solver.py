@@ -72,8 +72,7 @@ class OnlineSolver:
             GraphError: the changes do not determine every pose, or concern one that has left the lag; names the keys.
                 The solver is then as before: correct the graph and update again. Or a pose was removed.
         """
-        if self._data.is_replaced:
-            raise GraphError("a pose was removed from the graph, which no solver follows; make a new one by online()")
+        self._check_not_replaced(self._data)
         on_deep_stack(len(self._data), self._update)
 
     def _update(self) -> None:
@@ -95,6 +94,16 @@ class OnlineSolver:
         self._accept(changes, values, leaving)
         self._landmarks.accept(latest, leaving_points)
         self._held.settle(far=bool(changes.removed) or self._closes_loops(changes))
+
+    @property
+    def rejected(self) -> frozenset[int]:
+        """Ids of the factors that are not believed; empty without ``outliers=``."""
+        return frozenset()
+
+    @property
+    def doubtful(self) -> tuple[str, ...]:
+        """Reasons why the last search for wrong loops may be wrong; empty without ``outliers="gnc"``."""
+        return ()
 
     # estimates
 
@@ -175,6 +184,11 @@ class OnlineSolver:
         values = solve(choose_start(data, "auto")).values
         return Builder(self._data, biases_of(values)), values
 
+    @staticmethod
+    def _check_not_replaced(data: GraphData) -> None:
+        if data.is_replaced:
+            raise GraphError("a pose was removed from the graph, which no solver follows; make a new one by online()")
+
     def _check(self, changes: Changes) -> None:
         """Check that the changed graph is determined, and that no change concerns poses that left the lag."""
         marginalised = [factor_id for factor_id in changes.removed if factor_id not in self._held.names]
@@ -244,8 +258,12 @@ class OnlineSolver:
         self._note_marginalised_biases(ids)
         self._held.forget([*ids, *((kind, key) for key in self._data.keys_at(poses) for kind in ("fixed", "bias"))])
         if self._forget:
-            self._data.forget(ids, poses, leaving)
-            self._tracker.forget(ids)
+            self._forget_factors(ids, poses, leaving)
+
+    def _forget_factors(self, ids: set[int], poses: range, leaving: Array) -> None:
+        """Remove marginalised factors from the graph."""
+        self._data.forget(ids, poses, leaving)
+        self._tracker.forget(ids)
 
     def _note_marginalised_biases(self, ids: Iterable[int]) -> None:
         """Note the poses whose biases marginalised samples constrain: no prior of first biases may be added there."""

@@ -13,6 +13,7 @@ from hybridlio.graph.model.noise import is_positive
 
 SolverName: TypeAlias = Literal["auto", "batch", "gnc", "incremental", "fixed-lag"]
 OnlineName: TypeAlias = Literal["incremental", "fixed-lag"]
+OutlierTest: TypeAlias = Literal["chi2", "gnc"]
 InitialMethod: TypeAlias = Literal["odometry", "spanning-tree", "chordal"]
 InitialName: TypeAlias = Literal["auto", "given"] | InitialMethod
 
@@ -21,6 +22,7 @@ TOLERANCE = 1e-6  # of the error: poses then lie within a few thousandths of a s
 
 SOLVERS = ("auto", "batch", "gnc", "incremental", "fixed-lag")
 ONLINE_SOLVERS = ("incremental", "fixed-lag")
+OUTLIER_TESTS = ("chi2", "gnc")
 INITIAL_METHODS: tuple[InitialMethod, ...] = ("odometry", "spanning-tree", "chordal")
 INITIAL = ("auto", "given", *INITIAL_METHODS)
 
