@@ -5,7 +5,7 @@ python benchmarks/clock_offsets.py DATA… [--offsets-ms -150 -50 -10 0 10 50 15
 Each recording's IMU stamps are moved by each offset in turn. The table has the offset that was found, its error and
 standard deviation, whether it was applied, and the processor time of the check. With `--drift` it also has the absolute
 trajectory error of odometry over the first scans, in percent of the path, with the offset uncorrected, corrected, and
-without any; this needs reference poses. With `--exact` it also has the error and the standard deviation that are left
+without any, and the ratio of the last two; this needs reference poses. With `--exact` it also has the error and the standard deviation that are left
 where the reference's turns, all of them and about all axes, take the place of the lidar's: what the gyroscope's noise
 and the motion allow.
 """
@@ -46,8 +46,8 @@ def exact_cells(late: hl.Sequence, offset_ms: float) -> list[str]:
     return ["–", "–"] if found is None else [f"{1e3 * found.offset_s + offset_ms:+.2f}", f"{1e3 * found.sigma_s:.2f}"]
 
 
-def row(sequence: hl.Sequence, offset_ms: float, scans: int | None, exact: bool) -> str:
-    """Return a row of the table for one recording with one offset."""
+def row(sequence: hl.Sequence, offset_ms: float, scans: int | None, exact: bool, right: float | None) -> str:
+    """Return a row of the table for one recording with one offset; ``right`` is the drift without any."""
     late = replace(sequence, imu=moved(sequence.imu, 1e-3 * offset_ms))
     begin = time.process_time()
     found = compare_imu(late) if is_comparable(late) else None
@@ -63,8 +63,9 @@ def row(sequence: hl.Sequence, offset_ms: float, scans: int | None, exact: bool)
     cells += ["; ".join([*found.doubtful, *found.wrong]) if found is not None else "", f"{spent:.1f}"]
     if exact:
         cells += exact_cells(late, offset_ms)
-    if scans is not None:
-        cells += [f"{drift_percent(one, scans):.3f}" for one in (late, check_recording(late), sequence)]
+    if scans is not None and right is not None:
+        drifts = [drift_percent(one, scans) for one in (late, check_recording(late))]
+        cells += [f"{drift:.4f}" for drift in (*drifts, right)] + [f"{drifts[1] / right:.2f}"]
     return f"| {' | '.join(cells)} |"
 
 
@@ -79,12 +80,14 @@ def main() -> None:
     logging.disable(logging.WARNING)
     heads = ["recording", "offset, ms", "found, ms", "error, ms", "σ, ms", "applied", "doubts", "CPU s"]
     heads += ["error, ms, exact turns", "σ, ms, exact turns"] if options.exact else []
-    heads += ["ATE % uncorrected", "ATE % corrected", "ATE % right clock"] if options.drift else []
+    heads += ["ATE % uncorrected", "ATE % corrected", "ATE % right clock", "ratio"] if options.drift else []
     print(f"| {' | '.join(heads)} |\n| {' | '.join(['---'] * len(heads))} |")
     for path in options.data:
         sequence = hl.open_sequence(path)
+        scans = options.scans if options.drift else None
+        right = drift_percent(sequence, scans) if scans is not None else None
         for offset_ms in options.offsets_ms:
-            print(row(sequence, offset_ms, options.scans if options.drift else None, options.exact), flush=True)
+            print(row(sequence, offset_ms, scans, options.exact, right), flush=True)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import typer
 
 from hybridlio.commands import common
 from hybridlio.commands.common import guarded
-from hybridlio.commands.terminal import print_result, progress
+from hybridlio.commands.terminal import notes_held_back, print_result, progress
 from hybridlio.datasets.rosbag.choices import NO_CHOICE, BagTopics
 
 if TYPE_CHECKING:
@@ -41,10 +41,11 @@ def info(
     found = _topics(path) if name == "rosbag" else None
     if found is not None and not as_json:
         _print_topics(path, found)  # before an error on which of them to use
-    recording = common.open_data(data, sequence, reader, raw_root, None, None, topics, rate)
-    summary = {"path": str(path), "reader": name, "topics": found, **summarise(recording)}
-    if check:
-        _add_check(summary, recording)
+    with notes_held_back():
+        recording = common.open_data(data, sequence, reader, raw_root, None, None, topics, rate)
+        summary = {"path": str(path), "reader": name, "topics": found, **summarise(recording)}
+        if check:
+            _add_check(summary, recording)
     if as_json:
         print_result(json.dumps(summary, indent=2, ensure_ascii=False))
         return

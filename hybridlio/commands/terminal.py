@@ -69,14 +69,45 @@ def set_up_logging(verbosity: int) -> None:
     logging.getLogger("matplotlib").setLevel(logging.WARNING if verbosity else logging.ERROR)
 
 
+@contextmanager
+def notes_held_back() -> Iterator[None]:
+    """Print no notes on recordings, for a command that shows them itself; after an error print them all."""
+    handlers = [h for h in logging.getLogger("hybridlio").handlers if isinstance(h, _Handler)]
+    for handler in handlers:
+        handler.held = []
+    try:
+        yield
+    except Exception:
+        for handler in handlers:
+            handler.print_held()
+        raise
+    finally:
+        for handler in handlers:
+            handler.held = None
+
+
 class _Handler(logging.Handler):
-    """Print records as ``warning: …`` or with a note's kind, ``corrected: …``, above a progress bar if one is shown."""
+    """Print records as ``warning: …`` or with a note's kind, ``corrected: …``, above a progress bar if one is shown.
+
+    Attributes:
+        held: the notes that are kept back for now; None to print them.
+    """
 
     def __init__(self, verbosity: int) -> None:
         super().__init__()
         self._verbosity = verbosity
+        self.held: list[logging.LogRecord] | None = None
+
+    def print_held(self) -> None:
+        """Print the notes that were kept back."""
+        held, self.held = self.held or [], None
+        for record in held:
+            self.emit(record)
 
     def emit(self, record: logging.LogRecord) -> None:
+        if self.held is not None and hasattr(record, "kind"):
+            self.held.append(record)
+            return
         logger_name = f" ({record.name})" if self._verbosity > 1 else ""
         label = getattr(record, "kind", record.levelname.lower())  # a note's kind says more than its level
         style = {logging.WARNING: "yellow", logging.ERROR: "red"}.get(record.levelno, "dim")

@@ -47,7 +47,7 @@ class StatedCalibration:
         rate_hz: scans per second, for a folder without stamps.
         layout: the columns of ``.bin`` scans.
         format: what is stated about the points.
-        lidars: poses of further lidars in the first one's frame, by their topics.
+        lidars: poses of further lidars in the first one's frame, by their topics or folders.
         keys: the keys that are in the file; ``T_imu_lidar`` also where frames state it.
     """
 
@@ -77,8 +77,8 @@ def read_calibration_yaml(path: Path, needs_imu: bool = False) -> StatedCalibrat
     * ``imu_noise``: noise densities by the names of :class:`hybridlio.core.sensors.ImuNoise`;
     * ``frames``, ``imu_frame`` and ``lidar_frame``: in place of ``T_imu_lidar``, a list of transforms between frames as
       in a TF tree, each ``parent``, ``child`` and the child's pose in the parent, and the names of the sensors' frames;
-    * ``lidars``: of a bag with several lidars that are merged, the pose of each further one in the first one's frame,
-      by its topic, in any form of a transform;
+    * ``lidars``: where several lidars are merged, the pose of each further one in the first one's frame, by its topic
+      or the folder of its scans, in any form of a transform;
     * ``vehicle``: a box in the lidar frame, corners ``min`` and ``max`` in metres, whose points are left out;
     * ``sigmas``: standard deviations as ``hybridlio calibrate`` writes them, for the reader's information alone;
     * ``rate_hz``: scans per second, for a folder without a file of stamps;
@@ -212,7 +212,7 @@ def _lidar(key: str, value: Any) -> tuple[LidarModel | None, tuple[float, float]
 
 def _lidars(key: str, value: Any) -> dict[str, Array]:
     if not isinstance(value, dict):
-        raise DataError(f"{key}: expected a mapping of topics to transforms, got {value!r}")
+        raise DataError(f"{key}: expected a mapping of topics or folders to transforms, got {value!r}")
     return {str(name): parse_transform(f"{key}: {name}", part) for name, part in value.items()}
 
 

@@ -7,12 +7,14 @@ two padding fields and allocates what a header announces; here every announced s
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from hybridlio.core.errors import DataError
+from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.points.fields import (
     Columns,
     Field,
@@ -24,6 +26,8 @@ from hybridlio.datasets.points.fields import (
 
 _TYPES = {"F": "f", "I": "i", "U": "u"}
 _MAX_EXPANSION = 88  # LZF's longest reference, 3 bytes for 264
+_HEAD_BYTES = 4096  # of a header, at least; usual ones have 200 to 400
+_SAME_PLACE_M, _SAME_ROTATION = 1e-3, 1e-4  # of a viewpoint that states nothing; numbers rounded in text
 _MAX_COUNT = 1 << 16  # values in a field; histograms of PCL have some hundreds
 
 
@@ -46,6 +50,28 @@ def read_pcd(path: Path) -> Columns:
     if header.kind == b"binary":
         return binary_columns(data, header.fields, header.points)
     return blocked_columns(_decompressed(data, header), header.fields, header.points)
+
+
+def note_viewpoints(paths: Sequence[Path], notes: Notes) -> None:
+    """Note headers that state a pose of the sensor: programs differ in whether the points are moved by it already."""
+    farthest_m, turned = 0.0, False
+    for path in paths:
+        try:
+            with path.open("rb") as file:
+                head = file.read(_HEAD_BYTES)
+            stated = re.search(rb"^VIEWPOINT +(.+)$", head.split(b"\nDATA")[0], re.MULTILINE)
+            numbers = np.array(stated[1].split() if stated else [], np.float64)
+        except (OSError, ValueError):
+            continue  # the error comes when the scan is read
+        if numbers.shape == (7,) and np.isfinite(numbers).all():
+            farthest_m = max(farthest_m, float(np.linalg.norm(numbers[:3])))
+            turned |= bool(np.abs(numbers[4:]).max() > _SAME_ROTATION)
+    if farthest_m > _SAME_PLACE_M or turned:
+        notes.add(
+            f"the headers state poses of the sensor (VIEWPOINT, up to {farthest_m:.1f} m from the origin"
+            f"{', turned' if turned else ''}), which are not applied: points are taken to be in the lidar's frame. If "
+            "they are in a map's frame, transform each scan by the inverse of its pose"
+        )
 
 
 def _split(content: bytes) -> tuple[_Header, bytes]:

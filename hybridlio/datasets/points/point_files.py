@@ -112,6 +112,8 @@ def open_point_files(
     except DataError as error:
         named = str(error).startswith(str(paths[0].parent))
         raise DataError(str(error) if named else _at(paths[0].parent if len(paths) > 1 else paths[0], error)) from None
+    if paths[0].suffix == ".pcd":
+        pcd.note_viewpoints([paths[k] for k in sampled(len(paths))], notes)
     return PointFiles(paths, stamps_ns, read, found)
 
 

@@ -9,7 +9,7 @@ applies it to each scan.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -28,17 +28,9 @@ ORIGINS = ("stamp", "absolute", "start", "middle", "end")
 # in order of preference; lower case, without a suffix that names the unit
 _NAMES = (
     *("t", "time", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset", "timeoffset", "ts", "offset"),
-    *(
-        "relative_time",
-        "time_relative",
-        "relative_timestamp",
-        "dt",
-        "delta_t",
-        "delta_time",
-        "utime",
-        "point_timestamp",
-    ),
-    *("toffset", "t_offset", "point_time", "point_time_offset", "rel_time", "reltime", "time_rel", "gps_time", "stamp"),
+    *("relative_time", "time_relative", "relative_timestamp", "dt", "delta_t", "delta_time", "utime"),
+    *("point_timestamp", "toffset", "t_offset", "point_time", "point_time_offset", "rel_time", "reltime", "time_rel"),
+    *("gps_time", "stamp"),
 )
 _LIKELY = ("time", "stamp", "offset", "delta", "nsec", "usec")  # parts of other names that may mean a time
 _SUFFIXES = {"_s": "s", "_sec": "s", "_ms": "ms", "_us": "us", "_ns": "ns", "_nsec": "ns"}
@@ -52,6 +44,10 @@ _FULL_SHARE = 0.9  # of 0 to 1: the points of a sweep that is written as shares 
 _MIN_RESOLUTION = 16  # steps of the number type in a sweep of 0.1 s: 6 ms, 6 cm at 10 m/s
 _FINE_STEP = 1e-3  # of a number type, in its own unit: coarser ones can make a column constant
 _NEAR_SWEEPS = 2.0  # relative times, and absolute ones on the stamps' clock, lie within two sweeps of the stamp
+_PIECE = 0.1  # of the usual number of points: a scan with fewer may be a piece of a sweep, and span as little
+_OTHER_UNIT = (
+    0.01  # of the usual span: units differ by 1000, and such a share of a sweep holds fewer points than a piece
+)
 _AT_END = 0.1  # of a sweep: the stamp is at its start, middle or end, with a gap of missing points
 
 
@@ -84,11 +80,14 @@ class PointTimes:
         origin: where the values count from. ``stamp``: the scan's stamp. ``absolute``: the origin of the stamps.
             ``start``, ``middle``, ``end``: the scan's stamp is the time of the sweep's first point, middle or last
             point, whatever the values count from.
+        span_ns, points: of a usual scan, to know a scan by whose times are in another unit; 0 if unknown.
     """
 
     column: str
     unit_ns: int
     origin: str
+    span_ns: int = field(default=0, compare=False)
+    points: int = field(default=0, compare=False)
 
     def offsets_ns(self, columns: Columns, stamp_ns: int) -> Stamps:
         """Return the time of each point minus the scan's stamp, ``(N,)`` int64 nanoseconds.
@@ -98,7 +97,8 @@ class PointTimes:
             stamp_ns: the scan's stamp.
 
         Raises:
-            DataError: the column is missing, has a value that is not finite, or leads over 1 s away from the stamp.
+            DataError: the column is missing, has a value that is not finite, leads over 1 s away from the stamp, or
+                spans a small part of the time that it spans in other scans.
         """
         if self.column not in columns:
             raise DataError(f"column '{self.column}' of the point times is missing; other scans have it")
@@ -106,6 +106,11 @@ class PointTimes:
         if not len(times):
             return times
         first, last = int(times.min()), int(times.max())
+        if len(times) > _PIECE * self.points and last - first < _OTHER_UNIT * self.span_ns:
+            raise DataError(
+                f"column '{self.column}' spans {last - first:,} ns in this scan and {self.span_ns:,} ns in others: "
+                "its times are in another unit, or missing"
+            )
         zero = {
             **{"stamp": 0, "absolute": stamp_ns},
             **{"start": first, "middle": (first + last) // 2, "end": last},
@@ -210,7 +215,8 @@ def _convention(
     if not ends:
         raise errors[0]
     origin = stated.origin or _origin(ends, step_ns)
-    found = PointTimes(name, unit_ns, origin)
+    span_ns = int(np.median([last - first for _, first, last in ends]))
+    found = PointTimes(name, unit_ns, origin, span_ns, int(np.median([len(column) for _, column in values])))
     for stamp, column in values:
         try:
             offsets.append(found.offsets_ns({name: column}, stamp))

@@ -1,8 +1,8 @@
 """The first bytes of large messages, in order of receipt, without reading the rest of them.
 
 Opening a bag takes the stamps of its clouds, which are nearly all of its bytes. Where the storage allows it, as SQLite
-and chunks without compression do, only the first bytes of each cloud are read from the file. ``rosbags`` finds the
-messages; it reads each one whole.
+and chunks without compression do, only the first bytes of each cloud are read from the file; compressed chunks of ROS 1
+are decompressed up to there. ``rosbags`` finds the messages; it reads each one whole.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from heapq import merge
 from typing import Any
 
 from hybridlio.core.errors import DataError
+from hybridlio.datasets.rosbag.chunk_start import ChunkStart
 
 HEAD_BYTES = 1024  # of a message: the stamp, and the name of a frame
 _RECORD = struct.Struct("<BQ")  # MCAP, https://mcap.dev/spec: kind and length of a record
@@ -49,7 +50,7 @@ def _of_owner(owner: Any, connections: list[Any], cut: Collection[str]) -> Itera
         yield from _sqlite(owner, connections, cut)
     elif isinstance(owner, McapReader) and owner.chunks:
         yield from _mcap(owner, connections, cut)
-    elif isinstance(owner, Reader) and _is_plain_ros1(owner):
+    elif isinstance(owner, Reader):
         yield from _ros1(owner, connections, cut)
     else:
         for connection, received_ns, raw in owner.messages(connections):
@@ -114,21 +115,31 @@ def _plain_chunk(file: Any, chunk: Any, channels: dict[int, Any], cut: Collectio
     yield from sorted(found, key=lambda message: message[0])
 
 
-def _is_plain_ros1(reader: Any) -> bool:
-    from rosbags.rosbag1.reader import decompressors
-
-    return all(chunk.decompressor is decompressors["none"] for chunk in reader.chunks.values())
-
-
 def _ros1(reader: Any, connections: list[Any], cut: Collection[str]) -> Iterator[Message]:
     from rosbags.rosbag1.reader import Header, RecordType, read_bytes, read_uint32
 
-    topics, file = {c.id: c.topic for c in connections}, reader.bio
+    topics, current, file = {c.id: c.topic for c in connections}, -1, reader.bio
     for entry in merge(*(reader.indexes[c] for c in topics)):
-        file.seek(reader.chunks[entry.chunk_pos].datapos + entry.offset)
+        if entry.chunk_pos != current:
+            current, (file, start) = entry.chunk_pos, _chunk_data(reader, entry.chunk_pos)
+        file.seek(start + entry.offset)
         header = Header.read(file)
         while header.get_uint8("op") == RecordType.CONNECTION:
             file.seek(read_uint32(file), 1)
             header = Header.read(file)
         topic, size = topics[header.get_uint32("conn")], read_uint32(file)
         yield topic, entry.time, read_bytes(file, min(size, HEAD_BYTES) if topic in cut else size)
+
+
+def _chunk_data(reader: Any, position: int) -> tuple[Any, int]:
+    """Return a file that holds the data of a chunk of a ROS 1 bag, and where in it they start."""
+    from bz2 import BZ2Decompressor
+
+    from lz4.frame import LZ4FrameDecompressor
+    from rosbags.rosbag1.reader import decompressors
+
+    chunk = reader.chunks[position]
+    if chunk.decompressor is decompressors["none"]:
+        return reader.bio, chunk.datapos
+    kind = BZ2Decompressor if chunk.decompressor is decompressors["bz2"] else LZ4FrameDecompressor
+    return ChunkStart(reader.bio, chunk.datapos, chunk.datasize, kind()), 0

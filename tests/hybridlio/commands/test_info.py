@@ -49,3 +49,24 @@ def test_topics_are_listed_also_where_the_choice_is_open(bag: Path) -> None:
     assert result.exit_code == 2
     assert "/imu/data" in result.stdout
     assert "no fixed transform between the IMU's frame 'mast'" in result.output
+
+
+def test_each_note_is_shown_once(tiny_drive: Path, tmp_path: Path) -> None:
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    for k in range(4):
+        np.save(scans / f"{k}.npy", open_sequence(tiny_drive)[k].scan.points)
+    result = CliRunner().invoke(app, ["info", str(tmp_path), "--rate", "10"])
+    assert result.exit_code == 0, result.output
+    assert result.output.count("evenly spaced, 10") == 1
+    assert result.output.count("no inertial data") == 1
+
+
+def test_notes_are_shown_also_where_the_recording_cannot_be_opened(tmp_path: Path) -> None:
+    (tmp_path / "scans").mkdir()
+    for k in range(4):
+        np.save(tmp_path / f"scans/{k}.npy", np.full((9, 3), 5e5 + k + 0.3))
+    result = CliRunner().invoke(app, ["info", str(tmp_path), "--rate", "10"])
+    assert result.exit_code == 2
+    assert result.output.count("scans are taken to be evenly spaced") == 1
+    assert "in a map's frame" in result.output

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from hybridlio.core.errors import DataError
-from hybridlio.datasets.points.pcd import read_pcd
+from hybridlio.datasets.notes import Notes
+from hybridlio.datasets.points.pcd import note_viewpoints, read_pcd
 from hybridlio.datasets.points.point_files import read_scan
 
 COUNT = 50
@@ -117,3 +118,21 @@ def test_a_malformed_header_is_refused(tmp_path: Path, change: tuple[bytes, byte
     (tmp_path / "scan.pcd").write_bytes(content.replace(*change))
     with pytest.raises(DataError, match="cannot read the header"):
         read_pcd(tmp_path / "scan.pcd")
+
+
+@pytest.mark.parametrize(
+    ("viewpoint", "says"),
+    [
+        ("0 0 0 1 0 0 0", ""),
+        ("0.0 0.0 0.0 1.0 0.0 0.0 0.0", ""),
+        ("4 0 3 1 0 0 0", "up to 5.0 m from the origin)"),
+        ("0 0 0 0.7 0 0 0.7", "up to 0.0 m from the origin, turned)"),
+    ],
+)
+def test_a_stated_pose_of_the_sensor_is_not_applied_and_said(tmp_path: Path, viewpoint: str, says: str) -> None:
+    head = header([(axis, "<f4", 1) for axis in "xyz"], "binary").replace(b"0 0 0 1 0 0 0", viewpoint.encode())
+    (tmp_path / "scan.pcd").write_bytes(head + XYZ.tobytes())
+    notes = Notes("ride")
+    note_viewpoints([tmp_path / "scan.pcd"], notes)
+    assert [says in note for note in notes.texts] == [True] * bool(says)
+    np.testing.assert_array_equal(read_scan(tmp_path / "scan.pcd", 0).points, XYZ)

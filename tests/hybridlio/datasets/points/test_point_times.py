@@ -212,3 +212,15 @@ def test_one_bad_scan_among_five_does_not_decide(bad: float, at: int) -> None:
     found, _ = find(times, stamps=stamps)
     assert found == PointTimes("t", 1, "stamp")
     np.testing.assert_array_equal(offsets(found, times[(at + 1) % 5]), SWEEP)
+
+
+@pytest.mark.parametrize("factor", [1000, 1_000_000, 1_000_000_000])
+def test_a_scan_in_another_unit_than_the_others_is_refused(factor: int) -> None:
+    found, _ = find([SWEEP for _ in STAMPS])
+    with pytest.raises(DataError, match=r"spans [\d,]+ ns in this scan and 99,900,000 ns in others.*another unit"):
+        offsets(found, SWEEP // factor)
+
+
+def test_a_piece_of_a_sweep_is_in_the_unit_of_the_others() -> None:
+    found, _ = find([SWEEP for _ in STAMPS])
+    np.testing.assert_array_equal(offsets(found, SWEEP[200:205]), SWEEP[200:205])
