@@ -36,12 +36,12 @@ from hybridlio.commands.terminal import progress
 from hybridlio.core import se3
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.files import write_atomically
-from hybridlio.core.packed_arrays import PackedList
 from hybridlio.core.sensors import Calibration, Frame, ImuSamples, Scan
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.odometry.estimate import Estimate
 from hybridlio.odometry.odometry import Odometry
+from hybridlio.record.packed_arrays import PackedList
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.simulate import simulate
 

@@ -31,7 +31,7 @@ def calibrate(
             "--calibrate",
             metavar="A,B,…",
             autocompletion=completion.calibrated,
-            help="What to find: extrinsics, time_offset, lever_arm, gps_clock.",
+            help="What to find: extrinsics, time_offset, imu_scale, lever_arm, gps_clock.",
         ),
     ] = "extrinsics,time_offset",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file.")] = False,

@@ -12,6 +12,7 @@ import numpy as np
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.files import read_yaml
+from hybridlio.core.imu_scale import ImuScale
 from hybridlio.core.lidar_models import LIDAR_MODELS, LidarModel
 from hybridlio.core.sensors import MAX_RANGE_M, Calibration, ImuNoise
 from hybridlio.core.setting_checks import SettingError
@@ -24,10 +25,11 @@ from hybridlio.datasets.transform_forms import HOW_TO_WRITE, parse_transform
 _KEYS = (
     *("T_imu_lidar", "T_camera_lidar", "lidar", "antenna_imu_m", "imu_time_offset_s", "imu_noise", "rate_hz"),
     *("columns", "point_times", "vehicle", "frames", "imu_frame", "lidar_frame", "lidars"),
-    "sigmas",
+    *("imu_scale", "sigmas"),
 )
 _LIDAR_KEYS = ("model", "min_range_m", "max_range_m")
 _VEHICLE_KEYS = ("min", "max")
+_SCALE_KEYS = ("gyro", "accel")
 _FRAME_KEYS = ("parent", "child")
 _TIMES_KEYS = ("column", "unit", "origin", "sweep_s")
 _MAX_TIME_OFFSET_S = 1e10  # of clocks that count from different years; larger ones are another unit
@@ -44,6 +46,7 @@ class StatedCalibration:
         lidar: the lidar's model.
         imu_noise: the IMU's noise densities.
         imu_time_offset_s: to add to the IMU's stamps to bring them to the scans' clock.
+        imu_scale: scale and misalignment of the IMU's axes.
         rate_hz: scans per second, for a folder without stamps.
         layout: the columns of ``.bin`` scans.
         format: what is stated about the points.
@@ -55,6 +58,7 @@ class StatedCalibration:
     lidar: LidarModel | None = None
     imu_noise: ImuNoise | None = None
     imu_time_offset_s: float | None = None
+    imu_scale: ImuScale = field(default_factory=ImuScale)
     rate_hz: float | None = None
     layout: BinLayout | None = None
     format: StatedFormat = field(default_factory=StatedFormat)
@@ -74,6 +78,8 @@ def read_calibration_yaml(path: Path, needs_imu: bool = False) -> StatedCalibrat
       and ``max_range_m``; points outside stated ranges are left out;
     * ``imu_time_offset_s``: seconds to add to the IMU's stamps to bring them to the scans' clock; without it the
       offset is found before a run;
+    * ``imu_scale``: matrices ``gyro`` and ``accel`` that bring the samples to true scale and orthogonal axes, see
+      :class:`hybridlio.core.imu_scale.ImuScale`;
     * ``imu_noise``: noise densities by the names of :class:`hybridlio.core.sensors.ImuNoise`;
     * ``frames``, ``imu_frame`` and ``lidar_frame``: in place of ``T_imu_lidar``, a list of transforms between frames as
       in a TF tree, each ``parent``, ``child`` and the child's pose in the parent, and the names of the sensors' frames;
@@ -128,6 +134,7 @@ def _stated(content: dict[str, Any]) -> StatedCalibration:
         lidar=lidar,
         imu_noise=read("imu_noise", _imu_noise, None),
         imu_time_offset_s=read("imu_time_offset_s", _time_offset_s, None),
+        imu_scale=read("imu_scale", _imu_scale, ImuScale()),
         rate_hz=read("rate_hz", lambda key, value: _number(key, value, 0, MAX_RATE_HZ), None),
         layout=read("columns", lambda _, value: stated_layout(value), None),
         format=StatedFormat(read("point_times", _point_times, None), limits_m, read("vehicle", _vehicle, None)),
@@ -222,6 +229,14 @@ def _imu_noise(key: str, value: Any) -> ImuNoise:
         return ImuNoise(**{name: _number(f"{key}: {name}", v, -np.inf, np.inf) for name, v in values.items()})
     except SettingError as error:
         raise DataError(f"{key}: {error}") from None
+
+
+def _imu_scale(key: str, value: Any) -> ImuScale:
+    matrices = _mapping(key, value, _SCALE_KEYS)
+    try:
+        return ImuScale(**{name: np.array(rows, dtype=np.float64) for name, rows in matrices.items()})
+    except (ValueError, TypeError):
+        raise DataError(f"{key}: expected matrices gyro and accel, each of three rows of three numbers") from None
 
 
 def _point_times(key: str, value: Any) -> StatedTimes:

@@ -25,7 +25,7 @@ from hybridlio.core.trajectory import read_tum
 from hybridlio.datasets.calibration_yaml import StatedCalibration, read_calibration_yaml
 from hybridlio.datasets.gps_csv import note_fixes, read_gps_csv
 from hybridlio.datasets.imu_csv import read_imu_csv
-from hybridlio.datasets.imu_mounting import note_mounting, on_scans_clock
+from hybridlio.datasets.imu_mounting import as_stated, note_mounting
 from hybridlio.datasets.kitti.vertical_angle import raised
 from hybridlio.datasets.merged_lidars import MergedScans, OtherLidar, nearest_scans
 from hybridlio.datasets.notes import Notes
@@ -88,7 +88,7 @@ def open_folder(
     scans = stamped(folder, scan_files(folder), stated.rate_hz if rate_hz is None else rate_hz, notes)
     stamps = scans.stamps_ns
     if len(imu):
-        imu = on_scans_clock(imu, stated.imu_time_offset_s, notes)
+        imu = as_stated(imu, stated.imu_scale, stated.imu_time_offset_s, notes)
         note_mounting(imu, stated.calibration.T_imu_lidar, notes)
     else:
         notes.add(f"no inertial data: {folder / 'imu.csv'} does not exist")
@@ -109,6 +109,7 @@ def open_folder(
         lidar=stated.lidar,
         imu_noise=stated.imu_noise,
         imu_time_offset_s=stated.imu_time_offset_s,
+        imu_scale=stated.imu_scale,
         notes=tuple(notes.texts),
     )
 

@@ -1,10 +1,11 @@
-"""Inertial samples beside scans: on the scans' clock, and mounted as the extrinsics state."""
+"""Inertial samples beside scans: on their clock, at true scale, and mounted as the extrinsics state."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from hybridlio.core.arrays import Array
+from hybridlio.core.imu_scale import ImuScale
 from hybridlio.core.sensors import NS_PER_S, ImuSamples
 from hybridlio.datasets.notes import Notes
 
@@ -12,8 +13,11 @@ _MAX_LEVER_ARM_M = 20.0  # from IMU to lidar on any vehicle; more is another uni
 _MAX_UPSIDE_DOWN = -0.5  # cosine of the angle between the specific force and the lidar's z axis: 120°, no hill
 
 
-def on_scans_clock(imu: ImuSamples, offset_s: float | None, notes: Notes) -> ImuSamples:
-    """Return the samples with their stamps moved by the stated offset of the clocks."""
+def as_stated(imu: ImuSamples, scale: ImuScale, offset_s: float | None, notes: Notes) -> ImuSamples:
+    """Return the samples at the stated scale, with their stamps moved by the stated offset of the clocks."""
+    if not scale.is_identity:
+        notes.found("IMU samples are corrected by the scale that calibration.yaml states")
+    imu = scale.corrected(imu)
     if not offset_s:
         return imu
     notes.found(f"IMU stamps are moved by {offset_s:+.6f} s, as calibration.yaml states")

@@ -10,6 +10,7 @@ import numpy as np
 
 from hybridlio.core.arrays import Array, Stamps
 from hybridlio.core.errors import ConfigError, DataError, HybridLioError, strip_control
+from hybridlio.core.imu_scale import ImuScale
 from hybridlio.core.lidar_models import LidarModel
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, GpsFix, ImuNoise, ImuSamples, Scan
 from hybridlio.core.trajectory import Trajectory
@@ -38,6 +39,7 @@ class Sequence:
         imu_noise: the IMU's noise densities, or None if the recording does not give them.
         imu_time_offset_s: seconds that were added to the IMU's stamps to bring them to the scans' clock: stated by the
             recording's calibration, or found (:func:`hybridlio.runs.recording_check.check_recording`); None if neither.
+        imu_scale: the scale that the IMU's samples were corrected by, as the recording's calibration states it.
         notes: what the reader found unusual (gaps, dropped stamps, substitutes); also logged when opening.
         source: how to open the recording again; None for one that was made in memory.
 
@@ -58,6 +60,7 @@ class Sequence:
     forward_speed_m_s: Array | None = None
     imu_noise: ImuNoise | None = None
     imu_time_offset_s: float | None = None
+    imu_scale: ImuScale = field(default_factory=ImuScale)
     notes: tuple[str, ...] = ()
     source: Source | None = None
 

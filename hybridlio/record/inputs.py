@@ -85,6 +85,7 @@ def record_of(odometry: Odometry, inputs: OdometryInputs, with_keyframes: bool =
     stated = _calibration(inputs.get("calibration"))
     notes: list[str] = []
     imu = _imu(inputs.get("imu"), notes)
+    imu = None if imu is None else stated.imu_scale.corrected(imu)
     poses = poses_of(cast("Any", odometry), inputs.get("stamps"), stated.calibration.T_camera_lidar)
     record = Record.from_odometry(
         poses, imu, fixes_of(inputs.get("fixes")), stated.calibration,

@@ -19,9 +19,9 @@ from hybridlio.cloud.voxel import voxel_average
 from hybridlio.core.arrays import Array, Floats, Index, Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.files import UNREADABLE_NPZ, atomic_path
-from hybridlio.core.packed_arrays import PackedCloud
 from hybridlio.core.sensors import Scan
 from hybridlio.core.setting_checks import check_positive, check_setting
+from hybridlio.record.packed_arrays import PackedCloud
 
 FORMAT_VERSION = 1  # stored in the file; other versions are rejected
 RESOLUTION_M = 0.005  # a quarter of a lidar's range noise; int16 then reaches 164 m

@@ -9,10 +9,10 @@ import numpy as np
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose, State
-from hybridlio.core.packed_arrays import PackedArray, pack_arrays, unpack_arrays
 from hybridlio.core.sensors import Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.record.loop_keyframes import LoopKeyframes
+from hybridlio.record.packed_arrays import PackedArray, pack_arrays, unpack_arrays
 from hybridlio.record.record import Record
 from hybridlio.record.step_arrays import earlier_scan_arrays, relative_arrays, relative_poses, with_earlier_scans
 

@@ -30,7 +30,8 @@ from hybridlio.odometry.config import Config
 from hybridlio.odometry.odometry import Odometry
 from hybridlio.runs.recording_check import compare_imu
 from hybridlio.runs.run import run_odometry
-from hybridlio.smoothing.calibration import OF_GPS, OF_IMU, Calibrated, CalibrationPriors, Parameter
+from hybridlio.runs.scale_search import ScaleSearch
+from hybridlio.smoothing.calibration import IMU_SCALE, OF_GPS, OF_IMU, Calibrated, CalibrationPriors, Parameter
 
 _NEWEST = 3  # rounds that give the slope: earlier ones had another mounting
 _MOST_ROUNDS = 6  # one of them beside the others, for the share of an error that a round shows
@@ -55,7 +56,8 @@ def calibrate(
     Args:
         sequence: the recording, with IMU samples. Its calibration is where the search starts: extrinsics within 10° and
             a few decimetres, clocks within 0.2 s.
-        parameters: names of :data:`hybridlio.smoothing.calibration.CALIBRATED`, or what is known of them before.
+        parameters: names of :data:`hybridlio.smoothing.calibration.CALIBRATED`, or what is known of them before. With
+            ``imu_scale`` also scale and misalignment of the IMU's axes (:mod:`hybridlio.calibration.imu_scale`).
         config: settings of the odometry.
         progress: called with the stage, the steps done and the steps in total.
 
@@ -67,11 +69,12 @@ def calibrate(
         ConfigError: an unknown parameter, or one whose sensor the recording lacks.
         DataError: fewer than 100 scans, or samples that do not belong to the scans at all.
     """
-    priors = parameters if isinstance(parameters, CalibrationPriors) else CalibrationPriors(parameters)
+    with_scale = not isinstance(parameters, CalibrationPriors) and IMU_SCALE in parameters
+    priors = parameters if isinstance(parameters, CalibrationPriors) else _priors(parameters)
     priors.check_sensors(has_imu=len(sequence.imu) > 0, has_gps=len(sequence.gps) > 0)
     if len(sequence) < _LEAST_SCANS:
         raise DataError(f"{sequence.name}: {len(sequence)} scans; calibration needs {_LEAST_SCANS} or more")
-    search = _Search(sequence, priors, config or Config(), progress or _silent)
+    search = _Search(sequence, priors, config or Config(), progress or _silent, ScaleSearch() if with_scale else None)
     search.start()
     for number in range(1, _MOST_ROUNDS + 1):
         if search.round(number):
@@ -79,18 +82,34 @@ def calibrate(
     return search.result()
 
 
+def _priors(names: Items[str]) -> CalibrationPriors:
+    """Return priors of what smoothing finds: all but the scale."""
+    if isinstance(names, str):
+        return CalibrationPriors(names)  # which says that several names are expected
+    return CalibrationPriors([name for name in names if name != IMU_SCALE])
+
+
 class _Search:
     """The search, with the recording at the calibration that was found last."""
 
-    def __init__(self, sequence: Sequence, priors: CalibrationPriors, config: Config, report: Progress) -> None:
+    def __init__(
+        self,
+        sequence: Sequence,
+        priors: CalibrationPriors,
+        config: Config,
+        report: Progress,
+        scale: ScaleSearch | None = None,
+    ) -> None:
         self._stated, self._now = sequence.calibration, sequence
         self._priors, self._config, self._report = priors, config, report
-        self._stated_offset_s = sequence.imu_time_offset_s or 0.0  # the reader has applied it
+        self._stated_offset_s = sequence.imu_time_offset_s or 0.0  # the reader has applied it, and the scale
+        self._stated_scale = sequence.imu_scale
         self._offset_s = 0.0  # added to the stamps of the samples since
         self._rounds: list[tuple[float, float]] = []  # clock of a round, and the change that it found
         self._best_s = 0.0  # the clock that the rounds so far mean
         self._share = 1.0  # of a clock's error that a round shows
         self._found: Calibrated | None = None
+        self._scale = scale
 
     def start(self) -> None:
         """Correct units, and take the clocks' offset from the check of recordings, which costs a part of a round.
@@ -136,6 +155,9 @@ class _Search:
             sigmas["time_offset"] = sigmas["time_offset"] / self._share
         self._found = replace(found, parameters=tuple(self._against_stated(one, moves) for one in found.parameters))
         settled = all(bool((np.abs(move) <= _SETTLED * sigmas[name]).all()) for name, move in moves.items())
+        if self._scale is not None:
+            self._now = replace(self._now, imu=self._scale.correct(record.online, self._now))
+            settled = settled and self._scale.is_settled
         if settled and not is_probed and number < _MOST_ROUNDS - 1:
             self._move(_PROBE_S)
             return False
@@ -161,7 +183,8 @@ class _Search:
     def result(self) -> Calibrated:
         """Return what the last round found."""
         assert self._found is not None
-        return replace(self._found, imu_time_offset_s=self._stated_offset_s + self._offset_s)
+        found = replace(self._found, imu_time_offset_s=self._stated_offset_s + self._offset_s)
+        return found if self._scale is None else self._scale.added_to(found, self._stated_scale)
 
     def _move(self, seconds: float) -> None:
         self._now = replace(self._now, imu=moved(self._now.imu, seconds))

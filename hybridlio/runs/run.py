@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
-from hybridlio.core.packed_arrays import PackedList
 from hybridlio.core.progress import Progress
 from hybridlio.core.sensors import NS_PER_S, Frame
 from hybridlio.core.trajectory import Trajectory
@@ -22,6 +21,7 @@ from hybridlio.datasets.sequence import Sequence
 from hybridlio.evaluation.evaluate import Steps
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.estimate import Estimate, steps_of, trajectory_of
+from hybridlio.record.packed_arrays import PackedList
 from hybridlio.record.record import Record
 from hybridlio.sources.innovation_gate import GATE_NIS, Verdict
 

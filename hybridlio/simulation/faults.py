@@ -103,6 +103,32 @@ def imu_bias(sequence: Sequence, sigmas: float, seed: int = 0) -> Sequence:
     return replace(sequence, imu=biased, notes=(*sequence.notes, note))
 
 
+def imu_scale_error(
+    sequence: Sequence, gyro: float = 0.015, accel: float = 0.005, cross: float = 0.01, seed: int = 0
+) -> Sequence:
+    """Give every axis of the IMU a wrong sensitivity, and let it pick up a part of what the other two should measure.
+
+    The defaults are those of a consumer MEMS IMU: sensitivities wrong by their tolerance, with random sign, and up to
+    half of the tolerance of 2 % across axes (data sheet of the InvenSense ICM-20948).
+
+    Args:
+        sequence: the recording.
+        gyro, accel: relative errors of the sensitivities.
+        cross: largest share of another axis, uniformly distributed.
+        seed: of the signs and shares.
+    """
+    rng = np.random.default_rng([seed, RandomStream.IMU_SCALE])
+    others = 1.0 - np.eye(3)
+    by_gyro, by_accel = (
+        np.eye(3) + np.diag(share * rng.choice([-1.0, 1.0], 3)) + rng.uniform(-cross, cross, (3, 3)) * others
+        for share in (gyro, accel)
+    )
+    imu = sequence.imu
+    wrong = ImuSamples(imu.stamps_ns, imu.gyro_rad_s @ by_gyro.T, imu.accel_m_s2 @ by_accel.T)
+    note = f"injected fault: IMU scale off by {100 * gyro:g} and {100 * accel:g} %, {100 * cross:g} % between axes"
+    return replace(sequence, imu=wrong, notes=(*sequence.notes, note))
+
+
 def _between(sequence: Sequence, start_s: float, end_s: float) -> tuple[int, int]:
     if not start_s <= end_s:
         raise ConfigError(f"faults: the interval from {start_s} to {end_s} s ends before it starts")

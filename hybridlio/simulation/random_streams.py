@@ -29,3 +29,4 @@ class RandomStream(IntEnum):
     AIR = 16  # and the scan's number
     DUST = 17
     PEOPLE = 18  # and the person's number
+    IMU_SCALE = 19

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +20,26 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.files import write_atomically
+from hybridlio.core.imu_scale import ImuScale
 from hybridlio.core.sensors import Calibration
 from hybridlio.core.setting_checks import check_positive
 
 CALIBRATED = ("time_offset", "extrinsics", "lever_arm", "gps_clock")
 OF_IMU, OF_GPS = ("time_offset", "extrinsics"), ("lever_arm", "gps_clock")
+IMU_SCALE = "imu_scale"  # which a whole recording shows, and no graph has as a variable
 # Information of the measurements over that of the prior, in a direction that counts as determined: a tenth of the
 # prior's error is then left in the estimate at most.
 _DETERMINED = 10.0
-_AXES = "xyz"
+# Names of a vector's components: of a matrix, row by row.
+_AXES = {3: tuple("xyz"), 9: tuple(row + column for row in "xyz" for column in "xyz")}
 _ALONG_AXIS = 0.98  # component of a unit vector that is called by the axis' name: within 11 degrees
-_UNITS = {"time_offset": (1e3, "ms"), "gps_clock": (1e3, "ms"), "rotation": (np.rad2deg(1.0), "°")}
+_UNITS = {"time_offset": (1e3, "ms"), "gps_clock": (1e3, "ms"), "rotation": (np.rad2deg(1.0), "°")} | dict.fromkeys(
+    ("gyro_scale", "accel_scale"), (1e2, "%")
+)
 _METRES = (1e2, "cm")
-_SI_UNITS = {"time_offset": "s", "gps_clock": "s", "rotation": "rad"}
+_SI_UNITS = {"time_offset": "s", "gps_clock": "s", "rotation": "rad"} | dict.fromkeys(
+    ("gyro_scale", "accel_scale"), "ratio"
+)
 _FRAMES = ("frames", "imu_frame", "lidar_frame")  # keys of calibration.yaml that T_imu_lidar takes the place of
 
 
@@ -86,9 +93,10 @@ class Parameter:
     """A calibrated parameter.
 
     Attributes:
-        name: ``rotation``, ``translation`` (of ``T_imu_lidar``), ``time_offset``, ``lever_arm`` or ``gps_clock``.
+        name: ``rotation``, ``translation`` (of ``T_imu_lidar``), ``time_offset``, ``lever_arm``, ``gps_clock``,
+            ``gyro_scale`` or ``accel_scale``.
         change: ``(d,)`` estimate minus what was stated; rad, m or s. A rotation's is a rotation vector in the lidar
-            frame (right perturbation), a translation's is in the IMU frame.
+            frame (right perturbation), a translation's is in the IMU frame, a scale's the matrix's elements by rows.
         covariance: ``(d, d)``; in undetermined directions that of the prior.
         prior_sigma: standard deviation of each component before.
         undetermined: ``(u, d)`` unit vectors of the directions that the motion does not determine.
@@ -122,14 +130,20 @@ class Parameter:
 
     def __str__(self) -> str:
         factor, unit = _UNITS.get(self.name, _METRES)
-        columns = zip(factor * self.change, factor * self.sigmas, strict=True)
-        return f"{self.name} {', '.join(f'{value:+.3g} ± {sigma:.2g}' for value, sigma in columns)} {unit}"
+        columns = [
+            f"{value:+.3g} ± {sigma:.2g}"
+            for value, sigma in zip(factor * self.change, factor * self.sigmas, strict=True)
+        ]
+        if len(columns) == len(_AXES[9]):  # of a matrix: those along the axes, and the largest one across
+            across = factor * np.abs(self.change.reshape(3, 3) * (1 - np.eye(3))).max()
+            return f"{self.name} {', '.join(columns[::4])} {unit}, up to {across:.2g} {unit} across axes"
+        return f"{self.name} {', '.join(columns)} {unit}"
 
 
 def _direction(vector: Array) -> str:
     largest = int(np.abs(vector).argmax())
-    if abs(vector[largest]) > _ALONG_AXIS:
-        return _AXES[largest]
+    if abs(vector[largest]) > _ALONG_AXIS and len(vector) in _AXES:
+        return _AXES[len(vector)][largest]
     return f"({', '.join(f'{value:.2f}' for value in vector * np.sign(vector[largest]))})"
 
 
@@ -138,6 +152,12 @@ def undetermined_directions(covariance: Array, prior_sigma: float) -> Array:
     variances, directions = np.linalg.eigh(covariance / prior_sigma**2)
     # posterior = 1 / (1 + r) of the prior, for information r of the measurements
     return np.asarray(directions.T[variances > 1 / (1 + _DETERMINED)])
+
+
+def undetermined_elements(covariance: Array, prior_sigmas: Array) -> Array:
+    """Return unit vectors ``(u, d)`` of the components whose posterior variance is close to the prior's ``(d,)``."""
+    d = len(prior_sigmas)
+    return np.asarray(np.eye(d)[np.diag(covariance) / prior_sigmas**2 > 1 / (1 + _DETERMINED)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +169,7 @@ class Calibrated:
         imu_time_offset_s: seconds to add to the IMU's stamps, as the recording has them, to bring them to the poses'
             clock.
         gps_time_offset_s: seconds to add to the fixes' stamps.
+        imu_scale: of the samples as they were recorded.
         parameters: what was calibrated, with its uncertainty.
     """
 
@@ -156,6 +177,7 @@ class Calibrated:
     imu_time_offset_s: float
     gps_time_offset_s: float
     parameters: tuple[Parameter, ...]
+    imu_scale: ImuScale = field(default_factory=ImuScale)
 
     def parameter(self, name: str) -> Parameter:
         """Return a parameter by name.
@@ -191,6 +213,8 @@ class Calibrated:
             content["antenna_imu_m"] = self.calibration.antenna_imu_m.tolist()
         if "time_offset" in names:
             content["imu_time_offset_s"] = self.imu_time_offset_s
+        if "gyro_scale" in names:
+            content["imu_scale"] = {"gyro": self.imu_scale.gyro.tolist(), "accel": self.imu_scale.accel.tolist()}
         content["sigmas"] = {
             f"{one.name}_{_SI_UNITS.get(one.name, 'm')}": one.sigmas.tolist() for one in self.parameters
         }
@@ -206,6 +230,7 @@ class Calibrated:
             "antenna_imu_m": None if antenna is None else antenna.tolist(),
             "imu_time_offset_s": self.imu_time_offset_s,
             "gps_time_offset_s": self.gps_time_offset_s,
+            "imu_scale": {"gyro": self.imu_scale.gyro.tolist(), "accel": self.imu_scale.accel.tolist()},
             "parameters": {
                 one.name: {"change": one.change.tolist(), "sigmas": one.sigmas.tolist(), "doubt": one.doubt}
                 for one in self.parameters

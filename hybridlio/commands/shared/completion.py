@@ -52,9 +52,9 @@ def _robust_methods() -> Iterable[str]:
 
 
 def _calibrated() -> Iterable[str]:
-    from hybridlio.smoothing.calibration import CALIBRATED
+    from hybridlio.smoothing.calibration import CALIBRATED, IMU_SCALE
 
-    return CALIBRATED
+    return (*CALIBRATED, IMU_SCALE)
 
 
 def _solvers() -> Iterable[str]:

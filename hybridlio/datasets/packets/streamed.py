@@ -15,7 +15,7 @@ from hybridlio.core.arrays import Stamps
 from hybridlio.core.errors import DataError, HybridLioError, strip_control
 from hybridlio.core.sensors import Calibration, ImuSamples, Scan
 from hybridlio.datasets.calibration_yaml import read_calibration_yaml
-from hybridlio.datasets.imu_mounting import note_mounting, on_scans_clock
+from hybridlio.datasets.imu_mounting import as_stated, note_mounting
 from hybridlio.datasets.kitti.vertical_angle import raised
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.points.fields import Columns
@@ -118,7 +118,7 @@ def packet_sequence(
     stated = read_calibration_yaml(path.parent / "calibration.yaml")
     T = stated.calibration.T_imu_lidar if "T_imu_lidar" in stated.keys else T_imu_lidar
     if len(imu):
-        imu = on_scans_clock(imu, stated.imu_time_offset_s, notes)
+        imu = as_stated(imu, stated.imu_scale, stated.imu_time_offset_s, notes)
         note_mounting(imu, T, notes)
     note_coverage(imu.stamps_ns, stamps, "inertial data", notes)
     scans = StreamedScans(path, turns, stamps, rows)
@@ -133,5 +133,6 @@ def packet_sequence(
         lidar=stated.lidar,
         imu_noise=stated.imu_noise,
         imu_time_offset_s=stated.imu_time_offset_s,
+        imu_scale=stated.imu_scale,
         notes=tuple(notes.texts),
     )

@@ -13,7 +13,7 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.lidar_models import LidarModel
 from hybridlio.core.sensors import Calibration, ImuSamples
 from hybridlio.datasets.calibration_yaml import StatedCalibration, read_calibration_yaml
-from hybridlio.datasets.imu_mounting import note_mounting, on_scans_clock
+from hybridlio.datasets.imu_mounting import as_stated, note_mounting
 from hybridlio.datasets.kitti.vertical_angle import raised
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.points.bin_layout import BinLayout
@@ -110,7 +110,7 @@ def sequence_of(found: Recording, notes: Notes, vertical_angle_deg: float | None
     mounting = _mounting(found, stated, notes)
     imu = found.imu
     if len(imu):
-        imu = on_scans_clock(imu, stated.imu_time_offset_s, notes)
+        imu = as_stated(imu, stated.imu_scale, stated.imu_time_offset_s, notes)
         note_mounting(imu, mounting.T_imu_lidar, notes)
     note_coverage(imu.stamps_ns, stamps, "inertial data", notes)
     points = replace(stated.format, times=stated.format.times or found.times)
@@ -126,6 +126,7 @@ def sequence_of(found: Recording, notes: Notes, vertical_angle_deg: float | None
         lidar=stated.lidar or found.lidar,
         imu_noise=stated.imu_noise,
         imu_time_offset_s=stated.imu_time_offset_s,
+        imu_scale=stated.imu_scale,
         notes=tuple(notes.texts),
     )
 

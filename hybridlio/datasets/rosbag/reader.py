@@ -15,7 +15,7 @@ from hybridlio.core.tables import counted
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.calibration_yaml import StatedCalibration, read_calibration_yaml
 from hybridlio.datasets.gps_csv import note_fixes
-from hybridlio.datasets.imu_mounting import note_mounting, on_scans_clock
+from hybridlio.datasets.imu_mounting import as_stated, note_mounting
 from hybridlio.datasets.kitti.vertical_angle import raised
 from hybridlio.datasets.merged_lidars import MergedScans, OtherLidar, nearest_scans
 from hybridlio.datasets.notes import Notes
@@ -116,7 +116,7 @@ def _open(path: Path, wanted: BagTopics, vertical_angle_deg: float | None) -> Se
     imu = _imu(chosen.get("imu"), contents.logs, notes)
     calibration = mounting.calibration(stated, has_imu=len(imu) > 0, has_gps="gps" in chosen)
     if len(imu):
-        imu = on_scans_clock(imu, stated.imu_time_offset_s, notes)
+        imu = as_stated(imu, stated.imu_scale, stated.imu_time_offset_s, notes)
         note_mounting(imu, calibration.T_imu_lidar, notes)
     note_coverage(imu.stamps_ns, scans.stamps_ns, "inertial data", notes)
     gps = measurements.gps_fixes(contents.logs["gps"], chosen["gps"].name, notes) if "gps" in chosen else ()
@@ -133,6 +133,7 @@ def _open(path: Path, wanted: BagTopics, vertical_angle_deg: float | None) -> Se
         lidar=stated.lidar,
         imu_noise=stated.imu_noise,
         imu_time_offset_s=stated.imu_time_offset_s,
+        imu_scale=stated.imu_scale,
         notes=tuple(notes.texts),
     )
 

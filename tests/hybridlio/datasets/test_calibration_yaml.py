@@ -96,6 +96,9 @@ class TestSensors:
             ("lidar", {"min_range_m": 5, "max_range_m": 4}),
             ("imu_time_offset_s", "0.1 s"),
             ("imu_time_offset_s", float("nan")),
+            ("imu_scale", {"gyro": [1, 1, 1]}),
+            ("imu_scale", {"gyro": "one"}),
+            ("imu_scale", {"gyroscope": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}),
             ("rate_hz", 0),
             ("rate_hz", True),
             ("columns", ["x", "y"]),
@@ -127,6 +130,16 @@ class TestInAFolder:
         sequence = open_sequence(folder)
         np.testing.assert_array_equal(sequence.imu.stamps_ns, before - 12_300_000)
         assert any("moved by -0.012300 s" in note for note in sequence.notes)
+
+    def test_the_imus_samples_are_corrected_by_the_stated_scale(self, recordings: Any, tmp_path: Path) -> None:
+        folder = recordings.write_folder(tmp_path, recordings.ride)
+        before = open_sequence(folder).imu
+        self.append(folder, "imu_scale: {gyro: [[1.01, 0, 0.02], [0, 1, 0], [0, 0, 1]]}\n")
+        sequence = open_sequence(folder)
+        gyro = before.gyro_rad_s + before.gyro_rad_s @ np.array([[0.01, 0, 0], [0, 0, 0], [0.02, 0, 0]])
+        np.testing.assert_allclose(sequence.imu.gyro_rad_s, gyro)
+        np.testing.assert_array_equal(sequence.imu.accel_m_s2, before.accel_m_s2)
+        assert any("corrected by the scale" in note for note in sequence.notes)
 
     def test_noise_and_ranges_reach_the_frames(self, recordings: Any, tmp_path: Path) -> None:
         folder = recordings.write_folder(tmp_path, recordings.ride)

@@ -7,7 +7,6 @@ import pytest
 
 from hybridlio.core import se3
 from hybridlio.core.errors import ConfigError, DataError, GraphError
-from hybridlio.core.packed_arrays import PackedCloud
 from hybridlio.core.sensors import GpsFix, Scan
 from hybridlio.datasets.sequence import Sequence, part_of
 from hybridlio.graph import PoseGraph
@@ -15,6 +14,7 @@ from hybridlio.graph.run.smooth import smooth
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.odometry import Odometry
 from hybridlio.record.loop_keyframes import LoopKeyframeSelector, LoopKeyframeSettings
+from hybridlio.record.packed_arrays import PackedCloud
 from hybridlio.record.record import Record
 from hybridlio.record.recorder import Recorder
 from hybridlio.runs.run import Run, run_odometry

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from hybridlio.core.packed_arrays import PackedArray, PackedCloud, PackedList, pack_arrays, unpack_arrays
 from hybridlio.record.loop_keyframes import LoopKeyframeSettings, compress
+from hybridlio.record.packed_arrays import PackedArray, PackedCloud, PackedList, pack_arrays, unpack_arrays
 
 
 @pytest.mark.parametrize(
