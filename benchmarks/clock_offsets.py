@@ -5,9 +5,9 @@ python benchmarks/clock_offsets.py DATA… [--offsets-ms -150 -50 -10 0 10 50 15
 Each recording's IMU stamps are moved by each offset in turn. The table has the offset that was found, its error and
 standard deviation, whether it was applied, and the processor time of the check. With `--drift` it also has the absolute
 trajectory error of odometry over the first scans, in percent of the path, with the offset uncorrected, corrected, and
-without any, and the ratio of the last two; this needs reference poses. With `--exact` it also has the error and the standard deviation that are left
-where the reference's turns, all of them and about all axes, take the place of the lidar's: what the gyroscope's noise
-and the motion allow.
+without any, and the ratio of the last two; this needs reference poses. With `--exact` it also has the error and the
+standard deviation that are left where the reference's turns, all of them and about all axes, take the place of the
+lidar's: what the gyroscope's noise and the motion allow.
 """
 
 from __future__ import annotations
