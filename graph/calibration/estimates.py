@@ -18,7 +18,7 @@ from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.calibrations import CalibrationKind, CalibrationVariable
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, check_key
-from hybridlio.smoothing.calibration import undetermined_directions
+from hybridlio.smoothing.calibration import Estimated, undetermined_directions
 
 _POSE = ("rotation about x", "rotation about y", "rotation about z", "x", "y", "z")
 _COMPONENTS = {
@@ -31,7 +31,7 @@ _NAMED_SHARE = 0.3  # of a unit vector: of six equal components, each has 0.4; s
 
 
 @dataclass(frozen=True, eq=False)
-class CalibrationEstimate:
+class CalibrationEstimate(Estimated):
     """A solved calibration variable.
 
     Attributes:
@@ -51,16 +51,6 @@ class CalibrationEstimate:
     change: Array
     covariance: Array
     undetermined: Array
-
-    @property
-    def sigmas(self) -> Array:
-        """Standard deviations of the components."""
-        return np.sqrt(np.diag(self.covariance))
-
-    @property
-    def is_determined(self) -> bool:
-        """Whether the measurements determine it in every direction."""
-        return not len(self.undetermined)
 
     @property
     def doubt(self) -> str | None:

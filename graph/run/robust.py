@@ -15,7 +15,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.estimates import State
 from hybridlio.graph.base import noise
-from hybridlio.graph.base.truncated_squares import GRADUATION, chi2_bound, first_control, truncated_weights
+from hybridlio.graph.base.truncated_squares import chi2_bound, graduate
 from hybridlio.graph.model.noise import Robust, default_width
 from hybridlio.graph.run.factor_groups import (
     FactorGroup,
@@ -29,7 +29,7 @@ from hybridlio.smoothing.verdict import KindFit
 # Kernels that tolerate outliers from the poses of the odometry on. Those that lose all weight (Tukey, truncated least
 # squares) drop correct loops there, and a dead zone keeps wrong ones (tests/graph/run/test_factor_groups.py).
 ROBUST_METHODS = ("huber", "cauchy", "geman-mcclure", "dcs", "gnc")
-_MAX_STEPS = 100  # a bound on loops that end by themselves: 1.4^100 graduates residuals of 10^7 standard deviations
+_MAX_STEPS = 100  # a bound on a loop that ends by itself
 _LEAST_WEIGHT = 0.5  # of a measurement that counts as accepted: one at the kernel's width keeps a quarter to a half
 _CONVERGED_RATIO = 0.99  # of the error to the previous one: weights do not depend on the last percent
 
@@ -178,18 +178,18 @@ def reject_outliers(
         Values, and weights ``(M,)``: 1 for inliers, 0 for outliers.
     """
     bounds = np.array([chi2_bound(len(measurement.covariance)) for measurement in measurements])
-    control = 0.0
-    for step in range(_MAX_STEPS):
-        shares = squared_residuals(measurements, values) / bounds  # so that one control parameter serves all sizes
-        control = control * GRADUATION if step else first_control(float(shares.max()), 1.0)
-        weights = truncated_weights(shares, 1.0, control)
+
+    def shares(at: gtsam.Values) -> Array:  # of the bounds, so that one control parameter serves all sizes
+        return np.asarray(squared_residuals(measurements, at) / bounds)
+
+    def weighted(at: gtsam.Values, weights: Array) -> gtsam.Values:
         graph = gtsam.NonlinearFactorGraph(trusted)
         for factor in robust_factors(measurements, "gnc", weights):
             graph.add(factor)
-        values = _solve_to_convergence(graph, values, solve)
-        if ((weights == 0) | (weights == 1)).all():
-            break
-    return values, np.round(weights)
+        return _solve_to_convergence(graph, at, solve)
+
+    values, weights = graduate(values, shares, weighted, 1.0)
+    return weighted(values, np.round(weights)), np.round(weights)
 
 
 def _solve_to_convergence(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, solve: Solve) -> gtsam.Values:

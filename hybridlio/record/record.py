@@ -106,7 +106,7 @@ class Record:
         calibration, imu_noise = calibration or Calibration(), imu_noise or ImuNoise()
         on_clock = on_poses_clock(trajectory, imu or ImuSamples.empty(), calibration, imu_time_offset_s)
         imu = on_clock.imu
-        steps = _steps_of(trajectory, imu, calibration, covariances)
+        steps = _steps_of(trajectory, on_clock.agreeing or imu, calibration, covariances)
         start_ns, end_ns = (int(stamp) for stamp in trajectory.stamps_ns[[0, -1]])
         inside = imu.between(start_ns, end_ns)
         first = inside.stamps_ns <= inside.stamps_ns[0] + NS_PER_S if len(inside) else np.zeros(0, bool)

@@ -8,6 +8,10 @@ A round does not show all of an error of the clock, because the scans that it is
 same clock: between 0.15 and 0.6 of it in simulated scenes. So what a round finds is divided by that share, which is the
 slope between rounds at different clocks (secant method). Its standard deviation is divided too, and else would claim
 two to seven times too much. Where the rounds' clocks are too close for a slope, one round is made beside them.
+
+Steps of scan matching state larger covariances than their errors. So all variances are multiplied by the χ² per degree
+of freedom that the last round left (the variance of unit weight of adjustment theory; Koch, "Parameter Estimation and
+Hypothesis Testing in Linear Models", 1999, section 3.2).
 """
 
 from __future__ import annotations
@@ -143,6 +147,8 @@ class _Search:
         record = replace(run.odometry.record(), imu_noise=self._config.imu_noise or self._now.imu_noise or ImuNoise())
         smoothed = smooth(record, gps=uses_gps, calibrate=self._priors)
         found: Calibrated = smoothed.found["calibration"]
+        factor = smoothed.verdict.variance_factor
+        found = replace(found, parameters=tuple(one.scaled(factor) for one in found.parameters))
         self._now = replace(self._now, calibration=found.calibration)
         sigmas = {one.name: one.sigmas for one in found.parameters}
         moves = {one.name: one.change for one in found.parameters if one.name != _CLOCK}

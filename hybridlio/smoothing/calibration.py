@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -88,8 +88,30 @@ class CalibrationPriors:
                 raise ConfigError(f"calibrate: {name} needs GPS fixes; give gps=True")
 
 
+class Estimated:
+    """What calibrated parameters of runs and calibration variables of pose graphs have in common.
+
+    Attributes:
+        covariance: ``(d, d)``.
+        undetermined: ``(u, d)`` unit vectors of the directions that nothing determines.
+    """
+
+    covariance: Array
+    undetermined: Array
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations ``(d,)`` of the components."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the measurements determine it in every direction."""
+        return not len(self.undetermined)
+
+
 @dataclass(frozen=True, eq=False)
-class Parameter:
+class Parameter(Estimated):
     """A calibrated parameter.
 
     Attributes:
@@ -108,15 +130,10 @@ class Parameter:
     prior_sigma: float
     undetermined: Array
 
-    @property
-    def sigmas(self) -> Array:
-        """Standard deviations ``(d,)`` of the components."""
-        return np.sqrt(np.diag(self.covariance))
-
-    @property
-    def is_determined(self) -> bool:
-        """Whether the motion determines it in every direction."""
-        return not len(self.undetermined)
+    def scaled(self, factor: float) -> Parameter:
+        """Return it with the variances of what the motion determines multiplied by a factor."""
+        held = self.prior_sigma**2 * self.undetermined.T @ self.undetermined
+        return replace(self, covariance=factor * (self.covariance - held) + held)
 
     @property
     def doubt(self) -> str | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from hybridlio.core.tables import counted
@@ -12,10 +12,12 @@ ODOMETRY, IMU = "odometry", "IMU"
 # χ² per component that is doubtful: residuals of 1.4 standard deviations. It is below 1 where all covariances are
 # right, as the poses are fitted to the residuals.
 _DOUBTFUL = 2.0
-# Residuals of two standard deviations on average: the result contradicts the odometry that it was made from. KITTI 00
-# with KISS-ICP's odometry and its IMU has 0.2 with right clocks, and 8.5 with clocks 521 ms apart.
+# χ² per degree of freedom, so residuals of two standard deviations on average: odometry and IMU contradict each other.
+# KITTI 00 with KISS-ICP's odometry and its IMU has 0.4 with right clocks, and 8 or more with clocks 521 ms apart.
 _CONTRADICTING = 4.0
 _WORST = 3  # named of each kind
+# 12 components of odometry, to the path and to the scan, and 15 of the IMU, for two poses, a velocity and biases
+_REDUNDANCY = 27 - 21
 _MEANINGS = {
     ODOMETRY: "the odometry's covariances are too small, or another measurement contradicts it: check the IMU's clock, "
     "units and T_imu_lidar",
@@ -81,9 +83,16 @@ class Verdict:
     @classmethod
     def of(cls, kinds: Sequence[KindFit]) -> Verdict:
         """Judge the kinds; further groups, such as GPS, may rightly contradict an odometry."""
-        known = tuple(kind for kind in kinds if kind.measurements)
-        alone = {kind.kind for kind in known} == {ODOMETRY, IMU}
-        return cls(known, alone and any(kind.kind == ODOMETRY and kind.ratio > _CONTRADICTING for kind in known))
+        found = cls(tuple(kind for kind in kinds if kind.measurements))
+        alone = {kind.kind for kind in found.kinds} == {ODOMETRY, IMU}
+        return replace(found, refused=alone and found._contradicts_odometry)
+
+    @property
+    def _contradicts_odometry(self) -> bool:
+        """Whether odometry and IMU do not fit, and odometry has more than all of the χ² that both may have."""
+        (odometry,) = (kind for kind in self.kinds if kind.kind == ODOMETRY)
+        share = odometry.chi2 / (odometry.chi2 + sum(kind.chi2 for kind in self.kinds if kind.kind == IMU))
+        return self.variance_factor > _CONTRADICTING and share * self.variance_factor > 1.0
 
     @property
     def doubts(self) -> tuple[str, ...]:
@@ -99,6 +108,17 @@ class Verdict:
                 meaning = _MEANINGS.get(kind.kind, "its measurements are wrong, or their covariances too small")
                 out.append(f"{kind.kind}: χ² per component is {kind.ratio:.1f}; worst: {named}. Usually {meaning}")
         return tuple(out)
+
+    @property
+    def variance_factor(self) -> float:
+        """χ² of odometry and IMU per degree of freedom: 1 where their covariances are right, less where too large.
+
+        A step with samples has :data:`_REDUNDANCY` components more than variables. 1 without such steps.
+        """
+        known = {kind.kind: kind for kind in self.kinds}
+        if not known.keys() >= {ODOMETRY, IMU}:
+            return 1.0
+        return (known[ODOMETRY].chi2 + known[IMU].chi2) / (_REDUNDANCY * known[IMU].measurements)
 
     def summary(self) -> str:
         """Return χ² per component by kind, in one line."""

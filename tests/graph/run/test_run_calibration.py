@@ -15,7 +15,7 @@ from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.sensors import ImuSamples
 from hybridlio.graph.run.smooth import smooth
 from hybridlio.record.record import Record
-from hybridlio.smoothing.calibration import Calibrated, CalibrationPriors
+from hybridlio.smoothing.calibration import Calibrated, CalibrationPriors, Parameter
 from hybridlio.smoothing.gps_options import GpsOptions
 
 OFFSET_S = 0.02  # to add to the samples' stamps
@@ -68,6 +68,24 @@ def test_a_walk_of_12_s_determines_the_calibration_well(carried: list[tuple[Any,
     limits = {"rotation": np.deg2rad(0.1), "translation": 0.02, "time_offset": 1e-3}
     for name, limit in limits.items():
         assert np.sqrt(np.mean([error[name] ** 2 for error in errors])) < limit
+
+
+@pytest.mark.parametrize("stated", [1.0, 2.0])
+def test_residuals_tell_by_how_much_all_noise_is_overstated(chain: Callable[..., Any], stated: float):
+    drive = chain(708, carried_path(708, 15.5), steps=150, step_sigmas=FROM_SCANS, drift_share=0.05)
+    record = drive.record(composed(drive))
+    steps = tuple(
+        replace(step, covariance=stated**2 * step.covariance, drift=stated**2 * step.drift) for step in record.relative
+    )
+    noise = replace(record.imu_noise, **{name: stated * value for name, value in vars(record.imu_noise).items()})
+    verdict = smooth(replace(record, relative=steps, imu_noise=noise)).verdict
+    assert verdict.variance_factor == pytest.approx(stated**-2, rel=0.15)  # 900 degrees of freedom: 5 %
+
+
+def test_a_scaled_parameter_keeps_the_prior_where_it_is_not_determined():
+    free = np.array([[0.0, 0.0, 1.0]])
+    found = Parameter("translation", np.zeros(3), np.diag([1e-4, 1e-4, 0.09]), 0.3, free).scaled(0.25)
+    np.testing.assert_allclose(found.covariance, np.diag([2.5e-5, 2.5e-5, 0.09]), atol=1e-12)
 
 
 def test_the_smoothed_path_uses_the_calibration(chain: Callable[..., Any]):

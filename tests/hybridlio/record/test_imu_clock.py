@@ -76,3 +76,37 @@ def test_offset_and_notes_are_saved(rng: np.random.Generator, tmp_path: Path):
     record.save(tmp_path / "odometry.npz")
     loaded = Record.load(tmp_path / "odometry.npz")
     assert (loaded.imu_time_offset_s, loaded.notes) == (record.imu_time_offset_s, record.notes)
+
+
+def test_a_stated_offset_that_is_wrong_does_not_hide_in_the_noise_of_the_odometry(rng: np.random.Generator):
+    """The odometry's covariances are those that the right clock shows, so that smoothing notices the contradiction."""
+    trajectory, imu = drive(rng)
+    right = Record.from_odometry(trajectory, imu, calibration=CALIBRATION)
+    wrong = Record.from_odometry(trajectory, imu, calibration=CALIBRATION, imu_time_offset_s=0.3)
+    assert "show a further offset of the clocks of -300" in wrong.notes[0]
+    np.testing.assert_allclose(wrong.relative[50].covariance, right.relative[50].covariance, rtol=0.1)
+    assert wrong.imu_time_offset_s == 0.3
+
+
+@pytest.mark.parametrize(
+    ("late_s", "steps", "note"),
+    [
+        (1000.0, None, "no IMU sample lies in the time of the poses, they are 9"),
+        (0.0, 30, "too few steps between poses have IMU samples"),
+    ],
+)
+def test_clocks_that_were_not_compared_are_noted(rng: np.random.Generator, late_s: float, steps: int | None, note: str):
+    trajectory, imu = drive(rng)
+    late = ImuSamples(imu.stamps_ns + round(late_s * 1e9), imu.gyro_rad_s, imu.accel_m_s2)
+    short = Trajectory(trajectory.stamps_ns[:steps], trajectory.poses[:steps])
+    record = Record.from_odometry(short, late, calibration=CALIBRATION)
+    assert record.notes[0].startswith(note)
+
+
+def test_a_drive_that_does_not_turn_does_not_tell_the_offset_and_says_so(rng: np.random.Generator):
+    stamps = np.arange(0, 20_000_000_001, 10_000_000)
+    straight = se3.make(np.tile(np.eye(3), (201, 1, 1)), np.column_stack([np.arange(201), *np.zeros((2, 201))]))
+    gyro = rng.normal(0, 1e-3, (len(stamps), 3))
+    imu = ImuSamples(stamps, gyro, np.tile([0, 0, 9.81], (len(stamps), 1)))
+    record = Record.from_odometry(Trajectory(stamps[::10], straight), imu)
+    assert "do not determine the offset of the clocks" in record.notes[0]

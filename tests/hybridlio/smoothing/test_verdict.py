@@ -33,9 +33,18 @@ def test_a_bad_kind_is_doubtful_with_its_worst_measurements_and_the_usual_cause(
 
 def test_only_an_imu_against_the_odometry_is_refused():
     assert Verdict.of([fit(ODOMETRY, 10.0), fit(IMU, 1.0)]).refused
-    assert not Verdict.of([fit(ODOMETRY, 1.0), fit(IMU, 10.0)]).refused
+    assert Verdict.of([fit(ODOMETRY, 1.2), fit(IMU, 10.0)]).refused
+    assert not Verdict.of([fit(ODOMETRY, 0.5), fit(IMU, 10.0)]).refused  # the solution stays at the odometry
+    assert not Verdict.of([fit(ODOMETRY, 1.2), fit(IMU, 1.0)]).refused
     assert not Verdict.of([fit(ODOMETRY, 10.0), fit(IMU, 1.0), fit("gps", 1.0)]).refused
     assert not Verdict.of([fit(ODOMETRY, 10.0)]).refused
+
+
+def test_the_variance_factor_is_chi2_per_degree_of_freedom():
+    """Of odometry and IMU: each step with samples has 27 components and 21 variables."""
+    steps = [KindFit.of(ODOMETRY, [("scan 1", 3.0, 12)] * 20), KindFit.of(IMU, [("scan 1", 3.0, 15)] * 20)]
+    assert Verdict.of(steps).variance_factor == pytest.approx(1.0)
+    assert Verdict.of([fit(ODOMETRY, 5.0)]).variance_factor == 1.0
 
 
 @pytest.fixture(scope="module")
