@@ -285,10 +285,9 @@ class WeightedSolver:
             weights[candidates] = weights_of_candidates
             return self.solve(values, weights)
 
-        kept = None if held is None else held[candidates]
-        values, weights[candidates] = graduate(
-            values, chi2, solve, bound, growth=graduation, largest=largest, held=kept
-        )
+        held = None if held is None else held[candidates]
+        found = graduate(values, chi2, solve, bound, growth=graduation, largest=largest, held=held)
+        values, weights[candidates] = found
         return values, weights >= 0.5
 
     def found(self, values: Any, correct: Mask) -> Found:
