@@ -62,7 +62,7 @@ def read_stamps(path: Path) -> Stamps:
 
     A file has one of three formats: ISO 8601 dates such as ``2011-09-26 13:04:32.349659964``, in UTC or with an offset
     (``+02:00``); seconds, if any line has a decimal point or exponent; else whole nanoseconds. A blank line, as for a
-    frame that was not recorded, reads as :data:`MISSING_STAMP`.
+    frame that was not recorded, reads as :data:`MISSING_STAMP`; lines that start with ``#`` are comments.
 
     Raises:
         DataError: the file is missing or empty, a line does not have the format of the first (the message names file
@@ -70,16 +70,18 @@ def read_stamps(path: Path) -> Stamps:
     """
     if not path.is_file():
         raise DataError(f"{path}: no such file; expected one time stamp per line")
-    lines = [line.strip() for line in path.read_text(encoding="utf-8", errors="replace").rstrip().splitlines()]
+    text = path.read_text(encoding="utf-8", errors="replace").rstrip()
+    numbered = {k: line.strip() for k, line in enumerate(text.splitlines(), 1) if not line.startswith("#")}
+    lines = list(numbered.values())
     if not any(lines):
         raise DataError(f"{path}: empty; expected one time stamp per line")
     parse = _parser(lines)
     stamps = np.full(len(lines), MISSING_STAMP)
-    for row, line in enumerate(lines):
+    for row, (number, line) in enumerate(numbered.items()):
         try:
             stamps[row] = parse(line) if line else MISSING_STAMP
         except (ValueError, InvalidOperation, OverflowError, AttributeError):
-            raise DataError(f"{path}, line {row + 1}: cannot read {line[:40]!r} as a time stamp") from None
+            raise DataError(f"{path}, line {number}: cannot read {line[:40]!r} as a time stamp") from None
     known = stamps[stamps != MISSING_STAMP]
     if parse is int and len(known) > 1 and 0 < np.median(np.abs(np.diff(known))) < _MIN_WHOLE_STEP_NS:
         raise DataError(

@@ -25,6 +25,8 @@ from hybridlio.datasets.points.point_format import PointFormat, StatedFormat, le
 
 SUFFIXES = (".bin", ".npy", ".pcd", ".ply", ".las", ".laz", ".feather", ".parquet")
 
+_CLOUD_COMPARE = "scalar_"  # before the names of fields in its .ply files
+
 _READERS: dict[str, Callable[[Path], Columns]] = {
     ".pcd": pcd.read_pcd,
     ".ply": ply.read_ply,
@@ -133,7 +135,7 @@ def read_columns(path: Path, layout: BinLayout | None = None, step_ns: int | Non
     if path.suffix == ".bin":
         return (layout or BinLayout()).read(path)
     if path.suffix != ".npy":
-        return {name.lower(): values for name, values in _READERS[path.suffix](path).items()}
+        return {name.lower().removeprefix(_CLOUD_COMPARE): v for name, v in _READERS[path.suffix](path).items()}
     values = tables.read_npy(path)
     if isinstance(values, dict):
         return {name.lower(): column for name, column in values.items()}

@@ -48,6 +48,7 @@ _PIECE = 0.1  # of the usual number of points: a scan with fewer may be a piece 
 _OTHER_UNIT = (
     0.01  # of the usual span: units differ by 1000, and such a share of a sweep holds fewer points than a piece
 )
+_LONG = 1.2  # of the distance between stamps; of a lidar that turns, a sweep ends where the next one starts
 _AT_END = 0.1  # of a sweep: the stamp is at its start, middle or end, with a gap of missing points
 
 
@@ -97,8 +98,7 @@ class PointTimes:
             stamp_ns: the scan's stamp.
 
         Raises:
-            DataError: the column is missing, has a value that is not finite, leads over 1 s away from the stamp, or
-                spans a small part of the time that it spans in other scans.
+            DataError: the column is missing, not finite, over 1 s from the stamp, or far shorter than in other scans.
         """
         if self.column not in columns:
             raise DataError(f"column '{self.column}' of the point times is missing; other scans have it")
@@ -216,6 +216,11 @@ def _convention(
         raise errors[0]
     origin = stated.origin or _origin(ends, step_ns)
     span_ns = int(np.median([last - first for _, first, last in ends]))
+    if step_ns is not None and span_ns > _LONG * step_ns:
+        notes.add(
+            f"point times: column '{name}' in {unit} spans {span_ns / 1e6:.0f} ms, over the {step_ns / 1e6:.0f} ms "
+            "between scans; check its unit and the rate of the scans"
+        )
     found = PointTimes(name, unit_ns, origin, span_ns, int(np.median([len(column) for _, column in values])))
     for stamp, column in values:
         try:

@@ -205,3 +205,13 @@ def test_an_array_that_announces_more_than_its_file_holds_is_rejected_before_mem
     (tmp_path / "scan.npy").write_bytes(data.replace(b"(9, 3), ", b"(10**9, 3), "))
     with pytest.raises(DataError, match=r"scan\.npy"):
         read_scan(tmp_path / "scan.npy", 5)
+
+
+def test_names_that_cloudcompare_writes_are_known(tmp_path: Path) -> None:
+    points = np.zeros(COUNT, [(name, "<f4") for name in ("x", "y", "z", "scalar_Intensity", "scalar_Time")])
+    points["x"], points["scalar_Intensity"], points["scalar_Time"] = 1, 0.5, np.linspace(0, 0.1, COUNT)
+    (tmp_path / "scan.ply").write_bytes(ply(points, ascii=False))
+    scan = read_scan(tmp_path / "scan.ply", 0)
+    assert scan.intensity is not None
+    assert scan.time_offsets_ns is not None
+    assert scan.time_offsets_ns[-1] == pytest.approx(1e8)

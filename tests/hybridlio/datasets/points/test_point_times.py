@@ -224,3 +224,11 @@ def test_a_scan_in_another_unit_than_the_others_is_refused(factor: int) -> None:
 def test_a_piece_of_a_sweep_is_in_the_unit_of_the_others() -> None:
     found, _ = find([SWEEP for _ in STAMPS])
     np.testing.assert_array_equal(offsets(found, SWEEP[200:205]), SWEEP[200:205])
+
+
+@pytest.mark.parametrize(("step_ns", "noted"), [(STEP_NS, False), (STEP_NS // 2, True)])
+def test_sweeps_longer_than_the_distance_between_scans_are_noted(step_ns: int, noted: bool) -> None:
+    _, notes = find(
+        [SWEEP / 1e9 for _ in STAMPS], stamps=[START_NS + k * step_ns for k in range(SCANS)], step_ns=step_ns
+    )
+    assert any("between scans; check its unit and the rate" in note for note in notes) == noted

@@ -11,6 +11,7 @@ import bags
 import numpy as np
 import pytest
 
+from hybridlio.core.arrays import Array
 from hybridlio.core.sensors import Scan
 from hybridlio.datasets import Sequence, open_sequence
 
@@ -25,6 +26,24 @@ class Drive:
     def messages(self, maker: bags.Messages, **options: Any) -> list[bags.Message]:
         s = self.sequence
         return bags.drive_messages(maker, self.scans, s.imu, s.calibration.T_imu_lidar, s.reference, **options)
+
+    @staticmethod
+    def estimates(sequence: Sequence) -> Array:
+        """The poses ``(N, 4, 4)`` that odometry estimates."""
+        from hybridlio.odometry.odometry import Odometry
+
+        odometry = Odometry(initial_pose="preintegration", residual="scan-matching")
+        return np.array([odometry.step(frame).pose for frame in sequence])
+
+
+@pytest.fixture(scope="session")
+def plain(as_folder: Any, drive_with_times: Drive, tmp_path_factory: pytest.TempPathFactory) -> Sequence:
+    return open_sequence(as_folder(tmp_path_factory.mktemp("plain"), drive_with_times))
+
+
+@pytest.fixture(scope="session")
+def plain_poses(plain: Sequence) -> Array:
+    return Drive.estimates(plain)
 
 
 @pytest.fixture(scope="session")

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import bags
+import lz4.frame
 import numpy as np
 import pytest
 import yaml
@@ -19,7 +20,6 @@ import yaml
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.datasets import Sequence, open_sequence, sequence_names
-from hybridlio.odometry.odometry import Odometry
 
 # name of the bag -> (ROS 2, storage, compression, Livox driver)
 FORMATS: dict[str, tuple[bool, str, str, str]] = {
@@ -41,21 +41,6 @@ def write(folder: Path, name: str, drive: Any, keep: Callable[[int], bool] = lam
     maker = bags.Messages(is_ros2)
     content = [row for row in drive.messages(maker, livox=livox) if keep(row[0])]
     return bags.write(folder / name, maker, content, storage, compress)
-
-
-def poses(sequence: Sequence) -> Array:
-    odometry = Odometry(initial_pose="preintegration", residual="scan-matching")
-    return np.array([odometry.step(frame).pose for frame in sequence])
-
-
-@pytest.fixture(scope="module")
-def plain(as_folder: Any, drive_with_times: Any, tmp_path_factory: pytest.TempPathFactory) -> Sequence:
-    return open_sequence(as_folder(tmp_path_factory.mktemp("plain"), drive_with_times))
-
-
-@pytest.fixture(scope="module")
-def plain_poses(plain: Sequence) -> Array:
-    return poses(plain)
 
 
 def check_equal(sequence: Sequence, plain: Sequence, has_livox: bool = False) -> None:
@@ -90,7 +75,8 @@ def test_every_format_gives_the_frames_of_the_plain_folder(
 def test_estimates_equal_those_from_the_plain_folder(
     name: str, drive_with_times: Any, plain_poses: Array, tmp_path: Path
 ) -> None:
-    np.testing.assert_allclose(poses(open_sequence(write(tmp_path, name, drive_with_times))), plain_poses, atol=1e-6)
+    sequence = open_sequence(write(tmp_path, name, drive_with_times))
+    np.testing.assert_allclose(drive_with_times.estimates(sequence), plain_poses, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["ros2-mcap", "ros2-sqlite3"])
@@ -220,16 +206,35 @@ def test_a_bag_whose_index_alone_is_lost_is_whole(
     assert any("the index is missing or damaged" in note for note in sequence.notes)
 
 
+def damaged(path: Path, at: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[at : at + 4000] = b"\xa5" * 4000
+    path.write_bytes(data)
+
+
 def test_chunks_before_a_damaged_one_are_read(drive_with_times: Any, tmp_path: Path) -> None:
     path = write(tmp_path, "ros1-lz4.bag", drive_with_times)
-    whole, data = open_sequence(path), bytearray(path.read_bytes())
-    for at in range(len(data) * 7 // 10, len(data) * 7 // 10 + 4000):
-        data[at] = 0xA5
-    path.write_bytes(data)
+    whole, data = open_sequence(path), path.read_bytes()
+    damaged(path, data.index(lz4.frame.compress(b"")[:4], len(data) // 2))  # where a chunk starts
     sequence = open_sequence(path)
     assert 2 <= len(sequence) < len(whole)
     np.testing.assert_array_equal(sequence[1].scan.points, whole[1].scan.points)
     assert any("truncated or damaged" in note and "before the damage are used" in note for note in sequence.notes)
+
+
+def test_of_a_chunk_damaged_behind_its_start_only_its_clouds_are_lost(drive_with_times: Any, tmp_path: Path) -> None:
+    path = write(tmp_path, "ros1-lz4.bag", drive_with_times)
+    whole = [frame.scan.points for frame in open_sequence(path)]
+    damaged(path, path.stat().st_size * 7 // 10)
+    sequence = open_sequence(path)
+    scans = [opened_or_error(functools.partial(sequence.load_scan, k), "ros1-lz4") for k in range(len(sequence))]
+    lost = [k for k, scan in enumerate(scans) if scan is None]
+    assert len(scans) == len(whole)
+    assert lost == [*range(lost[0], lost[-1] + 1)]
+    assert len(lost) <= 3
+    for scan, points in zip(scans, whole, strict=True):
+        if scan is not None:
+            np.testing.assert_array_equal(scan.points, points)
 
 
 def opened_or_error(opener: Callable[[], Any], place: str) -> Any:
