@@ -15,11 +15,12 @@ from hybridlio.graph.base.isam import gtsam_message
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key
+from hybridlio.graph.model.marginals import Marginal
 from hybridlio.graph.model.measurements import CODE, Factor
 from hybridlio.graph.solve.builder import Builder
 
 # Of poses alone: the velocities, biases, landmarks and calibration of other kinds would become part of the factor.
-_OF_POSES = ("between", "prior", "gps", "attitude", "altitude", "heading", *CODE)
+_OF_POSES = ("between", "prior", "gps", "attitude", "altitude", "heading", "marginal", *CODE)
 
 
 def marginal_factor(data: GraphData, gone: Collection[Key], coordinates: Array) -> Factor | None:
@@ -56,10 +57,8 @@ def marginal_factor(data: GraphData, gone: Collection[Key], coordinates: Array) 
         return None
     linear = gtsam.JacobianFactor(left, _ordering([X(index) for index in staying]))
     kept = [gtsam.Symbol(key).index() for key in linear.keys()]  # noqa: SIM118  (GTSAM's, no mapping)
-    at = gtsam.Values(values)
-    for index in set(concerned) - set(kept):
-        at.erase(X(index))
-    return Factor("gtsam", tuple(data.keys_at(kept)), np.zeros(0), code=gtsam.LinearContainerFactor(linear, at))
+    A, b = linear.jacobian()
+    return Factor("marginal", tuple(data.keys_at(kept)), Marginal(coordinates[kept], A, b).packed())
 
 
 def _check_kind(factor: Factor) -> None:

@@ -18,6 +18,8 @@ from hybridlio.graph.marginal_factors import marginal_factor
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData, PosesByKey
 from hybridlio.graph.model.keys import Key, check_key, list_keys
+from hybridlio.graph.model.marginals import Marginal
+from hybridlio.graph.model.measurements import Factor
 from hybridlio.graph.model.new_factors import check_start, new_measurement
 from hybridlio.graph.model.noise import NoiseInput, make_noise
 from hybridlio.graph.views.gtsam_graph import from_gtsam, to_gtsam
@@ -129,9 +131,9 @@ class WholeGraph(CalibratedMeasurements):
             other: a graph of the same dimension, without landmarks, geodetic origin or fixed poses. Its calibration
                 variables keep their names, which this graph must not have.
             keys: new keys of its poses, for those that change, such as ``{k: (1, k) for k in other.keys}``.
-            T_world_other: the other graph's world in this one ``(4, 4)``, by which its initial values and priors are
-                moved; without it they are left out, and factors between the graphs place its poses. Its other factors
-                in world (GPS, attitude, velocity, altitude, heading) are left out in any case.
+            T_world_other: the other graph's world in this one ``(4, 4)``, by which its initial values, priors and
+                marginals are moved; without it they are left out, and factors between the graphs place its poses. Its
+                other factors in world (GPS, attitude, velocity, altitude, heading) are left out in any case.
 
         Raises:
             GraphError: a key that is in use, or a graph that cannot be merged.
@@ -152,8 +154,8 @@ class WholeGraph(CalibratedMeasurements):
         self._data.calibrations |= theirs.calibrations
         ids = {}
         for factor_id, factor in theirs.factors.items():
-            if factor.kind == "prior" and T is not None:
-                factor = replace(factor, measured=_moved(factor.measured[None], T)[0])
+            if factor.kind in ("prior", "marginal") and T is not None:
+                factor = replace(factor, measured=_moved_measurement(factor, T, self._data.dimension))
             elif factor.kind in _IN_WORLD:
                 continue
             ids[factor_id] = self._data.add_factor(replace(factor, keys=tuple(renamed[key] for key in factor.keys)))
@@ -184,7 +186,15 @@ class WholeGraph(CalibratedMeasurements):
         return made
 
 
-_IN_WORLD = ("prior", "gps", "attitude", "velocity", "altitude", "heading")  # they hold in the other graph's world
+_IN_WORLD = (
+    "prior",
+    "marginal",
+    "gps",
+    "attitude",
+    "velocity",
+    "altitude",
+    "heading",
+)  # they hold in the other graph's world
 
 
 def _listed(keys: Collection[Key], what: str) -> list[Key]:
@@ -198,6 +208,14 @@ def _moved(coordinates: Array, T: Array) -> Array:
     """Return coordinates of poses seen from another world."""
     poses = se3.orthonormalise(T @ co.to_matrices(coordinates))
     return co.from_matrices(poses, 2 if coordinates.shape[1] == 3 else 3)
+
+
+def _moved_measurement(factor: Factor, T: Array, dimension: co.Dimension) -> Array:
+    """Return what a prior or a marginal measures, seen from another world."""
+    if factor.kind == "prior":
+        return np.asarray(_moved(factor.measured[None], T)[0])
+    marginal = Marginal.unpacked(factor.measured, len(factor.keys), dimension, factor.label)
+    return marginal.moved(_moved(marginal.coordinates, T)).packed()
 
 
 def _part(data: GraphData, kept: set[Key]) -> GraphData:

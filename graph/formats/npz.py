@@ -15,6 +15,7 @@ from hybridlio.core.files import UNREADABLE_NPZ, write_atomically
 from hybridlio.core.geodesy import check_geodetic
 from hybridlio.core.sensors import ImuSamples
 from hybridlio.graph.formats.npz_calibration import add_calibrations, calibration_arrays
+from hybridlio.graph.formats.npz_marginals import marginal_arrays, marginals
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.calibrations import CALIBRATION_KINDS, chosen
 from hybridlio.graph.model.edge_table import FORMS
@@ -25,8 +26,11 @@ from hybridlio.graph.model.new_factors import check_vector
 from hybridlio.graph.model.noise import Noise, NoiseInput, Robust, make_noise, make_robust
 
 _FORMAT = "hybridlio pose graph 1"
-# earlier releases, which would lose the landmarks or the calibration variables, refuse these
+# earlier releases, which would lose landmarks, calibration variables or marginals, refuse these
 _FORMAT_WITH_LANDMARKS, _FORMAT_WITH_CALIBRATION = "hybridlio pose graph 2", "hybridlio pose graph 3"
+_FORMAT_WITH_MARGINALS = "hybridlio pose graph 4"
+_FORMATS = (_FORMAT, _FORMAT_WITH_LANDMARKS, _FORMAT_WITH_CALIBRATION, _FORMAT_WITH_MARGINALS)
+_IN_COLUMNS: tuple[Kind, ...] = tuple(kind for kind in get_args(Kind) if kind != "marginal")
 _NO_ROBOT = -1  # in the robots' column, of an integer key
 
 
@@ -58,7 +62,8 @@ def write_npz(data: GraphData, path: str | os.PathLike[str]) -> None:
     code = [factor.label for factor in data.other_factors.values() if factor.kind in CODE]
     if code:
         raise GraphError(f"{path}: {code[0]} and {len(code) - 1} more are a user's code, which no file holds")
-    for kind in get_args(Kind):
+    arrays |= marginal_arrays(data)
+    for kind in _IN_COLUMNS:
         of_kind = {factor_id: factor for factor_id, factor in data.other_factors.items() if factor.kind == kind}
         if of_kind:
             arrays |= {f"{kind}_{name}": column for name, column in _factor_columns(of_kind).items()}
@@ -68,6 +73,8 @@ def write_npz(data: GraphData, path: str | os.PathLike[str]) -> None:
 
 
 def _format_of(data: GraphData) -> str:
+    if any(factor.kind == "marginal" for factor in data.other_factors.values()):
+        return _FORMAT_WITH_MARGINALS
     if data.calibrations:
         return _FORMAT_WITH_CALIBRATION
     return _FORMAT_WITH_LANDMARKS if len(data.landmarks) else _FORMAT
@@ -130,8 +137,8 @@ def read_npz(path: str | os.PathLike[str]) -> GraphData:
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-        if str(arrays["format"]) not in (_FORMAT, _FORMAT_WITH_LANDMARKS, _FORMAT_WITH_CALIBRATION):
-            raise DataError(f"{path}: has format {arrays['format']!s}; this release reads {_FORMAT_WITH_CALIBRATION}")
+        if str(arrays["format"]) not in _FORMATS:
+            raise DataError(f"{path}: has format {arrays['format']!s}; this release reads {_FORMATS[-1]}")
         return _assemble(arrays)
     except OSError as error:
         raise DataError(f"cannot read {path}: {error}") from error
@@ -147,8 +154,8 @@ def _assemble(arrays: dict[str, Any]) -> GraphData:
     _add_poses(data, arrays)
     _add_landmarks(data, arrays)
     add_calibrations(data, arrays)
-    by_id: dict[int, Factor] = {}
-    for kind in get_args(Kind):
+    by_id = marginals(data, arrays)
+    for kind in _IN_COLUMNS:
         prefix = f"{kind}_"
         columns = {name[len(prefix) :]: value for name, value in arrays.items() if name.startswith(prefix)}
         if columns:

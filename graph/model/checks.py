@@ -84,8 +84,8 @@ def free_motions(data: GraphData, part: list[Key]) -> list[str]:
         return []
     names = _MOTIONS if data.dimension == 3 else _MOTIONS[2:5]
     factors = [f for f in data.other_factors.values() if f.keys[0] in inside and f.kind not in ("bias", *OBSERVATIONS)]
-    if any(factor.kind in ("prior", "gtsam") for factor in factors):
-        return []  # what a factor of GTSAM's leaves free, the solver finds
+    if any(factor.kind in ("prior", "marginal", "gtsam") for factor in factors):
+        return []  # what a marginal or a factor of GTSAM's leaves free, the solver finds
     jacobian = np.vstack([np.zeros((1, 6)), *(_motion_jacobian(data, factor) for factor in _distinct(factors))])
     # rotations move a far position by metres: scaled down, so that both halves compare in the rank below
     reach = float(np.linalg.norm(jacobian[:, :3], axis=1).max())

@@ -15,7 +15,7 @@ from hybridlio.core.sensors import ImuNoise
 from hybridlio.graph.model.calibrations import of_kind
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key
-from hybridlio.graph.model.measurements import CODE, OBSERVATIONS, STEPS, Factor
+from hybridlio.graph.model.measurements import JOINING, OBSERVATIONS, Factor
 
 
 def group_labels(data: GraphData, kinds: Iterable[str]) -> tuple[int, NDArray[np.int32]]:
@@ -43,11 +43,11 @@ def groups(data: GraphData, kinds: Iterable[str]) -> list[list[Key]]:
 
 
 def components(data: GraphData) -> list[list[Key]]:
-    """Return the connected components over between-, IMU and users' factors, and over shared landmarks, largest first.
+    """Return the connected components over factors of several poses, and over shared landmarks, largest first.
 
     Two parts are joined where they share as many landmarks as determine a rigid transform: two, or three in space.
     """
-    parts = groups(data, (*STEPS, "imu", *CODE))
+    parts = groups(data, JOINING)
     observations = [f for f in data.other_factors.values() if f.kind in OBSERVATIONS]
     if len(parts) == 1 or not observations:
         return parts

@@ -14,7 +14,7 @@ from hybridlio.graph.model.noise import Noise, Robust
 
 Kind: TypeAlias = Literal[
     "between", "prior", "gps", "attitude", "velocity", "bias", "imu", "point", "bearing-range", "altitude", "heading",
-    "body-velocity", "sensor-step", "custom", "gtsam",
+    "body-velocity", "sensor-step", "marginal", "custom", "gtsam",
 ]  # fmt: skip
 CODE = ("custom", "gtsam")  # of users, which no file holds
 OBSERVATIONS = ("point", "bearing-range")  # of landmarks
@@ -24,6 +24,7 @@ VECTOR_NOISE_SIZE = {
 }  # fmt: skip
 VELOCITIES = ("velocity", "body-velocity")
 STEPS = ("between", "sensor-step")  # a pose in the frame of another
+JOINING = (*STEPS, "imu", "marginal", *CODE)  # concern several poses
 IN_OWN_ORDER = ("custom", "heading", "gps")  # residuals that are no tangent vectors, which GTSAM orders in its own way
 SCALARS = ("altitude", "heading")
 
@@ -40,9 +41,9 @@ class Factor:
             ``attitude``: direction in world, in body (6); ``velocity``: m/s (3); ``bias``: accelerometer, gyroscope
             (6); ``imu``: the fields of :class:`hybridlio.core.sensors.ImuNoise` in their order (6); ``point``: a
             landmark in the frame of the pose (d); ``bearing-range``: angle or unit direction, and range (2, in space
-            4); ``altitude``: m (1); ``heading``: rad (1); ``body-velocity``: m/s (3); empty for ``custom`` and
-            ``gtsam``.
-        noise: of the measurement; None for ``imu``, whose noise follows from the samples.
+            4); ``altitude``: m (1); ``heading``: rad (1); ``body-velocity``: m/s (3); ``marginal``: see
+            :class:`hybridlio.graph.model.marginals.Marginal`; empty for ``custom`` and ``gtsam``.
+        noise: of the measurement; None for ``imu``, whose noise follows from the samples, and for ``marginal``.
         robust: kernel, or None.
         samples: of an ``imu`` factor.
         landmark: key of the observed landmark, of ``point`` and ``bearing-range``.

@@ -193,12 +193,14 @@ def new_measurement(factor: Factor, measured: ArrayLike, dimension: co.Dimension
     """Return another measurement of a factor, as :class:`Factor` holds it.
 
     Raises:
-        GraphError: a factor of samples, of a user's code or of GTSAM's.
+        GraphError: a factor of samples, a marginal, a user's code or GTSAM's.
         DataError: a measurement of another shape, or not finite.
     """
     name, old = factor.label, factor.measured
-    if factor.kind in ("imu", *CODE):
-        raise GraphError(f"{name}: samples and code are no measurement to replace; remove it and add another")
+    if factor.kind in ("imu", "marginal", *CODE):
+        raise GraphError(
+            f"{name}: samples, marginals and code are no measurement to replace; remove it and add another"
+        )
     if factor.kind in (*STEPS, "prior"):
         return co.from_matrix(measured, dimension, name)
     if factor.kind == "gps":

@@ -36,10 +36,11 @@ from hybridlio.graph.model.connectivity import InertialChain, chains_without_bia
 from hybridlio.graph.model.edge_table import FORMS
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key
+from hybridlio.graph.model.marginals import Marginal
 from hybridlio.graph.model.measurements import IN_OWN_ORDER, OBSERVATIONS, Factor
 from hybridlio.graph.model.noise import Robust
 from hybridlio.graph.model.user_residual import altitude, heading
-from hybridlio.graph.solve.custom_factors import body_velocity_factor, custom_factor
+from hybridlio.graph.solve.custom_factors import body_velocity_factor, custom_factor, linear_factor
 from hybridlio.graph.solve.landmark_factors import initial_landmarks, insert_landmarks, observation
 
 # rad, m: of the prior that holds a fixed pose. Small against any sensor, large enough that information of 1e12 beside
@@ -217,6 +218,10 @@ class Builder:
     def _attitude(self, factor: Factor, indices: list[int], model: Any) -> Any:
         z = factor.measured
         return gtsam.AttitudeFactorPose3(X(indices[0]), gtsam.Unit3(z[:3]), model, gtsam.Unit3(z[3:]))
+
+    def _marginal(self, factor: Factor, indices: list[int], _: Any) -> Any:
+        found = Marginal.unpacked(factor.measured, len(indices), self.data.dimension, factor.label)
+        return linear_factor(found, [self._pose_variable(index) for index in indices])
 
     def _velocity(self, factor: Factor, indices: list[int], model: Any) -> Any:
         return gtsam.PriorFactorVector(V(indices[0]), factor.measured, model)

@@ -10,6 +10,7 @@ import numpy as np
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.graph.model import coordinates as co
+from hybridlio.graph.model.marginals import Marginal
 from hybridlio.graph.model.user_residual import UserResidual
 
 _PLANAR = np.array(co.GTSAM_ORDER[2])  # GTSAM's x, y, θ among our heading, x, y
@@ -69,3 +70,23 @@ def body_velocity_factor(measured: Array, pose: int, velocity: int, model: Any) 
         return np.asarray(in_body - measured)
 
     return _PythonFactor(model, [pose, velocity], error)
+
+
+def linear_factor(marginal: Marginal, variables: list[int]) -> Any:
+    """Return the factor of a marginal over pose variables.
+
+    In Python, because GTSAM's own linear factors can be made of at most three variables from there.
+    """
+    at, blocks = co.gtsam_poses(marginal.coordinates), np.split(marginal.A, len(variables), axis=1)
+    kind = "atPose2" if marginal.coordinates.shape[1] == 3 else "atPose3"
+
+    def error(this: Any, values: gtsam.Values, jacobians: Any) -> Array:
+        del this
+        now = [getattr(values, kind)(variable) for variable in variables]
+        moved = np.concatenate([before.localCoordinates(pose) for before, pose in zip(at, now, strict=True)])
+        if jacobians is not None:
+            for k, block in enumerate(blocks):
+                jacobians[k] = np.asfortranarray(block)
+        return np.asarray(marginal.A @ moved - marginal.b)
+
+    return _PythonFactor(gtsam.noiseModel.Unit.Create(len(marginal.b)), variables, error)

@@ -238,13 +238,13 @@ class Solution(SolutionViews):
         builder = Builder(self._data)
         graph = builder.graph(robust=False)
         order = np.argsort(co.GTSAM_ORDER[2]) if self._data.dimension == 2 else slice(None)
-        coded = {n for n, f in self._data.other_factors.items() if f.kind in CODE}
+        coded = {n for n, f in self._data.other_factors.items() if f.kind in ("marginal", *CODE)}
         found = {}
         for slot, factor_id in enumerate(builder.factor_ids()):
             factor: Any = graph.at(slot)
             has_residual = hasattr(factor, "unwhitenedError")  # some of GTSAM's have none
             residual = np.asarray(factor.unwhitenedError(self._result.values)) if has_residual else np.zeros(0)
-            # a planar observation has two components; users' own residuals have any number, in their order
+            # a planar observation has two components; users' own residuals and marginals have any number
             in_gtsams_order = len(residual) > 2 and factor_id not in coded
             residual = residual[order] if in_gtsams_order else residual
             found[factor_id] = residual, 2 * float(factor.error(self._result.values))

@@ -45,6 +45,28 @@ def test_marginalised_poses_leave_the_others_and_their_covariances_as_they_were(
         np.testing.assert_allclose(after.covariance(key), before.covariance(key), rtol=1e-3, atol=1e-7)
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_marginal_is_saved_and_merged(dimension, tmp_path):
+    graph = circle(dimension, np.random.default_rng(3))
+    graph.marginalise([1, 2, 3], graph.optimize())
+    graph.marginalise([20, 21], graph.optimize())
+    graph.save(tmp_path / "small.npz")
+    loaded, expected = PoseGraph.load(tmp_path / "small.npz"), graph.optimize()
+    assert dict.fromkeys(loaded.factors) == dict.fromkeys(graph.factors)
+    np.testing.assert_allclose(loaded.optimize().poses, expected.poses, atol=1e-9)
+    moved, T = PoseGraph(dimension), se3.exp([0, 0, 1.0, 5, 3, 0])
+    moved.merge(graph, T_world_other=T)
+    fixes = [n for n, factor in graph.factors.items() if factor.kind == "gps"]
+    for number in fixes:
+        graph.remove(number)
+    np.testing.assert_allclose(moved.optimize().poses, T @ graph.optimize().poses, atol=1e-5)
+    with pytest.raises(GraphError, match="cannot hold 2 × marginal"):
+        graph.save(tmp_path / "small.g2o")
+    number = next(n for n, factor in graph.factors.items() if factor.kind == "marginal")
+    with pytest.raises(GraphError, match="marginals and code are no measurement"):
+        graph.set_measurement(number, np.eye(4))
+
+
 def test_a_marginal_acts_on_what_comes_later():
     whole = circle(3, np.random.default_rng(2))
     small = whole.copy()
@@ -114,7 +136,7 @@ def test_measurements_of_every_kind_are_replaced():
         np.testing.assert_allclose(graph.factors[graph.set_measurement(number, measured)].measured, expected)
     code = graph.add_factor(0, lambda T: T[0, 3], 1.0)
     for number, value, message in (
-        (code, 1, "samples and code are no measurement to replace"),
+        (code, 1, "samples, marginals and code are no measurement to replace"),
         (99, 1, "no factor has id 99"),
         (next(iter(graph.factors)), np.zeros((4, 4)), "prior 0"),
     ):
