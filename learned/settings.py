@@ -20,6 +20,9 @@ from hybridlio.core.setting_checks import (
     check_setting,
 )
 
+# Far above any network of use (the paper's widest part has 512 features): a damaged recipe must not take all memory.
+_MOST, _DEEPEST = 10_000, 100  # of widths; of layers one behind the other
+
 
 @dataclass(frozen=True)
 class NetworkSettings:
@@ -108,9 +111,13 @@ class NetworkSettings:
         )
         check_positive(self, *counts, "vertex_scale_m", "residual_scale", "output_scale")
         check_not_negative(self, "projective_steps", "weight_channels")
+        for name in (*counts, "projective_steps", "weight_channels"):
+            most = _DEEPEST if name in ("blocks", "imu_layers", "iterations", "projective_steps") else _MOST
+            check_setting(self, name, getattr(self, name) <= most, f"{most} or less")
         stride, stages = self.stem_stride, self.stages
         check_setting(self, "stem_stride", len(stride) == 2 and min(stride) >= 1, "two numbers of 1 or more")
         check_setting(self, "stages", bool(stages) and min(stages) >= 1, "one or more numbers of 1 or more")
+        check_setting(self, "stages", len(stages) <= 16 and max(stages) <= _MOST, f"16 numbers of {_MOST} or less")
         if not self.encoder and not self.projective_steps:
             raise ConfigError("network: set encoder, or projective_steps above 0: nothing else estimates the residual")
 

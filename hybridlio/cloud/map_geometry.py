@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.lidar_models import LIDAR_MODELS, LidarModel
 
+_MOST_CELLS = 10_000_000  # a lidar gives a million points a scan at most; a damaged file may announce any number
+
 
 @dataclass(frozen=True)
 class MapGeometry:
@@ -30,6 +32,8 @@ class MapGeometry:
             )
         if self.rows < 1 or self.columns < 1:
             raise ConfigError(f"map geometry: rows and columns must be at least 1, got {self.rows} x {self.columns}")
+        if self.rows * self.columns > _MOST_CELLS:
+            raise ConfigError(f"map geometry: {self.rows} x {self.columns} cells; at most {_MOST_CELLS} are of use")
 
     @property
     def row_deg(self) -> float:

@@ -11,7 +11,6 @@ from hybridlio.commands import common
 from hybridlio.commands.common import guarded
 from hybridlio.commands.shared import completion
 from hybridlio.commands.terminal import print_result, print_warning, progress
-from hybridlio.core.errors import ConfigError
 from hybridlio.datasets.rosbag.choices import NO_CHOICE, BagTopics
 
 if TYPE_CHECKING:
@@ -34,7 +33,7 @@ def calibrate(
             help="What to find: extrinsics, time_offset, imu_scale, lever_arm, gps_clock.",
         ),
     ] = "extrinsics,time_offset",
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file.")] = False,
+    overwrite: common.Overwrite = False,
     sequence: common.SequenceName = None,
     reader: common.ReaderName = None,
     raw_root: common.RawRoot = None,
@@ -49,10 +48,10 @@ def calibrate(
     A minute in which the sensors turn about every axis is enough. What the motion does not determine is named, and
     stays as stated.
     """
+    from hybridlio.datasets.protection import check_new_file
     from hybridlio.runs.calibrate import calibrate as find
 
-    if out.exists() and not overwrite:
-        raise ConfigError(f"{out} exists; give another name, or --overwrite")
+    check_new_file(out, overwrite, data)
     recording = common.open_data(data, sequence, reader, raw_root, frames, None, topics, rate)
     with progress("calibration") as report:
         found = find(recording, common.split_names(parameters), config=common.load_settings(config), progress=report)

@@ -57,6 +57,7 @@ Verbose = Annotated[
 Data = Annotated[
     Path, typer.Argument(metavar="DATA", help="A recording or bag, or a folder that contains one.", show_default=False)
 ]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
 SequenceName = Annotated[
     str | None, typer.Option("--sequence", metavar="NAME", help="The recording to use if DATA contains several.")
 ]

@@ -22,6 +22,7 @@ def export(
     data: Annotated[
         Path | None, typer.Option("--data", metavar="DATA", help="The recording, if it is not where the run found it.")
     ] = None,
+    overwrite: common.Overwrite = False,
     scans: Annotated[
         bool, typer.Option("--scans", help="Write the points of every scan too, read from the recording.")
     ] = False,
@@ -31,12 +32,11 @@ def export(
 
     The run folder itself holds poses in the formats of TUM and KITTI; `georeference` writes GeoJSON, `map` clouds.
     """
-    from hybridlio.datasets.protection import check_output
+    from hybridlio.datasets.protection import check_new_file
     from hybridlio.viewing.mcap_export import check_mcap_path, export_mcap
 
     check_mcap_path(mcap)
-    if data is not None:
-        check_output(mcap.parent, data, may_hold=True)
+    check_new_file(mcap, overwrite, *([] if data is None else [data]))
     with progress("export") as reported:
         scene = export_mcap(run, mcap, data=data, scans=scans, progress=reported)
     for note in scene.left_out:

@@ -74,7 +74,7 @@ def odometry(
     from hybridlio.runs.run import adapt_config
     from hybridlio.runs.whole_folder import partial_folder
 
-    shown = _shown(view, save, data)
+    shown = _shown(view, save, data, overwrite)
     if resume and (out is None or overwrite):
         raise ConfigError("--resume needs -o, the folder of the run that is to go on, and no --overwrite")
     chosen = common.load_settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
@@ -97,18 +97,18 @@ class _Shown:
     save: Path | None
 
 
-def _shown(view: bool, save: Path | None, data: Path) -> _Shown | None:
+def _shown(view: bool, save: Path | None, data: Path, overwrite: bool) -> _Shown | None:
     """Return where to show the run, or None; check that it can be shown there."""
     if not view and save is None:
         return None
     if view and save is not None:
         raise ConfigError("--view opens the viewer, --save writes a file for it; give one of them")
-    from hybridlio.datasets.protection import check_output
+    from hybridlio.datasets.protection import check_new_file
     from hybridlio.viewing.rerun_stream import check_target
 
     check_target(save)
     if save is not None:
-        check_output(save.parent, data, may_hold=True)
+        check_new_file(save, overwrite, data)
     return _Shown(save)
 
 

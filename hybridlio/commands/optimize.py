@@ -7,10 +7,9 @@ from typing import Annotated
 
 import typer
 
-from hybridlio.commands.common import Verbose, guarded
+from hybridlio.commands.common import Overwrite, Verbose, guarded
 from hybridlio.commands.shared import completion
 from hybridlio.commands.terminal import print_result, print_warning
-from hybridlio.core.errors import ConfigError
 
 
 @guarded
@@ -32,15 +31,16 @@ def optimize(
     plot: Annotated[
         Path | None, typer.Option(metavar="PNG", help="Where to draw it, with factors coloured by their χ².")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")] = False,
+    overwrite: Overwrite = False,
     _verbosity: Verbose = 0,
 ) -> None:
     """Find the poses that fit a pose graph's factors best."""
+    from hybridlio.datasets.protection import check_new_file
     from hybridlio.graph.pose_graph import PoseGraph
 
     for path in (output, plot):
-        if path is not None and path.exists() and not overwrite:
-            raise ConfigError(f"{path} exists; give another name, or --overwrite")
+        if path is not None:
+            check_new_file(path, overwrite)
     loaded = PoseGraph.load(graph)
     solution = loaded.optimize(solver)  # type: ignore[arg-type]  # checked by optimize
     if output is not None:

@@ -7,10 +7,9 @@ from typing import Annotated
 
 import typer
 
-from hybridlio.commands.common import Verbose, guarded
+from hybridlio.commands.common import Overwrite, Verbose, guarded
 from hybridlio.commands.evaluate import load_pair
 from hybridlio.commands.terminal import print_result, print_table, print_warning
-from hybridlio.core.errors import ConfigError
 
 
 @guarded
@@ -30,19 +29,17 @@ def report(
         ),
     ] = None,
     out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The page to write.")] = Path("report.html"),
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
+    overwrite: Overwrite = False,
     _verbosity: Verbose = 0,
 ) -> None:
     """Compare trajectories, of any odometry, with ground truth and each other in one page of charts."""
-    from hybridlio.datasets.protection import check_output
+    from hybridlio.datasets.protection import check_new_file
     from hybridlio.evaluation.metrics_table import metrics_table
     from hybridlio.evaluation.reference_check import reference_doubts
     from hybridlio.evaluation.report import write_report
     from hybridlio.evaluation.report_data import ReportData, analyse
 
-    if out.exists() and not overwrite:
-        raise ConfigError(f"{out} exists; choose another file with -o, or give --overwrite")
-    check_output(out.parent, may_hold=True)
+    check_new_file(out, overwrite)
     pairs = [load_pair(path, reference) for path in estimates]
     first, true, steps = pairs[0]
     names = _names(estimates)

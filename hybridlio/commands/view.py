@@ -23,6 +23,7 @@ def view(
     data: Annotated[
         Path | None, typer.Option("--data", metavar="DATA", help="The recording, if it is not where the run found it.")
     ] = None,
+    overwrite: common.Overwrite = False,
     scans: Annotated[
         bool, typer.Option("--scans/--no-scans", help="Show the points of every scan, read from the recording.")
     ] = True,
@@ -35,13 +36,13 @@ def view(
     if report:
         _open_report(run)
         return
-    from hybridlio.datasets.protection import check_output
+    from hybridlio.datasets.protection import check_new_file
     from hybridlio.viewing.rerun_stream import check_target
     from hybridlio.viewing.view import view as show
 
     check_target(save)
-    if save is not None and data is not None:
-        check_output(save.parent, data, may_hold=True)
+    if save is not None:
+        check_new_file(save, overwrite, *([] if data is None else [data]))
     with progress("view") as reported:
         scene = show(run, save, data=data, scans=scans, progress=reported)
     for note in scene.left_out:

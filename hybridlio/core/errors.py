@@ -20,7 +20,10 @@ def shown(value: object) -> str:
 
 
 class HybridLioError(Exception):
-    """Base class of all errors that the library raises on purpose."""
+    """Base class of all errors that the library raises on purpose; messages have no control characters of a file's."""
+
+    def __init__(self, *arguments: object) -> None:
+        super().__init__(*(strip_control(one) if isinstance(one, str) else one for one in arguments))
 
 
 class DataError(HybridLioError):

@@ -19,7 +19,7 @@ from hybridlio.core.errors import DataError, HybridLioError, shown
 
 # raised when an .npz file is damaged or holds something else
 UNREADABLE_NPZ = (
-    OSError, ValueError, KeyError, IndexError, TypeError, EOFError, BadZipFile, zlib.error, HybridLioError
+    OSError, ValueError, KeyError, IndexError, TypeError, EOFError, RuntimeError, BadZipFile, zlib.error, HybridLioError
 )  # fmt: skip
 
 _MAX_PATH_BYTES = 4096  # PATH_MAX of Linux; a part of a path has at most 255 (NAME_MAX)

@@ -72,6 +72,8 @@ def without_filled_gaps(imu: ImuSamples) -> tuple[ImuSamples, list[tuple[int, in
     """Return the measured samples, and the gaps ``(start_ns, end_ns)`` that :func:`filled_gaps` found."""
     keep: Mask = np.ones(len(imu), dtype=bool)
     gaps = filled_gaps(imu)
+    if not gaps:
+        return imu, []
     for first, last in gaps:
         keep[first + 1 : last] = False
     return _at_rows(imu, keep), [(int(imu.stamps_ns[a]), int(imu.stamps_ns[b])) for a, b in gaps]

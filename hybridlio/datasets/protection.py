@@ -16,6 +16,8 @@ from hybridlio.datasets.rosbag.reader import SUFFIXES
 # Levels below the output folder that are searched for recordings: KITTI's root/date/drive is 2 deep, its
 # dataset/sequences/00 is 3 deep.
 _SEARCH_DEPTH = 3
+# An MCAP file begins with its magic, the operation and length of the header record, and the length of its profile.
+_MCAP, _MCAP_PROFILE = b"\x89MCAP0\r\n", 8 + 1 + 8 + 4
 _MAX_FOLDERS = 5000  # keeps the search below about a second, also where somebody writes to a home folder
 
 
@@ -41,6 +43,34 @@ def check_output(folder: str | os.PathLike[str], *recordings: str | os.PathLike[
     held = next((path for path in given if path == out or out in path.parents), None) or next(_below(out), None)
     if held is not None:
         raise _refusal(folder, "is" if held == out else "holds", held)
+
+
+def check_new_file(file: str | os.PathLike[str], overwrite: bool, *recordings: str | os.PathLike[str]) -> None:
+    """Check that a command may write a file: it is new or ``overwrite`` is set, and no recording is damaged by it.
+
+    Args:
+        file: the file to write.
+        overwrite: whether it may replace another file, which must not be a bag.
+        recordings: paths of recordings that the file must not lie in, whatever their layout.
+
+    Raises:
+        ConfigError: the file exists, is a folder or a bag, or lies inside a recording.
+    """
+    path = user_path(file)
+    if path.is_dir():
+        raise ConfigError(f"{os.fspath(file)} is a folder; name a file")
+    if (path.exists() or path.is_symlink()) and not overwrite:
+        raise ConfigError(f"{os.fspath(file)} exists; choose another file, or give --overwrite")
+    if path.exists() and path.suffix in SUFFIXES and not _is_export(path):
+        raise _refusal(file, "is", path)
+    check_output(path.parent, *recordings, may_hold=True)
+
+
+def _is_export(path: Path) -> bool:
+    """Return whether an MCAP file, by the first record, is no recording of ROS; such are written for viewers."""
+    with path.open("rb") as file:
+        start = file.read(_MCAP_PROFILE + 4)
+    return start.startswith(_MCAP) and start[_MCAP_PROFILE:] not in (b"ros1", b"ros2")
 
 
 def _refusal(folder: str | os.PathLike[str], how: str, recording: Path) -> ConfigError:

@@ -14,7 +14,7 @@ from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.tables import counted
 from hybridlio.datasets import folder
 from hybridlio.datasets.calibration_yaml import MAX_RATE_HZ
-from hybridlio.datasets.imu_faults import without_spikes
+from hybridlio.datasets.imu_faults import without_filled_gaps, without_spikes
 from hybridlio.datasets.kitti import odometry, raw
 from hybridlio.datasets.kitti.vertical_angle import check_angle
 from hybridlio.datasets.notes import Notes
@@ -125,7 +125,7 @@ def open_sequence(
     chosen = _pick(root, found, sequence)
     raw = user_path(raw_root).resolve() if raw_root is not None else None
     options = ReaderOptions(raw, vertical_angle_deg, topics or BagTopics(), rate_hz)
-    opened = _without_spikes(READERS[name].open(found[chosen], options))
+    opened = without_false_samples(READERS[name].open(found[chosen], options))
     raw_name = None if raw is None else str(raw)
     source = Source(str(root), chosen, name, raw_name, vertical_angle_deg, options.topics, rate_hz)
     return replace(opened, source=source)
@@ -153,18 +153,26 @@ def reopen(source: Source, path: str | os.PathLike[str] | None = None) -> Sequen
     return whole if not source.start and source.stop is None else whole.part(source.start, source.stop)
 
 
-def _without_spikes(sequence: Sequence) -> Sequence:
-    """Return the sequence without spikes in its IMU samples; note how many there were."""
-    imu, left_out_ns = without_spikes(sequence.imu)
-    if not len(left_out_ns):
-        return sequence
-    notes = Notes(sequence.name, list(sequence.notes))
-    after_s = (left_out_ns[0] - sequence.stamps_ns[0]) / NS_PER_S
-    notes.corrected(
-        f"dropped {counted(len(left_out_ns), 'IMU sample')} far from the neighbouring ones, the first {after_s:.2f} s "
-        "after the first scan"
-    )
-    return replace(sequence, imu=imu, notes=tuple(notes.texts))
+def without_false_samples(sequence: Sequence) -> Sequence:
+    """Return the sequence without IMU samples that were not measured, as all readers do, and note them.
+
+    Such are spikes, and stretches on a straight line: a recorder filled a gap, or a driver repeated its last sample.
+    """
+    measured, left_out_ns = without_spikes(sequence.imu)
+    imu, gaps = without_filled_gaps(measured)
+    notes, first_ns = Notes(sequence.name, list(sequence.notes)), int(sequence.stamps_ns[0])
+    if len(left_out_ns):
+        notes.corrected(
+            f"dropped {counted(len(left_out_ns), 'IMU sample')} far from the neighbouring ones, the first "
+            f"{(left_out_ns[0] - first_ns) / NS_PER_S:.2f} s after the first scan"
+        )
+    if gaps:
+        lost_s = sum(end - start for start, end in gaps) / NS_PER_S
+        notes.corrected(
+            f"dropped the IMU samples of {counted(len(gaps), 'gap')}, {lost_s:.2f} s in all, that a straight line or a "
+            f"repeated sample fills, the first {(gaps[0][0] - first_ns) / NS_PER_S:.2f} s after the first scan"
+        )
+    return sequence if imu is sequence.imu else replace(sequence, imu=imu, notes=tuple(notes.texts))
 
 
 def locate(path: str | os.PathLike[str], sequence: str | None = None, reader: str | None = None) -> tuple[str, Path]:

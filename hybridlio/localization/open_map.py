@@ -20,6 +20,8 @@ from hybridlio.record.record import Record
 from hybridlio.runs.folder import KEYFRAMES, RECORD, is_run_folder, read_run
 from hybridlio.smoothing.loop_closure import up_of
 
+_LARGEST_M = 1e9  # coordinates of any system of the Earth are below 5e7 m
+
 
 def open_prior_map(path: str | Path) -> PriorMap:
     """Open a map: a run folder (smoothed or not), or a ``.ply``, ``.pcd``, ``.las``, ``.laz`` or ``.npz`` file.
@@ -72,12 +74,24 @@ def _points(path: Path) -> Array:
     if path.suffix.lower() == ".npz":
         try:
             with np.load(path, allow_pickle=False) as file:
-                points = np.asarray(file["points"], np.float64)
+                points = np.asarray(file["points"], np.float64).reshape(-1, 3)
         except UNREADABLE_NPZ as error:
             raise DataError(f"{path}: not a map ({error}); `hybridlio map` writes one") from error
     elif path.suffix.lower() in SUFFIXES:
-        columns = read_columns(path)
-        points = np.column_stack([columns[axis] for axis in "xyz"]).astype(np.float64)
+        points = _columns(path)
     else:
         raise DataError(f"{path}: unknown format; a map is a run folder or a .ply, .pcd, .las, .laz or .npz file")
-    return points[np.isfinite(points).all(axis=1)]
+    points = points[np.isfinite(points).all(axis=1)]
+    if np.abs(points).max(initial=0.0) > _LARGEST_M:
+        raise DataError(f"{path}: coordinates over {_LARGEST_M:.0e} m; the file is damaged")
+    return points
+
+
+def _columns(path: Path) -> Array:
+    try:
+        columns = read_columns(path)
+        return np.column_stack([columns[axis] for axis in "xyz"]).astype(np.float64)
+    except KeyError as error:
+        raise DataError(f"{path}: no column {error.args[0]}; a map has x, y and z") from error
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hybridlio.core.errors import ConfigError
 from hybridlio.core.files import make_folder, write_atomically
 from hybridlio.core.progress import Progress
 from hybridlio.mapping.build import MapTiles
@@ -19,7 +20,7 @@ from hybridlio.mapping.point_map import PointMap
 if TYPE_CHECKING:
     from pyproj import CRS
 
-INDEX = "tiles.json"
+INDEX, _WRITING = "tiles.json", ".tiles.json"
 _TILE = re.compile(r"x[+-]\d{4,}_y[+-]\d{4,}\.\w+")  # a name of ours
 
 
@@ -49,15 +50,17 @@ def write_tiles(
         The number of points.
 
     Raises:
-        ConfigError, DataError: as :func:`~hybridlio.mapping.files.write_map`.
+        ConfigError, DataError: as :func:`~hybridlio.mapping.files.write_map`; or there is a file of a tile's name that
+            no earlier map has written.
     """
     make_folder(folder)
     old, rows, total = _files_of(folder), [], 0
-    for done, tile in enumerate(tiles.names, 1):
+    file_names = {tile: f"x{tile[0]:+05d}_y{tile[1]:+05d}{suffix}" for tile in tiles.names}
+    _claim(folder, list(file_names.values()), old)
+    for done, (tile, name) in enumerate(file_names.items(), 1):
         points = tiles.points(tile)
         if len(points):
             points = points if project is None else project(points)
-            name = f"x{tile[0]:+05d}_y{tile[1]:+05d}{suffix}"
             write_map(folder / name, points, colour, crs)
             extent = [np.round(end(points.points, axis=0), 3).tolist() for end in (np.min, np.max)]
             rows.append({"file": name, "points": len(points), "min": extent[0], "max": extent[1]})
@@ -68,13 +71,29 @@ def write_tiles(
     write_atomically(folder / INDEX, json.dumps(index, indent=2) + "\n")
     for name in old - {str(row["file"]) for row in rows}:
         (folder / name).unlink(missing_ok=True)
+    (folder / _WRITING).unlink()
     return total
 
 
+def _claim(folder: Path, names: list[str], old: set[str]) -> None:
+    """Note in a hidden file which tiles are written, so that a map knows those of a run that was killed.
+
+    Raises:
+        ConfigError: one of them is there, and no tile of an earlier map.
+    """
+    if taken := [name for name in names if name not in old and (folder / name).exists()]:
+        raise ConfigError(f"{folder / taken[0]} is no tile of an earlier map; choose another folder")
+    write_atomically(folder / _WRITING, json.dumps({"tiles": [{"file": name} for name in {*names, *old}]}) + "\n")
+
+
 def _files_of(folder: Path) -> set[str]:
-    """Return the tiles that an earlier map wrote to a folder, as its index lists them; of its names no others."""
+    """Return the tiles that earlier maps wrote to a folder, finished or not; of its names no others."""
+    return _listed(folder / INDEX) | _listed(folder / _WRITING)
+
+
+def _listed(index: Path) -> set[str]:
     try:
-        tiles = json.loads((folder / INDEX).read_text(encoding="utf-8"))["tiles"]
+        tiles = json.loads(index.read_text(encoding="utf-8"))["tiles"]
         return {name for name in (str(tile["file"]) for tile in tiles) if _TILE.fullmatch(name)}
     except (OSError, ValueError, KeyError, TypeError):
         return set()

@@ -9,8 +9,9 @@ if the path that they found is smooth while the IMU contradicts two steps of it 
 jumps, or moves on beside its jump as the IMU predicts, the scan is. Scans that leave a direction unconstrained, as
 those of a narrow lidar on open ground do, drift smoothly and are no judges of the IMU.
 
-Where neither is shown to be right, because scans that are believed without the IMU move abruptly and contradict it
-grossly, as after a false start, the position is doubted: see :attr:`InnovationGate.doubt_m2`.
+Where neither is shown to be right, the position is doubted (:attr:`InnovationGate.doubt_m2`): because scans that are
+believed without the IMU move abruptly and contradict it grossly, as after a false start; or because the contradiction
+began with a scan that fits the map poorly, as where the scans jump to another place.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.motion_limits import UNKNOWN_TRANSLATION_SIGMA_M
 from hybridlio.sources.motion_change import MotionChange
+from hybridlio.sources.usual_fit import UsualFit
 
 Verdict = Literal["untested", "accepted", "undecided", "IMU left out", "down-weighted", "rejected", "relocated"]
 
@@ -137,6 +139,8 @@ class InnovationGate:
         self.doubt_m2 = 0.0
         self._unconfirmed_m = 0.0  # length of the path since the IMU last confirmed it
         self._motion = MotionChange()
+        self._fit = UsualFit()
+        self._misfit = False  # a scan that fits poorly has contradicted the IMU grossly, which has not agreed since
         self._determined_in_a_row = 0  # scans until now that constrain every direction
         # the last scan, where it was found, in the pose that the source's path has for it; None if they are the same
         self._found: Array | None = None
@@ -171,6 +175,7 @@ class InnovationGate:
         else:
             relative, result = self._tested(measured, own, predicted, bridge, dt_s)
         self._note_path(own, result)
+        self._note_fit(measured, result)
         if result.verdict in ("untested", "IMU left out") and self._is_doubtful(own, predicted, dt_s):
             self.doubt_m2, self._unconfirmed_m = self.doubt_m2 + self._unconfirmed_m**2, 0.0
         if measured.ok and result.verdict in _MOVES_ON:
@@ -189,12 +194,22 @@ class InnovationGate:
         if self._accepted_in_a_row >= WARM_UP_STEPS:
             self._unconfirmed_m = 0.0
 
+    def _note_fit(self, measured: RelativePose, result: GateResult) -> None:
+        """Note whether a gross contradiction began with a scan that fits the map poorly; the IMU may end it."""
+        if result.verdict == "accepted":
+            self._fit.learn(measured.details)
+            self._misfit = self._misfit and self._accepted_in_a_row < WARM_UP_STEPS
+        elif result.nis is not None and result.nis > GROSS_NIS and self._fit.is_poor(measured.details):
+            self._misfit = True
+
     def _is_doubtful(self, own: RelativePose, predicted: RelativePose | None, dt_s: float) -> bool:
         """Whether scans that are believed without the IMU contradict it grossly, and move abruptly at that.
 
         So they do after a false start, whose speed changes with every scan. The path since the IMU last confirmed it
-        may then be wrong by all its length.
+        may then be wrong by all its length. So may that from a scan which did not fit the map.
         """
+        if self._misfit:
+            return True
         if predicted is None or not _comparable(own, predicted) or not self._motion.is_abrupt(own.pose, dt_s):
             return False
         return normalised_innovation_squared(own, predicted) > GROSS_NIS

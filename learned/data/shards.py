@@ -15,6 +15,7 @@ import uuid
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 from hybridlio.cloud.map_geometry import MapGeometry
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.files import write_atomically
+from hybridlio.learned.setting_values import from_dict
 
 FORMAT = 1  # raise by 1 when the files of a shard change
 _STEP_M = 0.004  # a fifth of an HDL-64E's range noise; int16 then reaches 131 m, beyond the range limit of 120 m
@@ -179,11 +181,13 @@ class Shard:
         self.folder = Path(folder)
         self.info = _read_info(self.folder)
         n, geometry = self.info.scans, self.info.geometry
-        steps = {name: self._array(name) for name in (*_STEPS, "loss_offsets")}
+        steps = {name: self._array(name, shape) for name, shape in self._row_shapes().items()}
         self.imu, self.imu_there, self.dt_s = steps["imu"], steps["imu_there"], steps["dt_s"]
         self.velocity_m_s, self.usable = steps["velocity_m_s"], steps["usable"]
         self.initial, self.reference = steps["initial"], steps["reference"]
         self._offsets = steps["loss_offsets"]
+        if self._offsets[0] != 0 or (np.diff(self._offsets) < 0).any():
+            raise DataError(f"{self.folder / 'loss_offsets.npy'}: no increasing numbers; prepare the shard again")
         total = int(self._offsets[-1])
         self._maps = self._raw("vertex_maps", np.int16, (n, 3, geometry.rows, geometry.columns))
         self._points = self._raw("loss_points", np.int16, (total, 3))
@@ -204,15 +208,28 @@ class Shard:
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         return points, np.asarray(normals / np.where(length > 0, length, 1), np.float32)
 
-    def _array(self, name: str) -> NDArray[Any]:
+    def _row_shapes(self) -> dict[str, tuple[str, tuple[int, ...]]]:
+        """Return kind and shape of each array of rows."""
+        n = self.info.scans
+        return {
+            "imu": ("f", (n, self.info.imu_samples, 6)),
+            **dict.fromkeys(("imu_there", "usable"), ("b", (n,))),
+            "dt_s": ("f", (n,)),
+            "velocity_m_s": ("f", (n, 3)),
+            **dict.fromkeys(("initial", "reference"), ("f", (n, 4, 4))),
+            "loss_offsets": ("i", (n + 1,)),
+        }
+
+    def _array(self, name: str, expected: tuple[str, tuple[int, ...]]) -> NDArray[Any]:
         path = self.folder / f"{name}.npy"
         try:
-            values: NDArray[Any] = np.load(path, allow_pickle=False)
-        except (OSError, ValueError) as error:
+            values = np.array(np.load(path, "r", allow_pickle=False))  # mapped: nothing is allocated that is not there
+        except (OSError, ValueError, EOFError, OverflowError, MemoryError, SyntaxError, TokenError) as error:
             raise DataError(f"{path}: cannot be read ({error}); prepare the shard again") from error
-        expected = self.info.scans + (name == "loss_offsets")
-        if len(values) != expected:
-            raise DataError(f"{path}: {len(values)} rows for {self.info.scans} scans; prepare the shard again")
+        if (values.dtype.kind, values.shape) != expected:
+            raise DataError(
+                f"{path}: {values.dtype} of shape {values.shape} for {self.info.scans} scans; prepare the shard again"
+            )
         return values
 
     def _raw(self, name: str, dtype: type[np.generic], shape: tuple[int, ...]) -> NDArray[Any]:
@@ -233,6 +250,6 @@ def _read_info(folder: Path) -> ShardInfo:
         values = json.loads(path.read_text())
         if values["format"] != FORMAT:
             raise DataError(f"{path}: format {values['format']}, this version reads {FORMAT}; prepare the shard again")
-        return ShardInfo(**{**values, "geometry": MapGeometry(**values["geometry"])})
-    except (ValueError, KeyError, TypeError, ConfigError) as error:
+        return from_dict(ShardInfo, values, "shard")
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, ConfigError) as error:
         raise DataError(f"{path}: not the description of a shard ({error}); prepare the shard again") from error

@@ -156,7 +156,7 @@ class PointWeights(nn.Module):
 
 def _coarse_cells(geometry: MapGeometry) -> Tensor:
     """Return the index ``(H·W,)`` of the coarse cell that contains each cell, both counted row by row."""
-    rows, columns = (torch.arange(n) // _COARSE for n in (geometry.rows, geometry.columns))
+    rows, columns = (torch.arange(n, device="cpu") // _COARSE for n in (geometry.rows, geometry.columns))
     return (rows[:, None] * (int(columns[-1]) + 1) + columns).flatten()
 
 

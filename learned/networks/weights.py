@@ -69,6 +69,8 @@ class Weights:
 
     def network(self, device: torch.device | str = "cpu") -> OdometryNetwork:
         """Return the trained network in evaluation mode."""
+        with torch.device("meta"):  # a damaged recipe may announce a network of any size
+            _check_fit(own_tensors(OdometryNetwork(self.recipe.network)), self.tensors, self.where)
         network = OdometryNetwork(self.recipe.network)
         put_weights(network, self.tensors, self.where)
         return network.to(device).eval()
@@ -92,6 +94,13 @@ def put_weights(network: nn.Module, tensors: Mapping[str, Tensor], where: str) -
         ConfigError: they do not fit; lists tensors that are missing, unknown or of another shape.
     """
     own = own_tensors(network)
+    _check_fit(own, tensors, where)
+    with torch.no_grad():
+        for name, tensor in own.items():
+            tensor.copy_(tensors[name])
+
+
+def _check_fit(own: Mapping[str, Tensor], tensors: Mapping[str, Tensor], where: str) -> None:
     wrong = [f"{name} is missing" for name in own if name not in tensors]
     wrong += [f"{name} is unknown" for name in tensors if name not in own]
     wrong += [
@@ -104,9 +113,6 @@ def put_weights(network: nn.Module, tensors: Mapping[str, Tensor], where: str) -
         raise ConfigError(
             f"{where}: do not fit the network ({'; '.join(wrong[:_LISTED])}{more}); use the recipe in their file"
         )
-    with torch.no_grad():
-        for name, tensor in own.items():
-            tensor.copy_(tensors[name])
 
 
 def save_weights(
@@ -151,6 +157,8 @@ def load_weights(path: str | os.PathLike[str]) -> Weights:
         with safe_open(str(path), "pt") as file:
             metadata = dict(file.metadata() or {})
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (not a mapping)
+        if broken := [name for name, tensor in tensors.items() if not tensor.isfinite().all()]:
+            raise DataError(f"{path}: {broken[0]} holds numbers that are not finite; train the weights again")
     except (OSError, SafetensorError) as error:
         raise DataError(f"{path}: weights cannot be read ({error})") from error
     try:

@@ -18,6 +18,11 @@ from hybridlio.core.files import write_atomically
 from hybridlio.learned.setting_values import from_dict, to_dict
 from hybridlio.learned.settings import Recipe
 
+# raised by PyTorch and ours where a checkpoint is damaged
+_MALFORMED = (
+    OSError, RuntimeError, pickle.UnpicklingError, EOFError, KeyError, IndexError, TypeError, ValueError,
+    AttributeError, OverflowError, ConfigError,
+)  # fmt: skip
 FORMAT = 1  # raise by 1 when the fields of a checkpoint change
 
 
@@ -51,10 +56,17 @@ def take(recipe: Recipe, data: int, step: int, network: nn.Module, optimiser: Op
 
 
 def restore(checkpoint: Checkpoint, network: nn.Module, optimiser: Optimizer) -> None:
-    """Set network, optimiser and random generators to the state of a checkpoint."""
-    network.load_state_dict(checkpoint.network)
-    optimiser.load_state_dict(checkpoint.optimiser)
-    torch.set_rng_state(checkpoint.random["cpu"])
+    """Set network, optimiser and random generators to the state of a checkpoint.
+
+    Raises:
+        DataError: the state is not that of such a network.
+    """
+    try:
+        network.load_state_dict(checkpoint.network)
+        optimiser.load_state_dict(checkpoint.optimiser)
+        torch.set_rng_state(checkpoint.random["cpu"])
+    except _MALFORMED as error:
+        raise DataError(f"the checkpoint does not fit its recipe ({_line(error)}); delete it to start again") from error
     if "cuda" in checkpoint.random and torch.cuda.is_available():
         torch.cuda.set_rng_state(checkpoint.random["cuda"])
 
@@ -94,8 +106,15 @@ def load(path: str | os.PathLike[str]) -> Checkpoint:
             values["optimiser"],
             values["random"],
         )
-    except (OSError, RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, ConfigError) as error:
-        raise DataError(f"{path}: not a checkpoint that can be resumed ({error}); delete it to start again") from error
+    except _MALFORMED as error:
+        raise DataError(
+            f"{path}: not a checkpoint that can be resumed ({_line(error)}); delete it to start again"
+        ) from error
+
+
+def _line(error: BaseException) -> str:
+    """Return the first line of an error; PyTorch's tell much more."""
+    return str(error).partition("\n")[0] or type(error).__name__
 
 
 def differences(wanted: Recipe, found: Recipe) -> list[str]:

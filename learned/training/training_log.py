@@ -9,6 +9,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from hybridlio.core.errors import DataError
 from hybridlio.core.files import write_atomically
 
 
@@ -45,9 +46,19 @@ class TrainingLog:
 
 
 def read_log(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
-    """Return the rows of a ``log.jsonl``, without an incomplete last line."""
-    lines = Path(path).read_text(encoding="utf-8").splitlines(keepends=True)
-    return [json.loads(line) for line in lines if line.endswith("\n")]
+    """Return the rows of a ``log.jsonl``, without an incomplete last line.
+
+    Raises:
+        DataError: the file is missing or damaged.
+    """
+    try:
+        lines = Path(path).read_text(encoding="utf-8").split("\n")[:-1]
+        rows = [json.loads(line) for line in lines]
+        if not all(isinstance(row, dict) and isinstance(row["step"], int) for row in rows):
+            raise DataError("a row is no object with a step")
+    except (OSError, ValueError, KeyError, RecursionError, DataError) as error:
+        raise DataError(f"{path}: not the log of a training run ({error}); delete it to go on") from error
+    return rows
 
 
 def _tensorboard(folder: Path, step: int) -> Any:

@@ -14,6 +14,7 @@ import faults
 import numpy as np
 
 from hybridlio.core import se3
+from hybridlio.datasets.registry import without_false_samples
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.runs.recording_check import check_recording
 
@@ -42,8 +43,8 @@ class Row:
     checked: bool = False
 
     def inject(self, drive: Sequence) -> Sequence:
-        """Return the drive with the fault, as a run gets it."""
-        found = self.fault(drive)
+        """Return the drive with the fault, as a reader and the check give it to a run."""
+        found = without_false_samples(self.fault(drive))
         return (check_recording(found) if self.checked else found).part(0, self.scans)
 
 
@@ -63,7 +64,9 @@ SURVIVED = {
     "neither for 0.5 s": _survived(
         faults.both(faults.no_scans(3, 3.5), faults.no_imu(3, 3.5)), 1.0, "bridged", "the scans are noted as bridged"
     ),
-    "IMU frozen for 2 s": _survived(faults.frozen(3, 5), 0.2),
+    "IMU frozen for 2 s": _survived(
+        faults.frozen(3, 5), 0.2, "a repeated sample fills", "its samples are left out, with a note"
+    ),
     "IMU late by 100 ms": _survived(
         faults.late(0.1), 0.2, "the IMU's clock differs", "the check before a run moves its stamps", checked=True
     ),

@@ -87,6 +87,7 @@ def map_(
     normals: Normals = True,
     tiles: Tiles = None,
     mesh: Mesh = False,
+    overwrite: common.Overwrite = False,
     georeference: Georeference = False,
     _verbosity: common.Verbose = 0,
 ) -> None:
@@ -97,7 +98,7 @@ def map_(
     from hybridlio.runs.whole_folder import held
 
     settings = MapSettings(voxel, min_range, max_range, remove_moving=not keep_moving, normals=normals or mesh)
-    output = _Output(out, colour, None if tiles is None else f".{tiles.lstrip('.')}", mesh)
+    output = _Output(out, colour, None if tiles is None else f".{tiles.lstrip('.')}", mesh, overwrite)
     output.check(data or run)
     source = open_map_source(run, data, poses)
     if georeference:
@@ -125,10 +126,11 @@ class _Output:
     colour: str
     tile_suffix: str | None
     mesh: bool
+    overwrite: bool
 
     def check(self, recording: Path) -> None:
         """Check all that can be wrong with the output before the work begins."""
-        from hybridlio.datasets.protection import check_output
+        from hybridlio.datasets.protection import check_new_file, check_output
         from hybridlio.mapping.colours import check_colour
         from hybridlio.mapping.files import check_map_path
         from hybridlio.mapping.mesh import check_mesh_path
@@ -140,7 +142,10 @@ class _Output:
             check_mesh_path(self.path)
         else:
             check_map_path(self.path if self.tile_suffix is None else self.path / f"tile{self.tile_suffix}")
-        check_output(self.path if self.tile_suffix is not None else self.path.parent, recording, may_hold=True)
+        if self.tile_suffix is None:
+            check_new_file(self.path, self.overwrite, recording)
+        else:
+            check_output(self.path, recording, may_hold=True)
 
     def write(self, tiles: MapTiles, voxel_m: float, origin: GeodeticPoint | None, report: Progress) -> str:
         """Write the map; return what it consists of."""

@@ -44,7 +44,7 @@ def recording(tiny_drive: Path, tmp_path: Path) -> Path:
 
 
 def test_no_command_writes_to_a_folder_that_is_holds_or_lies_inside_a_recording(recording, finished_run, tmp_path):
-    before = snapshot(tmp_path / "D")
+    before, other = snapshot(tmp_path / "D"), shutil.copytree(finished_run, tmp_path / "other")
     for out in (recording, recording / "run", recording.parent):
         for words in (
             ("odometry", recording, "-o", out),
@@ -57,10 +57,19 @@ def test_no_command_writes_to_a_folder_that_is_holds_or_lies_inside_a_recording(
             ("train", recording, "-o", out, "--overwrite"),
             ("train", recording, "-o", tmp_path / "training", "--cache", out),
             ("ablate", recording, "--table", 1, "--test", recording, "-o", out),
+            ("localize", recording, "--map", finished_run, "-o", out),
+            ("merge", finished_run, other, "-o", out),
         ):
             assert "recordings are never written to" in refused(2, *words)
     for out in (recording, recording / "scans"):
         assert "recordings are never written to" in refused(2, "simulate", out, "--seconds", 1)
+        for words in (
+            ("map", finished_run, "-o", out / "map.ply"),
+            ("report", finished_run, "-o", out / "report.html"),
+            ("optimize", finished_run / "graph.g2o", "-o", out / "graph.g2o"),
+            ("calibrate", recording, "-o", out / "calibration.yaml", "--overwrite"),
+        ):
+            assert "recordings are never written to" in refused(2, *words)
     assert snapshot(tmp_path / "D") == before
 
 
@@ -80,15 +89,25 @@ def test_a_batch_beside_the_recordings_is_allowed(recording, tmp_path):
         ("compare.md", ("compare", "DATA", "-o", "OUT")),
         ("checkpoint.pt", ("train", "DATA", "-o", "OUT", "--overwrite")),
         ("table-1.md", ("ablate", "DATA", "--table", "1", "--test", "DATA", "-o", "OUT")),
+        ("map.ply", ("map", "RUN", "-o", "OUT/map.ply")),
+        ("report.html", ("report", "RUN", "-o", "OUT/report.html")),
+        ("graph.g2o", ("optimize", "RUN/graph.g2o", "-o", "OUT/graph.g2o")),
+        ("picture.png", ("optimize", "RUN/graph.g2o", "--plot", "OUT/picture.png")),
+        ("calibration.yaml", ("calibrate", "DATA", "-o", "OUT/calibration.yaml")),
+        ("merge.json", ("merge", "RUN", "OTHER", "-o", "OUT")),
+        ("poses_tum.txt", ("localize", "DATA", "--map", "RUN", "-o", "OUT", "--overwrite")),
         ("poses_tum.txt", ("odometry", "DATA", "-o", "OUT", "--overwrite")),
         ("2026_01_01/calib_cam_to_cam.txt", ("simulate", "OUT", "--seconds", "0.3", "--lidar", "16-beam")),
     ],
 )
-def test_a_file_that_the_program_did_not_write_is_not_replaced(recording, tmp_path, name, words):
+def test_a_file_that_the_program_did_not_write_is_not_replaced(recording, finished_run, tmp_path, name, words):
     out = tmp_path / "out"
     (out / name).parent.mkdir(parents=True)
     (out / name).write_text("mine")
-    line = refused(2, *({"DATA": recording, "OUT": out}.get(word, word) for word in words))
+    other = shutil.copytree(finished_run, tmp_path / "other") if "OTHER" in words else None
+    places = {"DATA": recording, "OUT": out, "RUN": finished_run, "OTHER": other}
+    parts = (word.partition("/") for word in words)
+    line = refused(2, *(f"{places.get(first, first)}{slash}{rest}" for first, slash, rest in parts))
     assert str(out) in line
     assert (out / name).read_text() == "mine"
 
@@ -104,9 +123,10 @@ def test_a_simulation_is_not_written_into_a_run(finished_run, tmp_path):
 def test_a_second_writer_is_refused(recording, finished_run, tmp_path):
     folder = shutil.copytree(finished_run, tmp_path / "run")
     other_folders = [
-        tmp_path / name for name in ("comparison", "batch", "training", "table", "town/drive-0001", "map.ply")
+        tmp_path / name
+        for name in ("comparison", "batch", "training", "table", "town/drive-0001", "map.ply", "localized", "merged")
     ]
-    compared, batched, trained, table, drive, cloud = other_folders
+    compared, batched, trained, table, drive, cloud, localized, merged = other_folders
     code = """import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -127,6 +147,8 @@ with ExitStack() as stack:
         ("ablate", recording, "--table", 1, "--test", recording, "-o", table),
         ("simulate", drive.parent, "--seconds", 1),
         ("map", folder, "-o", cloud, "--voxel", 1),
+        ("localize", recording, "--map", folder, "-o", localized),
+        ("merge", folder, finished_run, "-o", merged),
     )
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=Path(__file__).parents[3]) as other:
         other.stdout.read(1)

@@ -63,11 +63,14 @@ def test_a_smaller_map_leaves_no_tiles_of_a_larger_one_and_keeps_what_is_not_its
     smaller = {row["file"] for row in json.loads((folder / "tiles.json").read_text())["tiles"]}
     assert smaller < larger
     assert {path.name for path in folder.glob("*.ply")} == smaller | {"x+9999_y+9999.ply"}
+    (folder / "tiles.json").unlink()
+    assert "no tile of an earlier map" in refused(2, "map", finished_run, "-o", folder, "--tiles", "ply", *COARSE)
+    assert {path.name for path in folder.glob("*.ply")} == smaller | {"x+9999_y+9999.ply"}
 
 
 def test_the_smoothed_poses_of_a_run_are_used_and_named(finished_run: Path, tmp_path: Path) -> None:
     run = shutil.copytree(finished_run, tmp_path / "run")
-    out = ("-o", tmp_path / "map.ply", *COARSE)
+    out = ("-o", tmp_path / "map.ply", "--overwrite", *COARSE)
     assert f"by the poses of {run}, " in ok("map", run, *out)
     ok("smooth", run)
     assert f"by the poses of {run / 'smoothed'}, " in ok("map", run, *out)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hybridlio.core.errors import ConfigError
-from hybridlio.datasets.protection import check_output, is_recording
+from hybridlio.datasets.protection import check_new_file, check_output, is_recording
 
 
 def touch(root: Path, *names: str) -> None:
@@ -87,3 +87,20 @@ def test_scans_without_stamps_are_protected_where_they_are_the_input(tmp_path: P
     for out in ("drive", "drive/run", "."):
         with pytest.raises(ConfigError, match="recordings are never written to"):
             check_output(tmp_path / out, tmp_path / "drive")
+
+
+def test_a_file_is_replaced_only_if_it_is_said_and_a_bag_never(tmp_path: Path) -> None:
+    touch(tmp_path, "map.ply", "ride.bag", "drive/velodyne_points/data/0000000000.bin")
+    header = b"\x89MCAP0\r\n\x01" + (40).to_bytes(8, "little")  # of the first record
+    (tmp_path / "ride.mcap").write_bytes(header + (4).to_bytes(4, "little") + b"ros2")
+    (tmp_path / "export.mcap").write_bytes(header + (0).to_bytes(4, "little") + b"\x06\0\0\0")
+    check_new_file(tmp_path / "new.ply", False)
+    for name in ("map.ply", "export.mcap"):
+        with pytest.raises(ConfigError, match="exists; choose another file, or give --overwrite"):
+            check_new_file(tmp_path / name, False)
+        check_new_file(tmp_path / name, True)
+    for name in ("ride.bag", "ride.mcap", "drive/map.ply"):
+        with pytest.raises(ConfigError, match="recordings are never written to"):
+            check_new_file(tmp_path / name, True)
+    with pytest.raises(ConfigError, match="is a folder"):
+        check_new_file(tmp_path / "drive", True)
