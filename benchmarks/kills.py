@@ -90,6 +90,9 @@ def commands(folder: Path, drives: list[Path]) -> dict[str, Command]:
             lambda out: [*ablate, "-o", str(out), "--cache", str(shards), "--device", "cpu"],
             ("*/weights.safetensors",),
         ),
+        "map": Command(
+            lambda out: ["map", str(run), "-o", str(out), "--tiles", "ply", "--voxel", "0.3"], ("*.ply", "tiles.json")
+        ),
         "simulate": Command(
             lambda out: ["simulate", str(out), "--seconds", "4", "--lidar", "16-beam"],
             ("*/*/velodyne_points/data/*", "*/*/poses.txt", "*/*/oxts/data/*"),
@@ -205,7 +208,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--kills", type=int, default=60)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--commands", default="odometry,smooth,batch,train,ablate,simulate")
+    parser.add_argument("--commands", default="odometry,smooth,batch,train,map,simulate,ablate")
     options = parser.parse_args()
     folder, chance = options.folder.resolve(), random.Random(options.seed)
     drives = [simulate(folder / f"drive-{k}", SimulationConfig(seconds=8.0, seed=k, lidar="16-beam")) for k in (3, 4)]

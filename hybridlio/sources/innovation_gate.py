@@ -124,10 +124,6 @@ class InnovationGate:
 
     Args:
         takes_back: whether the residual source can take a scan back, so that the path continues by the bridge.
-
-    Attributes:
-        doubt_m2: variance of the position, per axis, by which poses may be wrong beside what the graph knows: scans and
-            IMU have contradicted each other, and neither was shown to be right.
     """
 
     def __init__(self, takes_back: bool = True) -> None:
@@ -136,7 +132,7 @@ class InnovationGate:
         self._rejected_in_a_row = 0
         self._undecided = False
         self._accepted_in_a_row = 0
-        self.doubt_m2 = 0.0
+        self._doubt_m2 = 0.0  # that stays
         self._unconfirmed_m = 0.0  # length of the path since the IMU last confirmed it
         self._motion = MotionChange()
         self._fit = UsualFit()
@@ -144,6 +140,15 @@ class InnovationGate:
         self._determined_in_a_row = 0  # scans until now that constrain every direction
         # the last scan, where it was found, in the pose that the source's path has for it; None if they are the same
         self._found: Array | None = None
+
+    @property
+    def doubt_m2(self) -> float:
+        """Variance of the position, per axis, by which poses may be wrong beside what the graph knows.
+
+        Scans and IMU have contradicted each other, and neither was shown to be right. While scans that fit poorly are
+        bridged, the next one may still show that nothing was lost.
+        """
+        return self._doubt_m2 + (self._unconfirmed_m**2 if self._misfit and self._accepted_in_a_row == 0 else 0.0)
 
     def apply(
         self,
@@ -177,7 +182,7 @@ class InnovationGate:
         self._note_path(own, result)
         self._note_fit(measured, result)
         if result.verdict in ("untested", "IMU left out") and self._is_doubtful(own, predicted, dt_s):
-            self.doubt_m2, self._unconfirmed_m = self.doubt_m2 + self._unconfirmed_m**2, 0.0
+            self._doubt_m2, self._unconfirmed_m = self._doubt_m2 + self._unconfirmed_m**2, 0.0
         if measured.ok and result.verdict in _MOVES_ON:
             # the IMU confirms the path: then the step to this scan is from the bridge, not from a scan found wrongly
             step = measured.pose if result.verdict == "accepted" else own.pose
@@ -199,8 +204,8 @@ class InnovationGate:
         if result.verdict == "accepted":
             self._fit.learn(measured.details)
             self._misfit = self._misfit and self._accepted_in_a_row < WARM_UP_STEPS
-        elif result.nis is not None and result.nis > GROSS_NIS and self._fit.is_poor(measured.details):
-            self._misfit = True
+        elif result.verdict in ("undecided", "rejected", "relocated") and (result.nis or 0.0) > GROSS_NIS:
+            self._misfit = self._misfit or self._fit.is_poor(measured.details)
 
     def _is_doubtful(self, own: RelativePose, predicted: RelativePose | None, dt_s: float) -> bool:
         """Whether scans that are believed without the IMU contradict it grossly, and move abruptly at that.

@@ -104,9 +104,16 @@ FLAGGED = {
         None,
         "bridged",
     ),
-    "kidnapped": Row(
+    "scans jump to another place": Row(
         faults.rearranged(lambda k: k if k < 40 else k + 20),
-        "scans conflict with the IMU; the jump is not in the trajectory",
+        "scans conflict with the IMU; the jump is not in the trajectory, and the covariances grow by the path since",
+        None,
+        "conflict with the IMU",
+        scans=60,
+    ),
+    "kidnapped: carried to another place": Row(
+        faults.carried(40, 20),
+        "scans are rejected, then a new map begins; the covariances grow by the path until the IMU agrees again",
         None,
         "conflict with the IMU",
         scans=60,

@@ -206,6 +206,23 @@ def rearranged(source: Callable[[int], int]) -> Fault:
     return inject
 
 
+def carried(frame: int, frames: int) -> Fault:
+    """From a frame on, scans and samples are those of some frames later: the sensor was switched off and carried."""
+
+    def inject(sequence: Sequence) -> Sequence:
+        stamps, imu = sequence.stamps_ns, sequence.imu
+        jump_ns = int(stamps[frame + frames] - stamps[frame])
+        before, after = imu.stamps_ns < stamps[frame], imu.stamps_ns >= stamps[frame + frames]
+        left = ImuSamples(
+            np.r_[imu.stamps_ns[before], imu.stamps_ns[after] - jump_ns],
+            np.vstack([imu.gyro_rad_s[before], imu.gyro_rad_s[after]]),
+            np.vstack([imu.accel_m_s2[before], imu.accel_m_s2[after]]),
+        )
+        return replace(rearranged(lambda k: k if k < frame else k + frames)(sequence), imu=left)
+
+    return inject
+
+
 def unreadable(*frames: int) -> Fault:
     def inject(sequence: Sequence) -> Sequence:
         def load(k: int) -> Scan:

@@ -6,15 +6,16 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.estimates import RelativePose
-from hybridlio.sources.innovation_gate import WARM_UP_STEPS, InnovationGate
+from hybridlio.sources.innovation_gate import MAX_REJECTIONS, WARM_UP_STEPS, InnovationGate
 
 DT_S = 0.1
 COVARIANCE = np.diag(np.r_[np.full(3, 1e-3), np.full(3, 0.01)] ** 2)
 
 
-def step_of(length_m: float, from_imu: bool = False) -> RelativePose:
+def step_of(length_m: float, from_imu: bool = False, matched: float = 0.9) -> RelativePose:
     pose = se3.exp(np.array([0.0, 0.0, 0.0, length_m, 0.0, 0.0]))
-    return RelativePose(pose, COVARIANCE, "imu" if from_imu else "scans", from_imu=from_imu)
+    details = {} if from_imu else {"matched": matched}
+    return RelativePose(pose, COVARIANCE, "imu" if from_imu else "scans", from_imu=from_imu, details=details)
 
 
 def gate_after(steps: int) -> InnovationGate:
@@ -25,8 +26,8 @@ def gate_after(steps: int) -> InnovationGate:
     return gate
 
 
-def contradicted(gate: InnovationGate, found_m: float, left_out: bool = False) -> None:
-    gate.apply(step_of(found_m), step_of(1.0, True), step_of(1.0, True), DT_S, left_out)
+def contradicted(gate: InnovationGate, found_m: float, left_out: bool = False, matched: float = 0.9) -> None:
+    gate.apply(step_of(found_m, matched=matched), step_of(1.0, True), step_of(1.0, True), DT_S, left_out)
 
 
 def test_a_start_that_changes_its_speed_against_the_imu_may_be_wrong_by_its_length() -> None:
@@ -59,4 +60,35 @@ def test_scans_that_move_on_smoothly_are_not_doubted_whatever_the_imu_says() -> 
 def test_without_a_prediction_nothing_is_doubted() -> None:
     gate = gate_after(3)
     gate.apply(step_of(3.0), None, step_of(1.0), DT_S)
+    assert gate.doubt_m2 == 0
+
+
+def test_a_scan_that_does_not_fit_the_map_is_doubted_until_the_next_one_fits() -> None:
+    gate = gate_after(2 * WARM_UP_STEPS + 1)
+    contradicted(gate, 5.0, matched=0.4)
+    assert gate.doubt_m2 == 5.0**2
+    contradicted(gate, 1.0)
+    assert gate.doubt_m2 == 0
+
+
+def test_a_jump_to_another_place_stays_doubted_and_grows_until_the_imu_agrees_for_a_while() -> None:
+    gate = gate_after(2 * WARM_UP_STEPS + 1)
+    doubts = []
+    for _ in range(2 * MAX_REJECTIONS + 2):
+        contradicted(gate, 5.0, matched=0.4)
+        doubts.append(gate.doubt_m2)
+    assert all(np.diff(doubts) > 0)
+    for _ in range(2 * WARM_UP_STEPS):
+        contradicted(gate, 1.0)
+    stays = gate.doubt_m2
+    contradicted(gate, 5.0, left_out=True)
+    assert gate.doubt_m2 >= stays >= doubts[-1] / 2
+    for _ in range(2 * WARM_UP_STEPS):
+        contradicted(gate, 1.0)
+    assert gate.doubt_m2 <= stays + 5.0**2
+
+
+def test_a_contradiction_by_scans_that_fit_as_usual_is_no_jump() -> None:
+    gate = gate_after(2 * WARM_UP_STEPS + 1)
+    contradicted(gate, 5.0, matched=0.85)
     assert gate.doubt_m2 == 0
