@@ -3,9 +3,9 @@
     python benchmarks/pose_graphs_online.py [--poses N] [--first K] [--loop-every M] [--robust KERNEL]
 
 A robot drives laps of 400 steps with noisy odometry and closes a loop to the previous lap at every M-th pose
-(``fixed-lag``: to the middle of its lag). The first update takes K poses at once, as a graph that was loaded. Each backend runs in its own process. Prints, at five points of the run, the
-median and 99th percentile of an update's processor time over the last 1,000 poses, and the memory of the process; then
-the two times over all poses.
+(``fixed-lag``: to the middle of its lag). The first update takes K poses at once, as a graph that was loaded. Each
+backend runs in its own process. Prints, at five points of the run, the median and 99th percentile of an update's
+processor time over the last 1,000 poses, and the memory of the process; then the two times over all poses.
 """
 
 from __future__ import annotations
