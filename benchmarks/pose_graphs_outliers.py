@@ -24,6 +24,8 @@ _GOOD_PERCENT = 1.0  # of the spread, from which a result counts as right
 def add_wrong_loops(graph: PoseGraph, poses: Array, share: float, group: int, seed: int) -> set[int]:
     """Add wrong loops, a share of the right ones, in groups; return their ids."""
     rng, keys = np.random.default_rng(seed), graph.keys
+    if len(keys) < 3 * group:
+        raise SystemExit(f"{len(keys)} poses are too few for groups of {group} wrong loops")
     between = [factor for factor in graph.factors.values() if factor.kind == "between"]
     loops = [factor for factor in between if abs(factor.keys[0] - factor.keys[1]) != 1]
     wrong: set[int] = set()

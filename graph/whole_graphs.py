@@ -167,13 +167,14 @@ class WholeGraph(CalibratedMeasurements):
 
     @classmethod
     def from_gtsam(cls, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Self:
-        """Return a pose graph of GTSAM's factors over poses, with GTSAM's values as initial values.
+        """Return a pose graph of GTSAM's factors over poses and landmarks, with GTSAM's values as initial values.
 
-        Between-factors and priors with Gaussian noise become this graph's own; all others stay GTSAM's, and cannot be
-        saved.
+        Between-factors, priors, and bearings with ranges, all with Gaussian noise, become this graph's own; other
+        factors over poses stay GTSAM's, and cannot be saved. Calibration variables do not come back from
+        :meth:`to_gtsam`: GTSAM's have neither kind nor name.
 
         Raises:
-            DataError: values other than poses of one dimension, or a factor over other variables.
+            DataError: values other than poses and points of one dimension, or a factor that cannot be taken.
         """
         data = from_gtsam(graph, values)
         made: Any = cls(data.dimension)

@@ -43,7 +43,11 @@ class Changes:
 
 
 def check_followed(data: GraphData) -> None:
-    """Raise GraphError where a graph has what online solvers do not follow: calibration variables."""
+    """Raise GraphError where a graph has what online solvers do not follow: calibration variables.
+
+    One is shared by all factors of a sensor: whenever it is linearised anew, iSAM2 eliminates the whole graph again, so
+    that an update costs what a batch does.
+    """
     if data.calibrations:
         raise GraphError("online solvers take no calibration variables; solve the graph by optimize()")
 

@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
 
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.graph.calibration.variables import insert_calibrations
 from hybridlio.graph.model import coordinates as co
@@ -16,9 +17,11 @@ from hybridlio.graph.model.keys import Key, from_integer, to_integer
 from hybridlio.graph.model.measurements import Factor
 from hybridlio.graph.model.noise import Noise
 from hybridlio.graph.solve.builder import Builder
+from hybridlio.graph.solve.landmark_factors import initial_landmarks, insert_landmarks
 
 _BETWEEN = {"BetweenFactorPose3", "BetweenFactorPose2"}
 _PRIOR = {"PriorFactorPose3", "PriorFactorPose2"}
+_OBSERVATION = {"BearingRangeFactor3D", "BearingRangeFactor2D"}
 
 
 def to_gtsam(data: GraphData) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -42,26 +45,39 @@ def to_gtsam(data: GraphData) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]
     known = np.flatnonzero(~np.isnan(initial[:, 0]))
     for key, pose in zip(data.keys_at(known.tolist()), co.gtsam_poses(initial[known]), strict=True):
         values.insert(to_integer(key), pose)
+    insert_landmarks(values, _landmark_points(data, initial))
     insert_calibrations(values, data.calibrations)
     return graph, values
 
 
-def from_gtsam(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> GraphData:
-    """Return a pose graph of factors over poses; inverse of :func:`to_gtsam`, but for fixed poses, which become priors.
+def _landmark_points(data: GraphData, poses: Array) -> dict[int, Array]:
+    """Return the initial points of landmarks by index: where their observations see them, if all poses are known."""
+    given = data.landmarks.initial_values
+    found = {} if np.isnan(poses).any() else initial_landmarks(data, poses)
+    return found | {k: point for k, point in enumerate(given) if not np.isnan(point[0])}
 
-    Between-factors and priors with Gaussian noise become this package's own; all others stay GTSAM's.
+
+def from_gtsam(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> GraphData:
+    """Return a pose graph of factors over poses and landmarks; inverse of :func:`to_gtsam`.
+
+    Fixed poses come back as priors. Between-factors, priors and bearings with ranges of landmarks, if their noise is
+    Gaussian, become this package's own; all others over poses stay GTSAM's. Calibration variables do not come back:
+    GTSAM's have neither kind nor name, and their factors are code.
 
     Raises:
-        DataError: values of other kinds than poses of one dimension, or a factor over other variables.
+        DataError: values other than poses and points of one dimension, or a factor that cannot be taken.
     """
     if not isinstance(graph, gtsam.NonlinearFactorGraph) or not isinstance(values, gtsam.Values):
         raise DataError(f"from_gtsam: expected a NonlinearFactorGraph and Values, got {type(graph).__name__}")
     names = list(values.keys())
-    poses = [_pose(values, name) for name in names]
-    if len({len(pose) for pose in poses}) != 1:
-        raise DataError("from_gtsam: the values must be poses, all in the plane or all in space")
-    data = GraphData(2 if len(poses[0]) == 3 else 3)
-    data.add_poses([from_integer(name) for name in names], np.array(poses))
+    poses = {name: pose for name in names if (pose := _pose(values, name)) is not None}
+    if len({len(pose) for pose in poses.values()}) != 1:
+        raise DataError("from_gtsam: the values must have poses, all in the plane or all in space")
+    data = GraphData(2 if len(next(iter(poses.values()))) == 3 else 3)
+    data.add_poses([from_integer(name) for name in poses], np.array(list(poses.values())))
+    for name in names:
+        if name not in poses:
+            data.landmarks.add(from_integer(name), _point(values, name, data.dimension))
     for k in range(graph.size()):
         factor = graph.at(k)
         if factor is not None:
@@ -70,13 +86,24 @@ def from_gtsam(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Graph
 
 
 def _pose(values: gtsam.Values, name: int) -> Any:
+    """Return the coordinates of a pose, or None where the value is none."""
     for dimension in (3, 2):
         try:
             pose = getattr(values, f"atPose{dimension}")(name)
         except RuntimeError:  # GTSAM's only answer to a value of another type
             continue
         return pose_coordinates(pose)
-    raise DataError(f"from_gtsam: the value of {gtsam.Symbol(name).string()} is no pose")
+    return None
+
+
+def _point(values: gtsam.Values, name: int, dimension: int) -> Array:
+    try:
+        return np.array(getattr(values, f"atPoint{dimension}")(name))
+    except RuntimeError:
+        raise DataError(
+            f"from_gtsam: the value of {gtsam.Symbol(name).string()} is neither a pose nor a landmark; a pose graph "
+            "takes no others from GTSAM. Its own velocities, biases and calibration are kept by .npz files"
+        ) from None
 
 
 def pose_coordinates(pose: Any) -> Any:
@@ -88,13 +115,26 @@ def pose_coordinates(pose: Any) -> Any:
 
 def _factor(data: GraphData, factor: Any, row: int) -> Factor:
     keys: tuple[Key, ...] = tuple(from_integer(key) for key in list(factor.keys()))
-    unknown = [key for key in keys if key not in data]
-    if unknown:
-        raise DataError(f"from_gtsam: factor {row} concerns {unknown[0]}, which has no pose among the values")
     kind = type(factor).__name__
     model = factor.noiseModel() if hasattr(factor, "noiseModel") else None
+    if kind in _OBSERVATION and keys[1] in data.landmarks and not isinstance(model, gtsam.noiseModel.Robust):
+        return _observation(data, factor, keys)
+    unknown = [key for key in keys if key not in data]
+    if unknown and unknown[0] in data.landmarks:
+        raise DataError(
+            f"from_gtsam: factor {row}, a {kind}, cannot be taken: of landmarks only bearings with ranges can"
+        )
+    if unknown:
+        raise DataError(f"from_gtsam: factor {row} concerns {unknown[0]}, which has no pose among the values")
     if kind not in _BETWEEN | _PRIOR or model is None or isinstance(model, gtsam.noiseModel.Robust):
         return Factor("gtsam", keys, np.zeros(0), code=factor)
     measured = pose_coordinates(factor.measured() if kind in _BETWEEN else factor.prior())
     information = co.our_order(model.information(), data.dimension)
     return Factor("between" if kind in _BETWEEN else "prior", keys, measured, Noise("information", information))
+
+
+def _observation(data: GraphData, factor: Any, keys: tuple[Key, ...]) -> Factor:
+    measured = factor.measured()
+    bearing = [measured.bearing().theta()] if data.dimension == 2 else measured.bearing().point3()
+    noise = Noise("information", factor.noiseModel().information())
+    return Factor("bearing-range", keys[:1], np.r_[bearing, measured.range()], noise, landmark=keys[1])

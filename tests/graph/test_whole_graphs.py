@@ -127,3 +127,32 @@ def test_a_solution_gives_freedom_trajectory_graphs_and_pictures(tmp_path):
     figure = solution.plot()
     figure.savefig(tmp_path / "graph.png")
     assert (tmp_path / "graph.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_landmarks_go_to_gtsam_and_come_back(dimension):
+    graph, bearing = PoseGraph(dimension), 0.4 if dimension == 2 else [1.0, 0.3, 0.2]
+    graph.add_prior(0, np.eye(4), sigmas=1e-3)
+    graph.add_between(0, 1, se3.exp([0, 0, 0.1, 1, 0, 0]), sigmas=0.01)
+    graph.set_initial(1, se3.exp([0, 0, 0.1, 1, 0, 0]))
+    graph.add_bearing_range(0, (11, 5), bearing, 3.0, sigmas=(0.02, 0.1))
+    graph.add_point_observation(1, (11, 5), np.r_[2.0, 0.5, 0.3][:dimension], sigmas=0.1)
+    factors, values = graph.to_gtsam()
+    again = PoseGraph.from_gtsam(factors, values)
+    assert len(again.landmarks) == 1
+    expected, found = graph.optimize(tolerance=1e-12), again.optimize(tolerance=1e-12)
+    np.testing.assert_allclose(found.points[again.landmarks[0]], expected.point((11, 5)), atol=1e-6)
+    np.testing.assert_allclose(found.covariance(1), expected.covariance(1), rtol=1e-6)
+
+
+def test_what_gtsam_has_and_a_pose_graph_cannot_take_is_named():
+    values, factors = gtsam.Values(), gtsam.NonlinearFactorGraph()
+    values.insert(0, gtsam.Pose3())
+    values.insert(gtsam.symbol("l", 1), np.array([1.0, 2.0, 3.0]))
+    model = gtsam.noiseModel.Isotropic.Sigma(1, 0.1)
+    factors.add(gtsam.RangeFactor3D(0, gtsam.symbol("l", 1), 2.0, model))
+    with pytest.raises(DataError, match="factor 0, a RangeFactor3D, cannot be taken"):
+        PoseGraph.from_gtsam(factors, values)
+    values.insert(gtsam.symbol("b", 0), gtsam.imuBias.ConstantBias())
+    with pytest.raises(DataError, match="the value of b0 is neither a pose nor a landmark"):
+        PoseGraph.from_gtsam(gtsam.NonlinearFactorGraph(), values)
