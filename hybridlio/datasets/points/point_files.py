@@ -18,12 +18,12 @@ from hybridlio.core.arrays import Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import Scan
 from hybridlio.datasets.notes import Notes
-from hybridlio.datasets.points import pcd, ply, tables
+from hybridlio.datasets.points import pcd, ply, tables, text_rows
 from hybridlio.datasets.points.bin_layout import BinLayout, column_names, find_layout
 from hybridlio.datasets.points.fields import Columns
 from hybridlio.datasets.points.point_format import PointFormat, StatedFormat, learn_format, sampled
 
-SUFFIXES = (".bin", ".npy", ".pcd", ".ply", ".las", ".laz", ".feather", ".parquet")
+SUFFIXES = (".bin", ".npy", ".pcd", ".ply", ".las", ".laz", ".feather", ".parquet", *text_rows.SUFFIXES)
 
 _CLOUD_COMPARE = "scalar_"  # before the names of fields in its .ply files
 
@@ -134,9 +134,9 @@ def read_columns(path: Path, layout: BinLayout | None = None, step_ns: int | Non
         raise DataError("no such file")
     if path.suffix == ".bin":
         return (layout or BinLayout()).read(path)
-    if path.suffix != ".npy":
+    if path.suffix in _READERS:
         return {name.lower().removeprefix(_CLOUD_COMPARE): v for name, v in _READERS[path.suffix](path).items()}
-    values = tables.read_npy(path)
+    values = tables.read_npy(path) if path.suffix == ".npy" else text_rows.read_text(path)
     if isinstance(values, dict):
         return {name.lower(): column for name, column in values.items()}
     names = ["x", "y", "z", *column_names(values[:, 3:], step_ns)]

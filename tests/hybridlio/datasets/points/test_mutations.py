@@ -29,6 +29,8 @@ def write(path: Path) -> None:
     kinds = {name: KINDS[table.dtype[name].str] for name in table.dtype.names}
     if path.suffix == ".npy":
         np.save(path, table)
+    elif path.suffix == ".xyz":
+        np.savetxt(path, np.column_stack([table[name] for name in table.dtype.names]), header="x y z intensity t")
     elif path.suffix == ".bin":
         np.column_stack([table[name] for name in table.dtype.names[:4]]).astype("<f4").tofile(path)
     elif path.suffix == ".pcd":
@@ -65,7 +67,7 @@ def mutated(data: bytes, rng: np.random.Generator) -> bytes:
     return bytes(out)
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".bin", ".pcd", ".ply", ".las", ".laz", ".feather"])
+@pytest.mark.parametrize("suffix", [".npy", ".bin", ".pcd", ".ply", ".las", ".laz", ".feather", ".xyz"])
 def test_a_damaged_file_gives_a_scan_or_one_error_that_names_it(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"scan{suffix}"
     write(path)
