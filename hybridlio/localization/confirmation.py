@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.setting_checks import check_fraction, check_not_negative, check_positive
+from hybridlio.localization.fusion import UncertainPose
 
 
 @dataclass(frozen=True)
@@ -45,21 +46,12 @@ class Vote:
     """One scan's answer.
 
     Attributes:
-        T_map_world: ``(4, 4)`` pose of the odometry's world in the map.
-        T_world_lidar: ``(4, 4)`` of the scan.
-        travelled_m: along the path.
-        covariance: ``(6, 6)`` of ``T_map_world · T_world_lidar``.
+        at: of the present scan in the map: the answer, carried on by odometry.
+        travelled_m: of the scan that gave it, along the path.
     """
 
-    T_map_world: Array
-    T_world_lidar: Array
+    at: UncertainPose
     travelled_m: float
-    covariance: Array
-
-    @property
-    def T_map_lidar(self) -> Array:
-        """``(4, 4)`` pose of the scan in the map."""
-        return np.asarray(self.T_map_world @ self.T_world_lidar)
 
 
 @dataclass(eq=False)
@@ -69,23 +61,34 @@ class Confirmation:
     settings: ConfirmationSettings = field(default_factory=ConfirmationSettings)
     _votes: list[Vote] = field(default_factory=list)
 
-    def add(self, vote: Vote) -> bool:
-        """Add a vote; return whether it is confirmed by others, and no other answer is nearly as good."""
+    def move(self, step: Array, covariance: Array) -> None:
+        """Carry all votes on by a step ``T_k_k1`` ``(4, 4)`` of the odometry with its covariance."""
+        self._votes = [replace(one, at=one.at.moved(step, covariance)) for one in self._votes]
+
+    def add(self, vote: Vote) -> UncertainPose | None:
+        """Add a vote of the present scan; return its pose once others confirm it and no other answer is nearly as good.
+
+        The pose is that of the vote nearest to all that agree: a registration can settle in a minimum decimetres off,
+        within what counts as agreement, and then claims to be sure.
+        """
         settings = self.settings
         self._votes = [v for v in self._votes if vote.travelled_m - v.travelled_m < settings.window_m] + [vote]
-        agreeing = [one for one in self._votes if self._agree(vote, one)]
+        agreeing = [one for one in self._votes if self._difference(vote, one) <= 1.0]
         places = {one.travelled_m for one in agreeing}
         others = {one.travelled_m for one in self._votes if one not in agreeing} - places
         span_m = vote.travelled_m - min(places)
-        enough = len(places) >= settings.places and span_m >= settings.distance_m
-        return enough and len(others) <= settings.rival_share * len(places)
+        if len(places) < settings.places or span_m < settings.distance_m:
+            return None
+        if len(others) > settings.rival_share * len(places):
+            return None
+        return min(agreeing[::-1], key=lambda one: sum(self._difference(one, other) for other in agreeing)).at
 
     def clear(self) -> None:
         """Forget all votes."""
         self._votes = []
 
-    def _agree(self, one: Vote, other: Vote) -> bool:
-        """Return whether two votes place the later scan alike."""
-        gap = se3.log(se3.between(one.T_map_lidar, other.T_map_world @ one.T_world_lidar))
+    def _difference(self, one: Vote, other: Vote) -> float:
+        """Return how far two votes are apart, as a share of what counts as agreement."""
+        gap = se3.log(se3.between(one.at.pose, other.at.pose))
         apart_m, apart_deg = np.linalg.norm(gap[3:]), np.rad2deg(np.linalg.norm(gap[:3]))
-        return bool(apart_m <= self.settings.max_difference_m and apart_deg <= self.settings.max_difference_deg)
+        return float(max(apart_m / self.settings.max_difference_m, apart_deg / self.settings.max_difference_deg))

@@ -60,6 +60,8 @@ class LocalizationSettings:
 
     def at_scale(self, scale: float) -> LocalizationSettings:
         """Return the settings for scenes of a scale: below 1, in rooms, lengths shrink."""
+        if scale == 1.0:
+            return self
         thinning, keyframes, confirmation = scaled(self.thinning, scale), self.keyframes, self.confirmation
         return replace(
             self,
@@ -102,26 +104,29 @@ class Localizer:
     """
 
     def __init__(self, prior: PriorMap, settings: LocalizationSettings | None = None) -> None:
-        self._use(prior, settings or LocalizationSettings())
-        self._scale: float | None = None  # of the scene, by the first scan
+        self._given = prior, settings or LocalizationSettings()
+        self._scale = 0.0
+        self._use(1.0)
         self._bound = chi_square_quantile(self.settings.inlier_share, 6)
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget the run, as before another one: its start is given or found anew. What is known of the map is kept."""
+        self._has_begun = False
         self._last: UncertainPose | None = None
         self._last_pose: Array | None = None
         self._is_given = False  # the user vouches for a given start, until the map holds
         self._travelled_m = 0.0
         self._held_at_m = -np.inf
 
-    def _use(self, prior: PriorMap, settings: LocalizationSettings) -> None:
-        self._prior, self.settings = prior, settings
-        self._views = ViewPlaces(prior.surface, prior.up, settings.matching)
-        self._confirmation = Confirmation(settings.confirmation)
-        self._path = RecentPath(settings.keyframes, settings.matching.scale * VerificationSettings().reach_m)
-
-    def _begin(self, scan: Scan) -> None:
-        """Take map and settings that suit the scene of the first scan."""
-        self._scale = scale_of(thin(scan, self.settings.thinning).view_m)
-        if self._scale < 1.0:
-            self._use(self._prior.at_scale(self._scale), self.settings.at_scale(self._scale))
+    def _use(self, scale: float) -> None:
+        """Take map and settings for scenes of a scale, and collect keyframes and votes anew."""
+        if scale != self._scale:
+            prior, settings = self._given
+            self._scale, self._prior, self.settings = scale, prior.at_scale(scale), settings.at_scale(scale)
+            self._views = ViewPlaces(self._prior.surface, self._prior.up, self.settings.matching)
+        self._confirmation = Confirmation(self.settings.confirmation)
+        self._path = RecentPath(self.settings.keyframes, scale * VerificationSettings().reach_m)
 
     def start(self, at: UncertainPose, pose: Array) -> None:
         """Begin at a pose in the map.
@@ -141,15 +146,16 @@ class Localizer:
             step: the odometry's step from the last scan.
             up: ``(3,)`` in the odometry's world.
         """
-        if self._scale is None:
-            self._begin(scan)
+        if not self._has_begun:
+            self._use(scale_of(thin(scan, self._given[1].thinning).view_m))
+            self._has_begun = True
         predicted = self._predict(pose, step)
         is_keyframe = self._path.add(scan, pose, step)
         match, thinned = None, thin(scan, self.settings.thinning)
         if predicted is not None:
             is_vague = predicted.sigma_m > self.settings.sure_m
             match = match_with_map(self._prior.surface, thinned, predicted, self.settings.matching, is_vague)
-            self._last, held = self._corrected(predicted, match, pose)
+            self._last, held = self._corrected(predicted, match)
             if held:
                 return self._hold(self._last, match)
         if is_keyframe and self._is_lost and (found := self._recognised(thinned, pose, up)) is not None:
@@ -172,28 +178,28 @@ class Localizer:
         before, self._last_pose = self._last_pose, pose
         if before is None:
             return self._last
-        moved = se3.between(before, pose)
+        moved, drift = se3.between(before, pose), self.settings.odometry_scale * drift_of(step)
         self._travelled_m += float(np.linalg.norm(moved[:3, 3]))
-        if self._last is None:
-            return None
-        return self._last.moved(moved, self.settings.odometry_scale * drift_of(step))
+        self._confirmation.move(moved, drift)
+        return None if self._last is None else self._last.moved(moved, drift)
 
-    def _corrected(self, predicted: UncertainPose, match: MapMatch | None, pose: Array) -> tuple[UncertainPose, bool]:
+    def _corrected(self, predicted: UncertainPose, match: MapMatch | None) -> tuple[UncertainPose, bool]:
         """Return the pose after a match, and whether the match holds it."""
         if match is None or not match.holds or predicted.chi2(match.found) > self._bound:
             return predicted, False
-        is_vague = predicted.sigma_m > self.settings.sure_m and not self._is_given
-        if is_vague and not self._confirmed(match.found, pose):
-            return predicted, False
-        return predicted.fused(match.found), True
+        found: UncertainPose | None = match.found
+        if predicted.sigma_m > self.settings.sure_m and not self._is_given:
+            found = self._confirmed(match.found)
+        return (predicted, False) if found is None else (predicted.fused(found), True)
 
-    def _confirmed(self, found: UncertainPose, pose: Array) -> bool:
-        vote = Vote(found.pose @ se3.inverse(pose), pose, self._travelled_m, found.covariance)
-        return self._confirmation.add(vote)
+    def _confirmed(self, found: UncertainPose) -> UncertainPose | None:
+        """Return the pose that enough scans agree on; None before."""
+        return self._confirmation.add(Vote(found, self._travelled_m))
 
     def _recognised(self, scan: ThinnedScan, pose: Array, up: Array) -> UncertainPose | None:
         """Return the pose in the map by place recognition, once confirmed."""
-        return next((one for one in self._candidates(scan, pose, up) if self._confirmed(one, pose)), None)
+        confirmed = (self._confirmed(one) for one in self._candidates(scan, pose, up))
+        return next((one for one in confirmed if one is not None), None)
 
     def _candidates(self, scan: ThinnedScan, pose: Array, up: Array) -> list[UncertainPose]:
         """Return where the scan, a keyframe, may be: by the places of the map, or by its views."""

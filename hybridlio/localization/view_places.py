@@ -39,8 +39,9 @@ _OFFSETS = ((0.0, 0.0), (0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5))
 _SEARCH = CoarseSearch(kernel_m=2.0, iterations=8, refined=12)  # as for loops; of the starts of several candidates
 _JUDGED_STRIDE, _SPARSE = 16, 4  # every 16th point compares starts, every fourth refines them
 _SAME_M, _MATCHED = 0.5, 4  # refined poses nearer than this are one; the best four are matched with all points
-# Of a refined start: the final registration begins with a kernel this wide, and gives the true covariance.
-_REFINED_SIGMAS = np.repeat([np.deg2rad(0.5), 0.1], 3)
+# Of a refined start, whose poses within that distance are one: the final registration begins with a kernel as wide, and
+# gives the true covariance.
+_REFINED_SIGMAS = np.repeat([np.deg2rad(0.5), _SAME_M / np.sqrt(3)], 3)
 
 
 @dataclass(frozen=True, eq=False)

@@ -62,7 +62,9 @@ def _panels(
         top = 1 - k * (height + _GAP)
         name = "y" if not k else f"y{k + 1}"
         low = {"rangemode": "tozero"} if "height" not in title else {}
-        layout[f"yaxis{'' if not k else k + 1}"] = axis(title, domain=[max(top - height, 0), top], **low)
+        layout[f"yaxis{'' if not k else k + 1}"] = axis(
+            title, domain=[max(top - height, 0), top], automargin=True, **low
+        )
         for label, y, colour in curves:
             kept = thinned_peaks(y)
             traces.append(line(label, times_s[kept], y[kept], colour, yaxis=name, hovertemplate="%{y:.3f}"))

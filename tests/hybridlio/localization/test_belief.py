@@ -26,34 +26,49 @@ def test_a_vague_pose_yields_to_a_sure_one_and_not_the_other_way():
         np.testing.assert_allclose(one.fused(other).pose[:3, 3], 0.0, atol=1e-3)
 
 
-def vote(travelled_m: float, offset_m: float = 0.0) -> Vote:
-    """A vote of a run along x, whose world is displaced in the map."""
-    pose = se3.make(np.eye(3), np.array([travelled_m, 0.0, 0.0]))
-    return Vote(se3.make(np.eye(3), np.array([0.0, offset_m, 0.0])), pose, travelled_m, np.eye(6))
+def votes(confirmation: Confirmation, places_m: list[float], offsets_m: list[float]) -> list[bool]:
+    """Whether each answer of a run along x is believed; an offset displaces the answer sideways."""
+    believed, at_m = [], 0.0
+    for metres, offset in zip(places_m, offsets_m, strict=True):
+        confirmation.move(se3.make(np.eye(3), np.array([metres - at_m, 0.0, 0.0])), 1e-8 * np.eye(6))
+        pose = se3.make(np.eye(3), np.array([metres, offset, 0.0]))
+        believed.append(confirmation.add(Vote(UncertainPose(pose, 1e-4 * np.eye(6)), metres)) is not None)
+        at_m = metres
+    return believed
 
 
 def test_a_place_is_believed_when_scans_metres_apart_agree():
     confirmation = Confirmation(ConfirmationSettings(places=3, distance_m=8.0))
-    assert [confirmation.add(vote(metres)) for metres in (0.0, 4.0, 8.0)] == [False, False, True]
+    assert votes(confirmation, [0.0, 4.0, 8.0], [0.0] * 3) == [False, False, True]
 
 
 def test_a_vehicle_that_stands_confirms_nothing():
-    confirmation = Confirmation()
-    assert not any(confirmation.add(vote(0.001 * k)) for k in range(50))
+    assert not any(votes(Confirmation(), [0.001 * k for k in range(50)], [0.0] * 50))
 
 
 def test_scans_that_disagree_confirm_nothing():
-    confirmation = Confirmation()
-    assert not any(confirmation.add(vote(4.0 * k, offset_m=2.0 * k)) for k in range(10))
+    assert not any(votes(Confirmation(), [4.0 * k for k in range(10)], [2.0 * k for k in range(10)]))
 
 
 def test_a_rival_that_is_half_as_good_prevents_belief():
     confirmation = Confirmation(ConfirmationSettings(places=3, distance_m=8.0, rival_share=0.5))
-    votes = [vote(1.0, 30.0), vote(5.0, 30.0), vote(2.0), vote(6.0), vote(10.0)]
-    assert not any(confirmation.add(one) for one in votes)
-    assert confirmation.add(vote(14.0))
+    places, offsets = [1.0, 2.0, 5.0, 6.0, 10.0, 14.0], [30.0, 0.0, 30.0, 0.0, 0.0, 0.0]
+    assert votes(confirmation, places, offsets) == [False] * 5 + [True]
 
 
 def test_old_votes_are_forgotten():
     confirmation = Confirmation(ConfirmationSettings(places=3, distance_m=8.0, window_m=20.0))
-    assert not any(confirmation.add(vote(metres)) for metres in (0.0, 15.0, 30.0, 45.0))
+    assert not any(votes(confirmation, [0.0, 15.0, 30.0, 45.0], [0.0] * 4))
+
+
+def test_the_pose_believed_is_not_that_of_one_scan_decimetres_off():
+    step = se3.make(np.eye(3), np.array([5.0, 0.0, 0.0]))
+    for outlier in range(3):
+        confirmation, believed = Confirmation(), None
+        for k in range(3):
+            confirmation.move(step, 1e-6 * np.eye(6))
+            pose = se3.make(np.eye(3), np.array([5.0 * k, 0.4 * (k == outlier), 0.0]))
+            believed = confirmation.add(Vote(UncertainPose(pose, 1e-4 * np.eye(6)), 5.0 * k))
+        assert believed is not None
+        np.testing.assert_allclose(believed.pose[:3, 3], [10.0, 0.0, 0.0], atol=1e-9)
+        assert np.trace(believed.covariance) >= 6e-4 - 1e-12  # with the drift of the odometry on the way
