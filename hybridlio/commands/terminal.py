@@ -6,6 +6,7 @@ import functools
 import io
 import logging
 import sys
+import textwrap
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -42,9 +43,17 @@ def print_message(text: str, style: str = "red") -> None:
 def _print(console: Console, text: Text) -> None:
     """Print text; on a terminal wrapped between words, with longer words (paths) whole, elsewhere without wrapping."""
     if console.is_terminal:
-        console.print(text, overflow="ignore", crop=False)
-    else:
-        console.print(text, soft_wrap=True)
+        lines = [part for line in text.plain.split("\n") for part in _wrapped(line, console.width)]
+        text = Text("\n".join(lines), style=text.style)
+    console.print(text, soft_wrap=True)
+
+
+def _wrapped(line: str, width: int) -> list[str]:
+    """Return a line in parts of at most ``width`` characters, broken between words; rich breaks long words, too."""
+    if len(line) <= width:
+        return [line]
+    indent = line[: len(line) - len(line.lstrip())]
+    return textwrap.wrap(line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
 
 
 def print_warning(text: str) -> None:

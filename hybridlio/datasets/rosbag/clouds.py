@@ -16,6 +16,7 @@ Columns = dict[str, NDArray[Any]]
 # sensor_msgs/PointField: INT8, UINT8, INT16, UINT16, INT32, UINT32, FLOAT32, FLOAT64
 _KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 LIVOX_TIMES = StatedTimes("offset_time", "ns", "stamp")  # as :func:`livox_columns` gives them
+_MAX_POINT_BYTES = 1 << 16  # hundreds of times as many as any driver writes; NumPy refuses 2 GiB
 _MAX_TIMEBASE_NS = 1_000_000_000  # no lidar turns slower: a timebase farther from the stamp is on another clock
 
 
@@ -49,6 +50,8 @@ def livox_columns(raw: bytes, is_ros2: bool, stamp_ns: int) -> Columns:
 def _point_type(message: Any) -> np.dtype[Any]:
     order = ">" if message.is_bigendian else "<"
     formats, offsets, names = [], [], []
+    if message.point_step > _MAX_POINT_BYTES:
+        raise DataError(f"points of the cloud have {message.point_step} bytes each; the message is damaged")
     for field in message.fields:
         if field.datatype not in _KINDS:
             raise DataError(f"field {field.name!r} of the cloud has the unknown type {field.datatype}")

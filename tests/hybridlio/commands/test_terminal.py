@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from typing import Any
+
 import pytest
 from command_line import refused
 
@@ -32,6 +35,27 @@ def test_an_error_about_a_path_with_control_characters_is_one_clean_line() -> No
     for path in ("/a\x1b[2J" + "x" * 5000, "~nobody-of-this-name/a"):
         assert "\x1b" not in refused(2, "odometry", path)
         assert "\x1b" not in refused(2, "odometry", "/gone", "-o", path)
+
+
+TABLE = "choose a topic:\n  /points  100\n  /imu     10"
+
+
+@pytest.mark.parametrize("width", [40, 80])
+@pytest.mark.parametrize("show", [print_message, print_result])
+def test_on_a_terminal_nothing_wraps_inside_a_word(
+    show: Any, width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", str(width))
+    text = f"error: {'a-well-known word ' * 30}/{'long-path' * 20}/x: {TABLE}"
+    show(text)
+    printed = re.sub(r"\x1b\[[\d;]*m", "", "".join(capsys.readouterr()))
+    assert printed.split() == text.split()
+    assert all(len(line) <= width or " " not in line.strip() for line in printed.splitlines())
+    assert printed.rstrip("\n").endswith(TABLE.partition("\n")[2])
+    monkeypatch.delenv("FORCE_COLOR")
+    show(text)
+    assert "".join(capsys.readouterr()) == text + "\n"
 
 
 def test_progress_says_what_each_stage_counts_and_begins_anew_with_it(capsys: pytest.CaptureFixture[str]) -> None:

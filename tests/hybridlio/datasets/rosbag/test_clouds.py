@@ -82,6 +82,7 @@ def test_a_count_of_zero_means_a_scalar_and_a_row_step_of_zero_one_row() -> None
         (lambda m: setattr(m, "width", 4_000_000_000), "the message is truncated"),
         (lambda m: (setattr(m, "height", 2), setattr(m, "row_step", 5)), "rows of the cloud have 5 bytes, too few"),
         (lambda m: setattr(m, "point_step", 0), "field 'x' of the cloud lies outside its 0 bytes per point"),
+        (lambda m: setattr(m, "point_step", 2**32 - 1), "points of the cloud have 4294967295 bytes each"),
     ],
 )
 def test_a_cloud_that_does_not_fit_its_description_is_refused(change: Any, text: str) -> None:
