@@ -17,7 +17,7 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 from common import MIB, resident_mib
-from systems import Answer, Make
+from systems import Answer, Make, Step
 
 from hybridlio.core import se3
 from hybridlio.core.progress import Progress
@@ -38,7 +38,7 @@ class Pass:
         answers: one for each scan up to a failure.
         ms: wall-clock time of each.
         cpu_ms: processor time of each, summed over threads; other load on the machine does not lengthen it.
-        start_s: from the start of its process to the first answer, including reading.
+        start_s: from the start of its process to the first answer, including reading, loading and compiling.
         resident_mib: memory after each scan.
         peak_mib: the largest resident memory.
         error: why the pass ended early, or None.
@@ -128,14 +128,16 @@ def _processes(systems: dict[str, Make], opened: Open, threads: int) -> Iterator
 def _serve(connection: Connection, make: Make, opened: Open, threads: int, spawned_s: float) -> None:
     """Process the scans whose numbers arrive, until the other end closes."""
     logging.getLogger("hybridlio").setLevel(logging.ERROR)  # the parent has printed warnings about the recording
-    sequence, step = opened(), None
-    ready_s, start_s = time.time() - spawned_s, float("nan")
+    sequence, start_s = opened(), float("nan")
+    step = _made(make, sequence, threads)
+    ready_s = time.time() - spawned_s
     connection.send(None)
     while (k := _next(connection)) is not None:
         asked_s = time.time()
         try:
+            if isinstance(step, Exception):
+                raise step
             frame = sequence[k]
-            step = step or make(sequence, threads)
             begin, begin_cpu = time.perf_counter(), time.process_time()
             answer = step(frame)
             ms, cpu_ms = 1e3 * (time.perf_counter() - begin), 1e3 * (time.process_time() - begin_cpu)
@@ -147,6 +149,14 @@ def _serve(connection: Connection, make: Make, opened: Open, threads: int, spawn
         start_s = ready_s + time.time() - asked_s if k == 0 else start_s
         peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / MIB
         connection.send((answer, ms, cpu_ms, resident_mib(), peak_mib, start_s))
+
+
+def _made(make: Make, sequence: Sequence, threads: int) -> Step | Exception:
+    """Make the system, which loads and compiles what it needs; return the error if that fails."""
+    try:
+        return make(sequence, threads)
+    except Exception as error:
+        return error
 
 
 def _next(connection: Connection) -> int | None:

@@ -44,10 +44,12 @@ Make = Callable[[Sequence, int], Step]  # makes a system for a recording, with a
 
 
 def ours(config: Config, _: Sequence, threads: int) -> Step:
-    """Make hybridlio's odometry of a configuration."""
+    """Make hybridlio's odometry of a configuration, with everything loaded and compiled, as a stream has it."""
     from hybridlio.odometry.odometry import Odometry
+    from hybridlio.odometry.warm_up import warm_up
 
     odometry = Odometry(config=Config.model_validate(_with_threads(config.model_dump(), threads)))
+    warm_up(odometry)
 
     def step(frame: Frame) -> Answer:
         estimate = odometry.step(frame)
