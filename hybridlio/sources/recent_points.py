@@ -18,6 +18,10 @@ from hybridlio.core.sensors import Scan
 # A lidar repeats its pattern if more than this share of a scan's directions, in cells of this size, occur in the scan
 # before. On simulated recordings spinning lidars have 0.91 or more, those that do not repeat 0.40 or less.
 _REPEATED_SHARE, _CELL_DEG = 0.65, 1.0
+# Rows of a spinning lidar are fixed, so scans that were thinned at random share elevations where they share no
+# directions. Cells much finer than the rows' spacing, 0.35° with 128 rows over 45°, leave most elevations empty, while
+# a lidar without rows fills them as evenly as chance does.
+_ROW_CELL_DEG, _MOST_FILLED = 0.1, 0.5
 _SCANS = 10  # one second at 10 Hz, in which patterns cover most of their field of view
 
 
@@ -68,13 +72,24 @@ class RecentPoints:
 
 
 def repeats_pattern(earlier: Scan, later: Scan) -> bool:
-    """Return whether a lidar measures in about the same directions in two consecutive scans."""
-    return _repeats(_directions(earlier.points), _directions(later.points))
+    """Return whether a lidar measures in about the same directions, or rows, in two consecutive scans."""
+    if _repeats(_directions(earlier.points), _directions(later.points)):
+        return True
+    rows = _rows(earlier.points)
+    by_chance = len(rows) / (np.ptp(rows) + 1) if len(rows) else 1.0
+    return by_chance < _MOST_FILLED and _repeats(rows, _rows(later.points), by_chance)
 
 
-def _repeats(before: Index, directions: Index) -> bool:
-    shared = len(np.intersect1d(directions, before, assume_unique=True))
-    return shared > _REPEATED_SHARE * len(directions)
+def _repeats(before: Index, cells: Index, by_chance: float = 0.0) -> bool:
+    """Return whether most cells occur before, of those that would not do so by chance."""
+    shared = len(np.intersect1d(cells, before, assume_unique=True))
+    return shared - by_chance * len(cells) > _REPEATED_SHARE * (1 - by_chance) * len(cells)
+
+
+def _rows(points: Floats) -> Index:
+    """Return the cells of the elevations of points ``(N, 3)``, in ascending order."""
+    x, y, z = points.T.astype(np.float64)
+    return np.asarray(np.unique(np.rint(np.degrees(np.arctan2(z, np.hypot(x, y))) / _ROW_CELL_DEG).astype(np.int64)))
 
 
 def _directions(points: Array | Floats) -> Index:

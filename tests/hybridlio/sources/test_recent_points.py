@@ -3,7 +3,7 @@ import pytest
 
 from hybridlio.core import se3
 from hybridlio.core.sensors import Scan
-from hybridlio.sources.recent_points import RecentPoints
+from hybridlio.sources.recent_points import RecentPoints, repeats_pattern
 
 HERE = se3.exp(np.array([0.0, 0.1, 0.3, 1.0, -2.0, 0.5]))
 
@@ -56,3 +56,15 @@ def test_earlier_scans_are_moved_to_the_lidar_at_the_last_one(rng: np.random.Gen
     together = kept.together(again, HERE @ motion, 0.01)
     assert len(together) < 1.2 * len(points)
     np.testing.assert_allclose(np.sort(together, axis=0)[::50], np.sort(again, axis=0)[::50], atol=0.3)
+
+
+@pytest.mark.parametrize("count", [100, 300, 1000, 14000])
+def test_a_spinning_lidar_repeats_its_rows_however_few_of_its_points_are_left(rng: np.random.Generator, count: int):
+    first, second = (Scan(k, rng.choice(rings(rng), count, replace=False).astype(np.float32)) for k in range(2))
+    assert repeats_pattern(first, second)
+
+
+@pytest.mark.parametrize("count", [1, 100, 300, 1000, 20000])
+def test_scattered_scans_repeat_nothing_however_many_points_they_have(rng: np.random.Generator, count: int):
+    first, second = (Scan(k, scattered(rng, count).astype(np.float32)) for k in range(2))
+    assert not repeats_pattern(first, second)
