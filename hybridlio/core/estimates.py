@@ -221,6 +221,15 @@ class TakesBack(Protocol):
         ...
 
 
+@runtime_checkable
+class RefinesAgain(Protocol):
+    """A residual source that can measure its last scan again, compensated otherwise. Implementing it is optional."""
+
+    def refine_again(self, frame: Frame, initial: RelativePose) -> RelativePose:
+        """Return what ``refine`` would return for the frame in place of the last one, which must have been usable."""
+        ...
+
+
 class Backend(Protocol):
     """Third seam: combines all relative poses and inertial data into the state.
 

@@ -14,7 +14,15 @@ import numpy as np
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError
-from hybridlio.core.estimates import Backend, InitialPoseSource, RelativePose, ResidualSource, State, TakesBack
+from hybridlio.core.estimates import (
+    Backend,
+    InitialPoseSource,
+    RefinesAgain,
+    RelativePose,
+    ResidualSource,
+    State,
+    TakesBack,
+)
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise
 from hybridlio.odometry.compensation import MotionCompensation
 from hybridlio.odometry.estimate import InertialState
@@ -96,7 +104,12 @@ class Pipeline:
         return _checked(self.initial_pose.predict(frame, state), self.initial_pose.name)
 
     def refine(
-        self, frame: Frame, initial: RelativePose, state: State, seconds: dict[str, float]
+        self,
+        frame: Frame,
+        initial: RelativePose,
+        state: State,
+        seconds: dict[str, float],
+        again: RelativePose | None = None,
     ) -> tuple[Frame, RelativePose]:
         """Compensate the scan's motion by the initial pose, then refine that pose.
 
@@ -105,6 +118,8 @@ class Pipeline:
             initial: initial relative pose of the step to it.
             state: the backend's state at the scan before.
             seconds: gets the time spent in both stages.
+            again: None, or the initial relative pose from which the residual source refines its last scan again;
+                ``initial`` then only compensates.
 
         Returns:
             The compensated frame and the refined relative pose, with the noise of compensation in its covariance.
@@ -118,7 +133,10 @@ class Pipeline:
             )
             noise = self.compensation.noise(frame)
         with timed(seconds, "residual"):
-            relative = _checked(self.residual.refine(compensated, initial), self.residual.name)
+            if again is not None and isinstance(self.residual, RefinesAgain):
+                relative = self.residual.refine_again(compensated, again)
+            else:
+                relative = _checked(self.residual.refine(compensated, initial), self.residual.name)
         return compensated, relative if noise is None or not relative.ok else relative.wider(added=noise)
 
     def apply_gate(

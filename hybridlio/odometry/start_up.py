@@ -15,11 +15,12 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.estimates import RelativePose, State
+from hybridlio.core.estimates import RefinesAgain, RelativePose, State
 from hybridlio.core.motion_limits import BRIDGED_ACCELERATION_SIGMA_M_S2
 from hybridlio.core.sensors import NS_PER_S, Frame, ImuSamples, Scan
 from hybridlio.core.start_state import start_state
 from hybridlio.odometry.pipeline import Pipeline, timed
+from hybridlio.odometry.second_pass import motion_for_second_pass
 from hybridlio.odometry.start_search import StartEstimate, StartSearch
 from hybridlio.record import plain_values
 from hybridlio.record.record import Record
@@ -99,6 +100,9 @@ def measure_step(
         is_open = len(answer[1].degenerate) > 0 or answer[1].details.get("cost", 0.0) > LOST_COST
         if is_open and isinstance(residual, ScanMatching):
             pipeline.start_search = _search(pipeline, residual, leads=False)
+    elif isinstance(residual, RefinesAgain):
+        motion = motion_for_second_pass(frame, initial, answer[1], before.stamp_ns)
+        answer = answer if motion is None else pipeline.refine(frame, motion, before, {}, again=initial)
     if pipeline.start_search is not None:
         own = _pose_after(pipeline, before, answer[1])
         return _searched(pipeline, pipeline.start_search, frame, seconds, own) or answer
@@ -159,11 +163,14 @@ def repeat_first_step(
 ) -> tuple[Frame, RelativePose]:
     """Repeat the first step now that its motion is known, and return it as :meth:`Pipeline.refine` does.
 
-    The first scan is compensated again, with the speed that was found. Without an IMU the rotation was unknown too and
-    was searched for on a coarse grid; repeating the step from the answer improves it even where scans need no
-    compensation.
+    The first scan is compensated again, with the speed that was found, and both scans with the gyroscope's bias that it
+    shows: later scans are compensated so, and would otherwise lie turned by the bias over half a sweep. Without an IMU
+    the rotation was unknown too and was searched for on a coarse grid; repeating the step from the answer improves it
+    even where scans need no compensation.
     """
     first, (compensated, relative) = pipeline.first, found
+    if start.has_imu and relative.ok:
+        start = _with_turn_rate(pipeline, second, relative, start)
     repetitions = int(pipeline.compensation.applies_to(first)) if start.has_imu else _REPETITIONS_WITHOUT_IMU
     for _ in range(repetitions):
         if not relative.ok:
@@ -175,6 +182,18 @@ def repeat_first_step(
         )
         compensated, relative = pipeline.refine(second, relative, start, {})
     return compensated, relative
+
+
+def _with_turn_rate(pipeline: Pipeline, second: Frame, found: RelativePose, start: State) -> State:
+    """Return the start with the gyroscope's bias by the rotation of the first step, weighed with what is assumed."""
+    predicted = pipeline.setup.predict_from_imu(second, start)
+    if predicted is None:
+        return start
+    step_s, R = (second.scan.stamp_ns - start.stamp_ns) / NS_PER_S, pipeline.calibration.T_imu_lidar[:3, :3]
+    rate_error = R @ se3.log(se3.between(predicted.pose, found.pose))[:3] / step_s
+    variance = np.eye(3) * pipeline.imu_noise.gyro_bias_sigma_rad_s**2
+    gain = variance @ np.linalg.inv(variance + R @ found.covariance[:3, :3] @ R.T / step_s**2)
+    return replace(start, gyro_bias_rad_s=start.gyro_bias_rad_s - gain @ rate_error)
 
 
 def take_up_imu(pipeline: Pipeline, record: Record, frame: Frame) -> State:

@@ -11,10 +11,7 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.estimates import RelativePose
-from hybridlio.core.motion_limits import (
-    MEASUREMENT_FLOOR_SIGMAS,
-    UNKNOWN_TRANSLATION_SIGMA_M,
-)
+from hybridlio.core.motion_limits import MEASUREMENT_FLOOR_SIGMAS, UNKNOWN_TRANSLATION_SIGMA_M
 from hybridlio.core.sensors import NS_PER_S, Frame, Scan
 from hybridlio.registration.degeneracy import ObservedRegistration, RegistrationProblem, register_with_degeneracy
 from hybridlio.registration.local_map import LocalMap
@@ -49,12 +46,14 @@ class ScanMatching:
     """
 
     name = "scan-matching"
+    NOT_STATE = ("_before",)
 
     def __init__(self, settings: ScanMatchingSettings | None = None) -> None:
         self._scale = SceneScale(settings or ScanMatchingSettings())
         self._map = LocalMap(self.settings.local_map)
         self._state = MatchingState(PathPoint(np.eye(4)), PathPoint(np.eye(4)))
         self._stamp_ns = 0
+        self._before = self._state, self._stamp_ns  # when the last scan came
         self._recent = RecentPoints()
         self.current_scan: ThinnedScan | None = None
 
@@ -100,6 +99,7 @@ class ScanMatching:
         """Register the scan; where that fails, return the initial pose with ``ok`` False."""
         self._insert_pending_keyframe()
         self._recent.observe(frame.scan)
+        self._before = self._state, self._stamp_ns
         self.current_scan = scan = self._thin(frame.scan)
         dt_s = (frame.scan.stamp_ns - self._stamp_ns) / NS_PER_S
         self._stamp_ns = frame.scan.stamp_ns
@@ -108,6 +108,12 @@ class ScanMatching:
         if observed is None or observed.registration.matched < self.settings.min_matched:
             return self._bridge(scan, initial, observed)
         return self._accept(scan, initial, observed, dt_s)
+
+    def refine_again(self, frame: Frame, initial: RelativePose) -> RelativePose:
+        """Register the last scan, which matched, once more as it is compensated now, in place of that match."""
+        self._state, self._stamp_ns = self._before
+        self._recent.discard_last()
+        return self.refine(frame, initial)
 
     @property
     def settings(self) -> ScanMatchingSettings:
@@ -134,14 +140,9 @@ class ScanMatching:
         self._state = self._state.taken_back(initial)
 
     def pair(self, earlier: ThinnedScan, current: ThinnedScan, initial: RelativePose) -> RelativePose:
-        """Register one scan to another alone.
+        """Return ``T_j_k`` of the current scan in the earlier one, registered to it alone from ``initial``.
 
-        Args:
-            earlier, current: values of :attr:`current_scan`.
-            initial: about where the current scan is relative to the earlier one.
-
-        Returns:
-            ``T_j_k`` of the current scan in the earlier one; ``initial`` with ``ok`` False where registration fails.
+        Both are values of :attr:`current_scan`. Where registration fails, ``initial`` is returned with ``ok`` False.
         """
         too_few = min(len(earlier.points), len(current.points)) < self.settings.min_points
         if too_few or earlier.surface is None:

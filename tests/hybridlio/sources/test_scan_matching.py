@@ -50,6 +50,22 @@ def error(found: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
 # -------------------------------------------------------------------------------------------------- a drive
 
 
+def test_a_scan_that_is_matched_again_is_matched_as_if_once(sequence: Sequence, frames: list[Frame]):
+    steps = []
+    for times in (1, 2):
+        matching = ScanMatching()
+        matching.start(frames[0])
+        for k in range(1, 4):
+            initial = guess(true_pose(sequence, k - 1, k) @ OFF)
+            found = matching.refine(frames[k], initial)
+            if times == 2:
+                found = matching.refine_again(frames[k], initial)
+            steps.append(found)
+    for once, twice in zip(steps[:3], steps[3:], strict=True):
+        np.testing.assert_array_equal(once.pose, twice.pose)
+        np.testing.assert_array_equal(once.covariance, twice.covariance)
+
+
 @pytest.mark.parametrize("target", TARGETS)
 def test_a_short_drive_is_recovered_from_poor_guesses(target: str, sequence: Sequence, frames: list[Frame]):
     matching = ScanMatching(ScanMatchingSettings(target=target))

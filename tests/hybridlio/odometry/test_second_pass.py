@@ -1,0 +1,55 @@
+"""The first steps of a lidar in motion, whose sweeps are compensated by a speed and a bias that few scans measure."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from walks import errors_of, estimated, walk
+
+from hybridlio.core import se3
+from hybridlio.core.sensors import Frame
+from hybridlio.datasets.sequence import Sequence
+from hybridlio.odometry import start_up
+from hybridlio.odometry.estimate import Estimate
+from hybridlio.simulation.platforms.config import PlatformConfig
+
+WALK = PlatformConfig(scene="campus", platform="handheld", lidar="os0", seconds=2.0, seed=8102)
+
+
+@pytest.fixture(scope="module")
+def recording() -> Sequence:
+    return walk(WALK, count=6)
+
+
+@pytest.fixture(scope="module")
+def frames(recording: Sequence) -> list[Frame]:
+    return list(recording)
+
+
+def largest_step_error_m(estimates: list[Estimate], recording: Sequence) -> float:
+    """Return the largest position error of the measured steps from the third on."""
+    assert recording.reference is not None
+    poses, relative = recording.reference.poses, [estimate.relative for estimate in estimates]
+    steps = [one.pose for one in relative if one is not None]
+    apart = [se3.between(se3.between(poses[k], poses[k + 1]), step) for k, step in enumerate(steps)]
+    return max(float(np.linalg.norm(error[:3, 3])) for error in apart[2:])
+
+
+def yaw_error_rad(estimates: list[Estimate], recording: Sequence) -> float:
+    return float(np.abs(np.mean([error[2] for error in errors_of(estimates, recording.reference)[2:]])))
+
+
+def test_the_first_scans_lie_as_later_ones_and_steps_do_not_swing_although_bias_and_speed_are_unknown(
+    frames: list[Frame], recording: Sequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    estimates = estimated(frames)
+    assert yaw_error_rad(estimates, recording) < 5e-4
+    assert largest_step_error_m(estimates, recording) < 0.02
+
+    monkeypatch.setattr(start_up, "_with_turn_rate", lambda *given: given[-1])  # the bias of the first scans stays
+    turned = estimated(frames)
+    assert yaw_error_rad(turned, recording) > 1e-3
+    assert largest_step_error_m(turned, recording) < 0.02
+
+    monkeypatch.setattr(start_up, "motion_for_second_pass", lambda *_: None)
+    assert largest_step_error_m(estimated(frames), recording) > 0.04
