@@ -98,7 +98,7 @@ def open_point_files(
     """
     step_ns = int(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else None
     if read is None:
-        if layout is None and paths[0].suffix == ".bin":
+        if layout is None and paths[0].suffix.lower() == ".bin":
             layout = find_layout([paths[k] for k in sampled(len(paths))], step_ns, notes)
         read = partial(read_columns, layout=layout, step_ns=step_ns)
     reader = read
@@ -114,7 +114,7 @@ def open_point_files(
     except DataError as error:
         named = str(error).startswith(str(paths[0].parent))
         raise DataError(str(error) if named else _at(paths[0].parent if len(paths) > 1 else paths[0], error)) from None
-    if paths[0].suffix == ".pcd":
+    if paths[0].suffix.lower() == ".pcd":
         pcd.note_viewpoints([paths[k] for k in sampled(len(paths))], notes)
     return PointFiles(paths, stamps_ns, read, found)
 
@@ -132,11 +132,12 @@ def read_columns(path: Path, layout: BinLayout | None = None, step_ns: int | Non
     """
     if not path.is_file():
         raise DataError("no such file")
-    if path.suffix == ".bin":
+    suffix = path.suffix.lower()  # file systems of memory cards write capitals
+    if suffix == ".bin":
         return (layout or BinLayout()).read(path)
-    if path.suffix in _READERS:
-        return {name.lower().removeprefix(_CLOUD_COMPARE): v for name, v in _READERS[path.suffix](path).items()}
-    values = tables.read_npy(path) if path.suffix == ".npy" else text_rows.read_text(path)
+    if suffix in _READERS:
+        return {name.lower().removeprefix(_CLOUD_COMPARE): v for name, v in _READERS[suffix](path).items()}
+    values = tables.read_npy(path) if suffix == ".npy" else text_rows.read_text(path)
     if isinstance(values, dict):
         return {name.lower(): column for name, column in values.items()}
     names = ["x", "y", "z", *column_names(values[:, 3:], step_ns)]

@@ -65,9 +65,9 @@ def has_scans(folder: Path) -> bool:
 def files_in(folder: Path) -> tuple[Path, ...]:
     """Return the scan files directly in a folder, in natural order; ``.txt`` and ``.csv`` only in a folder of scans."""
     files = [p for p in folder.glob("*") if not p.name.startswith(".") and p.name not in STAMP_FILES]
-    found = [p for p in files if p.suffix in SUFFIXES]
+    found = [p for p in files if p.suffix.lower() in SUFFIXES]
     if not found and folder.name in _TEXT_FOLDERS:
-        found = [p for p in files if p.suffix in COMMON_SUFFIXES]
+        found = [p for p in files if p.suffix.lower() in COMMON_SUFFIXES]
     return tuple(sorted(found, key=_natural))
 
 
@@ -87,7 +87,7 @@ def stamped(folder: Path, paths: tuple[Path, ...], rate_hz: float | None, notes:
     """
     if not paths:
         raise DataError(f"{folder}: no scans ({', '.join(SUFFIXES)})")
-    suffixes = sorted({p.suffix for p in paths})
+    suffixes = sorted({p.suffix.lower() for p in paths})
     if len(suffixes) > 1:
         raise DataError(f"{paths[0].parent}: scans of several kinds ({', '.join(suffixes)}); keep one kind per folder")
     files = [*stamp_files(folder), *stamp_files(paths[0].parent)]

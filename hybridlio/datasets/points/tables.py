@@ -50,7 +50,7 @@ def read_arrow(path: Path) -> Columns:
     import pyarrow
     from pyarrow import feather, parquet
 
-    read = feather.read_table if path.suffix == ".feather" else parquet.read_table
+    read = feather.read_table if path.suffix.lower() == ".feather" else parquet.read_table
     try:
         table = read(path)
         columns = {
@@ -74,7 +74,7 @@ def read_las(path: Path) -> Columns:
     _check_las_size(path)
     try:
         # one thread: the parallel decompressor trusts sizes in the table of chunks
-        las = laspy.read(path, laz_backend=laspy.LazBackend.Lazrs if path.suffix == ".laz" else None)
+        las = laspy.read(path, laz_backend=laspy.LazBackend.Lazrs if path.suffix.lower() == ".laz" else None)
         names = [name for name in _LAS_COLUMNS if name in las.point_format.dimension_names]
         columns = {axis: np.asarray(getattr(las, axis), np.float64) for axis in "xyz"}
         return columns | {name: np.asarray(las[name]) for name in names}

@@ -67,6 +67,12 @@ def test_a_stated_rate_goes_before_names(recordings: Any, folder: Path) -> None:
     assert open_sequence(folder, rate_hz=20).stamps_ns[1] == 50_000_000
 
 
+def test_suffixes_may_be_capitals(recordings: Any, folder: Path) -> None:
+    for k in range(12):
+        (folder / f"scans/{k}.npy").rename(folder / f"scans/{k}.NPY")
+    assert [len(frame.scan) for frame in open_sequence(folder)] == [len(recordings.ride.points(k)) for k in range(12)]
+
+
 def test_stamps_may_stand_beside_the_scans(recordings: Any, folder: Path) -> None:
     (folder / "timestamps.txt").rename(folder / "scans/timestamps.txt")
     np.testing.assert_array_equal(open_sequence(folder).stamps_ns, recordings.ride.stamps_ns)
