@@ -1,4 +1,4 @@
-"""Faults injected into a recording: lost scans, a blocked lidar, an IMU with a gap or a large bias.
+"""Faults injected into a recording: lost scans, a blocked or poorly calibrated lidar, an IMU with gaps or errors.
 
 Each function takes a sequence, simulated or real, and returns another, with the fault in its notes. Times are seconds
 from the first scan.
@@ -73,6 +73,44 @@ def _without_sector(scan: Scan, middle_deg: float, width_deg: float) -> Scan:
     intensity = None if scan.intensity is None else scan.intensity[keep]
     offsets = None if scan.time_offsets_ns is None else scan.time_offsets_ns[keep]
     return Scan(scan.stamp_ns, scan.points[keep], intensity, offsets)
+
+
+def lidar_errors(
+    sequence: Sequence, elevation_sigma_deg: float = 0.2, range_by_intensity_m: float = 0.05, seed: int = 0
+) -> Sequence:
+    """Give a spinning lidar the systematic errors of one that is poorly calibrated.
+
+    Args:
+        sequence: the recording; its lidar's model gives the beams.
+        elevation_sigma_deg: standard deviation of the beams' constant errors of elevation.
+        range_by_intensity_m: by which a range is longer for a reflectance of 1 than for one of 0.
+        seed: of the beams' errors.
+
+    Raises:
+        ConfigError: the recording's lidar is unknown.
+    """
+    if sequence.lidar is None:
+        raise ConfigError(f"{sequence.name}: errors of its beams need a known lidar; state it in calibration.yaml")
+    beams = np.sort(np.radians(sequence.lidar.elevations_deg))
+    rng = np.random.default_rng([seed, RandomStream.LIDAR_ERRORS])
+    errors = np.radians(elevation_sigma_deg) * rng.standard_normal(len(beams))
+
+    def load(k: int) -> Scan:
+        scan = sequence.load_scan(k)
+        points = scan.points.astype(np.float64)
+        ranges = np.linalg.norm(points, axis=1)
+        elevation = np.arcsin(points[:, 2] / np.maximum(ranges, 1e-9))
+        beam = np.searchsorted((beams[1:] + beams[:-1]) / 2, elevation)
+        elevation = elevation + errors[beam]
+        if scan.intensity is not None:
+            ranges = ranges + range_by_intensity_m * (scan.intensity - 0.5)
+        azimuth = np.arctan2(points[:, 1], points[:, 0])
+        flat = ranges * np.cos(elevation)
+        moved = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), ranges * np.sin(elevation)])
+        return replace(scan, points=moved.astype(np.float32))
+
+    note = f"injected fault: beams off by {elevation_sigma_deg:g}°, ranges by {range_by_intensity_m:g} m with intensity"
+    return replace(sequence, load_scan=load, notes=(*sequence.notes, note))
 
 
 def imu_gap(sequence: Sequence, start_s: float, end_s: float) -> Sequence:

@@ -30,3 +30,4 @@ class RandomStream(IntEnum):
     DUST = 17
     PEOPLE = 18  # and the person's number
     IMU_SCALE = 19
+    LIDAR_ERRORS = 20
