@@ -5,6 +5,7 @@ Forster, Carlone, Dellaert, Scaramuzza, "On-Manifold Preintegration for Real-Tim
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import gtsam
@@ -24,6 +25,8 @@ from hybridlio.core.motion_limits import (
 from hybridlio.core.sensors import NS_PER_S, ImuNoise, ImuSamples
 
 _INTEGRATION_VARIANCE = 1e-8  # m²/s: GTSAM needs it positive; 0.1 mm per √s is far below what the accelerometer adds
+MOST_TURN_RAD = np.pi  # of samples that make one factor, see makes_one_factor
+_PART_TURN_RAD = np.pi / 2  # of a part of a longer turn
 _COVER_SLACK_NS = NS_PER_S // 1000  # stamps are often rounded to milliseconds
 # Random walk of the biases over a gap in the samples, m/s³ and rad/s² per √Hz: 30 and 50 times the defaults of
 # ImuNoise, because nothing is known about the sensor during a gap.
@@ -119,6 +122,16 @@ def preintegrate_unknown(state: State, dt_s: float) -> gtsam.PreintegratedCombin
     return pim
 
 
+def makes_one_factor(imu: ImuSamples, state: State) -> bool:
+    """Whether the samples turn by half a turn or less, so that one factor describes them.
+
+    GTSAM's factors preintegrate rotations in the tangent space at the start, which is singular at a whole turn: at 5°
+    per sample, half a turn is 0.03° off, 0.8 turns 0.15°, a whole one 2.4°, and two are 11° and 4 m off in 4 s, with a
+    covariance that claims far less.
+    """
+    return imu.largest_turn_rad(state.gyro_bias_rad_s) <= MOST_TURN_RAD
+
+
 def covers(imu: ImuSamples, start_ns: int, end_ns: int) -> bool:
     """Whether the samples reach from ``start_ns`` to ``end_ns``, within a millisecond."""
     if len(imu) < 2:
@@ -131,19 +144,58 @@ def predict_step(pim: gtsam.PreintegratedCombinedMeasurements, state: State) -> 
 
     The covariance propagates the state's (velocity, tilt, biases, gravity) and the noise of the samples.
     """
-    now = gtsam.NavState(gtsam.Pose3(state.T_world_imu), state.velocity_m_s)
+    then, J = _after(pim, _navigation(state), state)
+    return _step(state, then, J, pim.preintMeasCov(), pim.deltaTij())
+
+
+def predict_in_parts(imu: ImuSamples, state: State, noise: ImuNoise) -> tuple[Array, Array]:
+    """Return what :func:`predict_step` does for samples of any turn: parts of a quarter turn, one after the other."""
+    then, J, added = _navigation(state), np.eye(15), np.zeros((15, 15))
+    for part in _parts(imu, state):
+        pim = preintegrate(part, state, noise)
+        then, by_part = _after(pim, then, state)
+        J, added = by_part @ J, by_part @ added @ by_part.T + pim.preintMeasCov()
+    return _step(state, then, J, added, float(imu.stamps_ns[-1] - imu.stamps_ns[0]) / NS_PER_S)
+
+
+def _navigation(state: State) -> gtsam.NavState:
+    return gtsam.NavState(gtsam.Pose3(state.T_world_imu), state.velocity_m_s)
+
+
+def _after(
+    pim: gtsam.PreintegratedCombinedMeasurements, before: gtsam.NavState, state: State
+) -> tuple[gtsam.NavState, Array]:
+    """Return the navigation state after samples, and its derivatives ``(15, 15)`` by that before and by the biases."""
     by_state, by_bias = np.zeros((9, 9), order="F"), np.zeros((9, 6), order="F")
-    then = pim.predict(now, gtsam_bias(state), by_state, by_bias)
+    then = pim.predict(before, gtsam_bias(state), by_state, by_bias)
+    J = np.eye(15)
+    J[:9, :9], J[:9, 9:] = by_state, by_bias
+    return then, J
+
+
+def _step(state: State, then: gtsam.NavState, J: Array, noise: Array, duration_s: float) -> tuple[Array, Array]:
+    """Return the step from a state to the navigation state after it, from its derivatives and the samples' noise."""
     step = se3.between(state.T_world_imu, then.pose().matrix())
     R_world_imu, R_step = state.T_world_imu[:3, :3], step[:3, :3]
+    by_state = J[:9, :9].copy()
     # GTSAM perturbs a NavState's velocity in the body frame; the state's covariance is of the velocity in world
     by_state[:, 6:] = by_state[:, 6:] @ R_world_imu.T
     # step = now⁻¹·then: its perturbation is that of the pose after, less Ad(step⁻¹) times that of the pose before
     by_pose = by_state[:6, :6] - se3.adjoint(se3.inverse(step))
-    J = np.hstack([by_pose, by_state[:6, 6:], by_bias[:6]])
+    J = np.hstack([by_pose, by_state[:6, 6:], J[:6, 9:]])
     # gravity g moves the end by g·dt²/2 in world; a right perturbation's translation is in the frame of the end
-    half_dt2 = pim.deltaTij() ** 2 / 2
+    half_dt2 = duration_s**2 / 2
     by_gravity = np.vstack([np.zeros((3, 3)), half_dt2 * (R_world_imu @ R_step).T])
-    noise = pim.preintMeasCov()[:6, :6]
-    covariance = J @ state.covariance @ J.T + by_gravity @ state.gravity_covariance @ by_gravity.T + noise
+    covariance = J @ state.covariance @ J.T + by_gravity @ state.gravity_covariance @ by_gravity.T + noise[:6, :6]
     return step, (covariance + covariance.T) / 2
+
+
+def _parts(imu: ImuSamples, state: State) -> list[ImuSamples]:
+    """Return the samples in parts that turn by a quarter turn or less, each from the last sample of the one before."""
+    angles = np.linalg.norm(imu.turns(state.gyro_bias_rad_s), axis=1)
+    part_of_step = (np.cumsum(angles) / _PART_TURN_RAD).astype(int)
+    cuts = [0, *(np.flatnonzero(np.diff(part_of_step)) + 1).tolist(), len(angles)]
+    return [
+        ImuSamples(imu.stamps_ns[a : b + 1], imu.gyro_rad_s[a : b + 1], imu.accel_m_s2[a : b + 1])
+        for a, b in pairwise(cuts)
+    ]

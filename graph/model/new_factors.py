@@ -11,6 +11,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError, GraphError
 from hybridlio.core.se3 import as_floats
 from hybridlio.core.sensors import ImuNoise, ImuSamples
+from hybridlio.graph.base.preintegration import MOST_TURN_RAD
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.calibrations import CalibrationNames, chosen, of_kind
 from hybridlio.graph.model.graph_data import GraphData, PosesByKey
@@ -123,7 +124,8 @@ def imu_factor(
     """Return an inertial factor between two poses.
 
     Raises:
-        DataError: fewer than two samples, or noise densities that are not positive.
+        DataError: fewer than two samples, a turn of more than half a turn between them, or noise densities that are not
+            positive.
         GraphError: unknown pose or calibration variable, a pose joined to itself, or a planar graph.
     """
     name = factor_label("imu", ends)
@@ -135,6 +137,11 @@ def imu_factor(
         raise DataError(f"{name}: expected ImuSamples and ImuNoise, got {given}")
     if len(samples) < 2:
         raise DataError(f"{name}: at least 2 IMU samples are needed, got {len(samples)}")
+    if (turn := samples.largest_turn_rad(np.zeros(3))) > MOST_TURN_RAD:
+        raise DataError(
+            f"{name}: the samples turn by {np.degrees(turn):.0f}°, and one factor describes 180° at most; add poses in "
+            "between"
+        )
     densities = np.array(astuple(noise))
     if not (np.isfinite(densities).all() and densities.min() > 0):
         raise DataError(f"{name}: noise densities must be finite and positive, got {densities.tolist()}")

@@ -8,7 +8,13 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.sensors import Calibration, Frame, ImuNoise
-from hybridlio.graph.base.preintegration import covers, predict_step, preintegrate
+from hybridlio.graph.base.preintegration import (
+    covers,
+    makes_one_factor,
+    predict_in_parts,
+    predict_step,
+    preintegrate,
+)
 
 PREINTEGRATION = "preintegration"
 
@@ -26,24 +32,36 @@ class InertialSteps:
         self.noise = noise
         self._inputs: tuple[object, ...] | None = None
         self._preintegrated: gtsam.PreintegratedCombinedMeasurements | None = None
+        self._covers = False
         self._predicted: RelativePose | None = None
 
     def preintegrated(self, frame: Frame, state: State) -> gtsam.PreintegratedCombinedMeasurements | None:
-        """Return the preintegrated samples, or None where they do not cover the step from ``state`` to the scan."""
-        inputs = (self.noise, *_inputs(frame, state))
-        if inputs != self._inputs:
-            usable = state.has_imu and covers(frame.imu, state.stamp_ns, frame.scan.stamp_ns)
-            self._preintegrated = preintegrate(frame.imu, state, self.noise) if usable else None
-            self._inputs, self._predicted = inputs, None
+        """Return the preintegrated samples as one factor takes them.
+
+        None where they do not cover the step from ``state`` to the scan, or turn by more than one factor can describe:
+        half a turn while no scan came.
+        """
+        self._look(frame, state)
         return self._preintegrated
 
     def predicted(self, frame: Frame, state: State) -> RelativePose | None:
-        """Return the step between the lidar's poses, or None where :meth:`preintegrated` gives None."""
-        pim = self.preintegrated(frame, state)
-        if pim is not None and self._predicted is None:
-            step, covariance = predict_step(pim, state)
-            self._predicted = self.as_lidar_step(step, covariance, from_imu=True)
+        """Return the step between the lidar's poses, or None where the samples do not cover it."""
+        self._look(frame, state)
+        if self._covers and self._predicted is None:
+            pim = self._preintegrated
+            step = predict_in_parts(frame.imu, state, self.noise) if pim is None else predict_step(pim, state)
+            self._predicted = self.as_lidar_step(*step, from_imu=True)
         return self._predicted
+
+    def _look(self, frame: Frame, state: State) -> None:
+        """Preintegrate, unless the last call had the same inputs."""
+        inputs = (self.noise, *_inputs(frame, state))
+        if inputs == self._inputs:
+            return
+        self._covers = state.has_imu and covers(frame.imu, state.stamp_ns, frame.scan.stamp_ns)
+        is_factor = self._covers and makes_one_factor(frame.imu, state)
+        self._preintegrated = preintegrate(frame.imu, state, self.noise) if is_factor else None
+        self._inputs, self._predicted = inputs, None
 
     def as_lidar_step(self, step: Array, covariance: Array, ok: bool = True, from_imu: bool = False) -> RelativePose:
         """Convert a step of the IMU ``(4, 4)`` with its covariance ``(6, 6)`` to one of the lidar."""

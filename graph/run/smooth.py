@@ -21,7 +21,7 @@ from hybridlio.core.trajectory import Trajectory
 from hybridlio.graph.base.deep_stack import on_deep_stack
 from hybridlio.graph.base.isam import gtsam_message
 from hybridlio.graph.base.marginals import bayes_tree, pose_covariances
-from hybridlio.graph.base.preintegration import covers, preintegrate
+from hybridlio.graph.base.preintegration import covers, makes_one_factor, preintegrate
 from hybridlio.graph.run import factors
 from hybridlio.graph.run.factor_groups import FactorGroup
 from hybridlio.graph.run.gps_factors import GpsGroup
@@ -180,7 +180,7 @@ def _build(record: Record, states: list[State]) -> tuple[gtsam.NonlinearFactorGr
     for i, relative in enumerate(record.relative):
         state, stamp_ns = states[i], states[i + 1].stamp_ns
         imu = record.imu.between(state.stamp_ns, stamp_ns)
-        usable = state.has_imu and covers(imu, state.stamp_ns, stamp_ns)
+        usable = state.has_imu and covers(imu, state.stamp_ns, stamp_ns) and makes_one_factor(imu, state)
         pim = preintegrate(imu, state, record.imu_noise) if usable else None
         T_imu_lidar = record.calibration.T_imu_lidar
         graph.push_back(factors.step_factors(i, state, relative, pim, stamp_ns, T_imu_lidar, scans))

@@ -142,6 +142,16 @@ class ImuSamples:
         values = np.column_stack([np.interp(at, known, columns[:, i]) for i in range(6)])
         return ImuSamples(stamps, values[:, :3], values[:, 3:])
 
+    def turns(self, bias_rad_s: Array) -> Array:
+        """Return rotation vectors ``(S - 1, 3)`` between samples, rad, by rates without a bias ``(3,)``."""
+        rates = (self.gyro_rad_s[1:] + self.gyro_rad_s[:-1]) / 2 - bias_rad_s
+        return np.asarray(rates * (np.diff(self.stamps_ns) / NS_PER_S)[:, None])
+
+    def largest_turn_rad(self, bias_rad_s: Array) -> float:
+        """Return the largest turn from the first sample to any other: the length of the rates' integral."""
+        integral = np.cumsum(self.turns(bias_rad_s), axis=0)
+        return float(np.linalg.norm(integral, axis=1).max(initial=0.0))
+
     def during(self, scan: Scan) -> ImuSamples:
         """Return the samples from the scan's first point to its last; none if the points have no times."""
         if scan.time_offsets_ns is None or not len(scan):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hybridlio.core import se3
+from hybridlio.core.errors import DataError
 from hybridlio.core.motion_limits import GRAVITY_M_S2
 from hybridlio.core.sensors import ImuNoise, ImuSamples
 from hybridlio.graph import PoseGraph
@@ -154,3 +155,14 @@ def test_a_chain_that_samples_alone_join_is_solved_alike_in_batch_and_online():
     online.update()
     np.testing.assert_allclose(batch.pose(5), online.pose(5), atol=1e-6)
     np.testing.assert_allclose(batch.pose(5)[:3, 3], [np.sin(0.25) * 2, 2 - 2 * np.cos(0.25), 0], atol=1e-3)
+
+
+def test_samples_that_turn_by_more_than_one_factor_describes_are_refused():
+    graph = PoseGraph()
+    graph.add_prior(0, np.eye(4), sigmas=(1e-3,) * 6)
+    graph.add_pose(1, np.eye(4))
+    stamps = np.arange(0, 2_000_000_001, 10_000_000)
+    gyro, accel = np.tile([0.0, 0.0, 2.0], (len(stamps), 1)), np.tile([0.0, 0.0, 9.81], (len(stamps), 1))
+    with pytest.raises(DataError, match="turn by 229°, and one factor describes 180° at most; add poses in between"):
+        graph.add_imu(0, 1, ImuSamples(stamps, gyro, accel))
+    graph.add_imu(0, 1, ImuSamples(stamps, 0.5 * gyro, accel))

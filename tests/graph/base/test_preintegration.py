@@ -15,7 +15,14 @@ from hybridlio.core import se3
 from hybridlio.core.errors import DataError
 from hybridlio.core.estimates import State
 from hybridlio.core.sensors import NS_PER_S, ImuNoise, ImuSamples
-from hybridlio.graph.base.preintegration import covers, predict_step, preintegrate, sampling_noise
+from hybridlio.graph.base.preintegration import (
+    covers,
+    makes_one_factor,
+    predict_in_parts,
+    predict_step,
+    preintegrate,
+    sampling_noise,
+)
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.plan import plan
 from hybridlio.simulation.sensors.imu import ideal_imu
@@ -173,6 +180,40 @@ def test_motion_between_samples_at_10_hz_stays_within_the_sampling_noise():
         error = se3.log(se3.between(step, se3.between(*motion.poses)))
         nees.append(error @ np.linalg.solve(covariance, error) / 6)
     assert np.mean(nees) < 1.0
+
+
+def tumbling(turns: float) -> tuple[ImuSamples, Rotation]:
+    """Return 4 s of an IMU that turns on the spot, mostly about z, and its orientation at the end."""
+    times = np.arange(1601) / 400
+    about_z = np.full(len(times), 2 * np.pi * turns / 4)
+    rates = np.column_stack([0.3 * np.sin(3 * times), 0.3 * np.cos(2 * times), about_z])
+    steps = Rotation.from_rotvec((rates[1:] + rates[:-1]) / 2 / 400)
+    orientations = [Rotation.identity()]
+    for step in steps:
+        orientations.append(orientations[-1] * step)
+    R = Rotation.concatenate(orientations)
+    return samples(times, rates, R.inv().apply(-GRAVITY)), R[-1]
+
+
+@pytest.mark.parametrize("turns", [0.2, 0.6, 1.0, 2.0])
+def test_a_motion_of_any_turn_is_predicted_in_parts(turns: float):
+    """One preintegration of GTSAM's is 2.4° off at a whole turn and 11° and 4 m at two."""
+    imu, R_end = tumbling(turns)
+    step, covariance = predict_in_parts(imu, state_at(np.eye(4), np.zeros(3)), NOISE)
+    error = se3.log(se3.between(step, se3.make(R_end.as_matrix(), np.zeros(3))))
+    assert np.linalg.norm(error[:3]) < np.radians(0.03)
+    assert np.linalg.norm(error[3:]) < 0.02
+    assert makes_one_factor(imu, state_at(np.eye(4), np.zeros(3))) == (turns < 0.5)
+    # white noise of the rates adds up to its density times √4 s, however the axes turn
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)[:3]), 2 * NOISE.gyro_rad_s_sqrt_hz, rtol=0.15)
+
+
+def test_parts_give_the_pose_and_the_covariance_of_one_preintegration_where_that_is_exact():
+    imu, _ = tumbling(0.3)
+    state = state_at(np.eye(4), np.array([1.0, 0.5, 0.0]))
+    one, parts = predict_step(preintegrate(imu, state, NOISE), state), predict_in_parts(imu, state, NOISE)
+    assert np.abs(se3.log(se3.between(one[0], parts[0]))).max() < 5e-3
+    np.testing.assert_allclose(np.sqrt(np.diag(parts[1])), np.sqrt(np.diag(one[1])), rtol=0.12)
 
 
 def test_a_single_sample_is_an_error():

@@ -98,3 +98,21 @@ def test_samples_are_preintegrated_once_for_equal_inputs_and_again_for_others():
     assert steps.preintegrated(replace(asked, imu=faster), state) is not first
     assert steps.preintegrated(asked, replace(state, has_imu=False)) is None
     assert steps.predicted(frame(ImuSamples.empty()), state) is None
+
+
+def test_over_scans_lost_during_whole_turns_the_prediction_stays_right_and_no_factor_is_made():
+    times = np.arange(401) / 100
+    rates = np.column_stack([0.3 * np.sin(3 * times), 0.3 * np.cos(2 * times), np.full(401, np.pi)])
+    steps = Rotation.from_rotvec((rates[1:] + rates[:-1]) / 200)
+    R = [Rotation.identity()]
+    for step in steps:
+        R.append(R[-1] * step)
+    imu = ImuSamples(np.round(times * 1e9).astype(np.int64), rates, Rotation.concatenate(R).inv().apply([0, 0, 9.81]))
+    state, frame = straight(40)
+    inertial = InertialSteps(Calibration(), NOISE)
+    assert inertial.preintegrated(frame(imu), state) is None
+    predicted = inertial.predicted(frame(imu), state)
+    assert predicted is not None
+    assert predicted.from_imu
+    error = se3.so3_log(predicted.pose[:3, :3].T @ R[-1].as_matrix())
+    assert np.linalg.norm(error) < np.radians(0.1)
