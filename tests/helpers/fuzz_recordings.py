@@ -18,7 +18,7 @@ from hybridlio.core.errors import HybridLioError
 from hybridlio.datasets import open_sequence
 
 PACKETS = Path(os.environ.get("HYBRIDLIO_SHARED_DATA", "no such folder")) / "other_lidars"
-BAGS = ("sqlite3", "mcap", "ros1", "lz4")
+BAGS = ("sqlite3", "mcap", "zstd", "ros1", "lz4")
 UNCLEAR = "the scan cannot be read ("  # an error that no reader foresaw, turned into one by the sequence
 
 

@@ -164,9 +164,11 @@ def write_bag(root: Path, ride: Ride, kind: str = "sqlite3") -> Path:
     Args:
         root: where to write.
         ride: the ride.
-        kind: ``sqlite3`` or ``mcap`` for ROS 2; ``ros1``, or ``lz4`` for ROS 1 with compression.
+        kind: ``sqlite3``, ``mcap``, or ``zstd`` for MCAP with compression, for ROS 2; ``ros1``, or ``lz4`` for ROS 1
+            with compression.
     """
-    is_ros2 = kind in ("sqlite3", "mcap")
+    storage, compress = {"zstd": ("mcap", "storage"), "ros1": ("", ""), "lz4": ("", "lz4")}.get(kind, (kind, ""))
+    is_ros2 = storage != ""
     messages = bags.Messages(is_ros2)
     points = [ride.points(k).astype(np.float32) for k in range(ride.count)]
     scans = [Scan(int(t), p[:, :3], p[:, 3]) for t, p in zip(ride.stamps_ns, points, strict=True)]
@@ -174,4 +176,4 @@ def write_bag(root: Path, ride: Ride, kind: str = "sqlite3") -> Path:
     content = bags.drive_messages(messages, scans, imu, ride.T_imu_lidar, ride.lidar)
     root.mkdir(parents=True, exist_ok=True)
     path = root / ("ride" if is_ros2 else "ride.bag")
-    return bags.write(path, messages, content, kind if is_ros2 else "", "lz4" if kind == "lz4" else "")
+    return bags.write(path, messages, content, storage, compress)

@@ -1,4 +1,4 @@
-"""The start of a compressed chunk of a ROS 1 bag, decompressed no farther than it is read."""
+"""The start of a compressed chunk of a bag, decompressed no farther than it is read."""
 
 from __future__ import annotations
 

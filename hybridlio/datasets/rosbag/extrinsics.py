@@ -12,7 +12,7 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import Calibration
 from hybridlio.datasets.calibration_yaml import StatedCalibration
 from hybridlio.datasets.notes import Notes
-from hybridlio.datasets.rosbag.bag import Bag, Topic
+from hybridlio.datasets.rosbag.bag import Bag, Topic, readable
 from hybridlio.datasets.rosbag.choices import BagTopics
 from hybridlio.datasets.rosbag.known import KnownBag
 from hybridlio.datasets.rosbag.topics import TRANSFORM_TYPES
@@ -106,7 +106,8 @@ class Mounting:
             self._has_moving = True
             names = [t.name for t in self.bag.topics.values() if t.type in TRANSFORM_TYPES]
             for name, _, raw in self.bag.messages([name for name in names if not name.endswith("_static")]):
-                self.tree.add(self.bag.decode(name, raw))
+                with readable(self.bag.path):
+                    self.tree.add(self.bag.decode(name, raw))
             T = self.tree.find(target, source)
         return T
 

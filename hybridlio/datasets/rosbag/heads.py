@@ -1,8 +1,8 @@
 """The first bytes of large messages, in order of receipt, without reading the rest of them.
 
 Opening a bag takes the stamps of its clouds, which are nearly all of its bytes. Where the storage allows it, as SQLite
-and chunks without compression do, only the first bytes of each cloud are read from the file; compressed chunks of ROS 1
-are decompressed up to there. ``rosbags`` finds the messages; it reads each one whole.
+and chunks without compression do, only the first bytes of each cloud are read from the file; compressed chunks are
+decompressed up to there. ``rosbags`` finds the messages; it reads each one whole.
 """
 
 from __future__ import annotations
@@ -78,26 +78,17 @@ def _sqlite(storage: Any, connections: list[Any], cut: Collection[str]) -> Itera
 
 
 def _mcap(storage: Any, connections: list[Any], cut: Collection[str]) -> Iterator[Message]:
-    from rosbags.rosbag2.storage_mcap import msgsrc
-
     channels = {c.id: c for c in connections}
-    parts: list[Iterator[Any]] = []
-    for chunk in storage.chunks:
-        if not any(chunk.channel_count.get(channel, 0) for channel in channels):
-            continue
-        if chunk.compression:
-            parts.append(msgsrc(chunk, channels, chunk.message_start_time, chunk.message_end_time + 1, storage.bio))
-        else:
-            parts.append(_plain_chunk(storage.bio, chunk, channels, cut))
-    for received_ns, offset, connection, raw in merge(*parts):
+    chunks = [c for c in storage.chunks if any(c.channel_count.get(channel, 0) for channel in channels)]
+    for received_ns, offset, connection, raw in merge(*(_of_chunk(storage.bio, c, channels, cut) for c in chunks)):
         if offset:
             yield connection.topic, received_ns, raw
 
 
-def _plain_chunk(file: Any, chunk: Any, channels: dict[int, Any], cut: Collection[str]) -> Iterator[Any]:
+def _of_chunk(bag: Any, chunk: Any, channels: dict[int, Any], cut: Collection[str]) -> Iterator[Any]:
     """Yield the messages of a chunk as ``rosbags`` does: first a mark of its start, so that chunks are read late."""
     yield chunk.message_start_time, 0, None, None
-    at = chunk.chunk_start_offset + _RECORD.size + 40 + len(chunk.compression)
+    file, at = _mcap_data(bag, chunk)
     end, found = at + chunk.uncompressed_size, []
     while at < end:
         file.seek(at)
@@ -113,6 +104,20 @@ def _plain_chunk(file: Any, chunk: Any, channels: dict[int, Any], cut: Collectio
             size = min(size, HEAD_BYTES) if channels[channel].topic in cut else size
             found.append((received_ns, chunk.chunk_start_offset, channels[channel], file.read(size)))
     yield from sorted(found, key=lambda message: message[0])
+
+
+def _mcap_data(bag: Any, chunk: Any) -> tuple[Any, int]:
+    """Return a file that holds the data of a chunk of an MCAP file, and where in it they start."""
+    from lz4.frame import LZ4FrameDecompressor
+    from rosbags.rosbag2.storage_mcap import zstd  # type: ignore[attr-defined]  # Python's, or its backport
+
+    start = chunk.chunk_start_offset + _RECORD.size + 40 + len(chunk.compression)
+    if not chunk.compression:
+        return bag, start
+    kinds = {"lz4": LZ4FrameDecompressor, "zstd": zstd.ZstdDecompressor}
+    if chunk.compression not in kinds:
+        raise DataError(f"a chunk has the unknown compression {chunk.compression!r}")
+    return ChunkStart(bag, start, chunk.compressed_size, kinds[chunk.compression]()), 0
 
 
 def _ros1(reader: Any, connections: list[Any], cut: Collection[str]) -> Iterator[Message]:

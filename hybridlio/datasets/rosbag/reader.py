@@ -21,7 +21,7 @@ from hybridlio.datasets.merged_lidars import MergedScans, OtherLidar, nearest_sc
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.reference import poses_at
 from hybridlio.datasets.rosbag import measurements
-from hybridlio.datasets.rosbag.bag import METADATA, ROS_1, ROS_2_FILES, Bag, Topic, bag_files, part_number
+from hybridlio.datasets.rosbag.bag import METADATA, ROS_1, ROS_2_FILES, Bag, Topic, bag_files, part_number, readable
 from hybridlio.datasets.rosbag.choices import BagTopics
 from hybridlio.datasets.rosbag.extrinsics import Mounting, calibration_file
 from hybridlio.datasets.rosbag.heads import Message
@@ -156,7 +156,8 @@ def _read(bag: Bag, chosen: dict[str, Topic], notes: Notes) -> _Contents:
     messages = bag.messages_and_heads([*kinds, *static], clouds)
     for name, received_ns, raw in _until_damage(bag, messages, contents.logs["lidar"], notes):
         if name not in kinds:
-            contents.tree.add(bag.decode(name, raw))
+            with readable(bag.path):
+                contents.tree.add(bag.decode(name, raw))
             continue
         kind = kinds[name]
         header = _header(raw, bag.is_ros2)
@@ -164,9 +165,11 @@ def _read(bag: Bag, chosen: dict[str, Topic], notes: Notes) -> _Contents:
         if kind == "imu":
             values = read_imu(raw, header, bag.is_ros2)
         elif kind == "gps":
-            values = measurements.fix_values(bag.decode(name, raw))
+            with readable(bag.path):
+                values = measurements.fix_values(bag.decode(name, raw))
         elif kind == "reference":
-            child, values = measurements.body_pose(bag.decode(name, raw), chosen[kind].type)
+            with readable(bag.path):
+                child, values = measurements.body_pose(bag.decode(name, raw), chosen[kind].type)
             contents.body_frame = contents.body_frame or child
         contents.logs[kind].add(header, received_ns)
         contents.logs[kind].values.extend(values)

@@ -16,7 +16,7 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import Scan
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.points.point_format import PointFormat, StatedFormat, learn_format
-from hybridlio.datasets.rosbag.bag import Bag
+from hybridlio.datasets.rosbag.bag import Bag, readable
 from hybridlio.datasets.rosbag.clouds import LIVOX_TIMES, Columns, cloud_columns, livox_columns
 from hybridlio.datasets.rosbag.topics import LIVOX_TYPES
 from hybridlio.datasets.rosbag.wire import read_header
@@ -100,7 +100,8 @@ class BagScans:
         bag = self._bag()
         if bag.topics[self.topic].type in LIVOX_TYPES:
             return livox_columns(raw, bag.is_ros2, stamp_ns)
-        return cloud_columns(bag.decode(self.topic, raw))
+        with readable(self.path):  # a damaged definition of the message lacks attributes
+            return cloud_columns(bag.decode(self.topic, raw))
 
     def _scan(self, raw: bytes, stamp_ns: int) -> Scan:
         if self.has_stamps and read_header(raw, self._bag().is_ros2).stamp_ns != stamp_ns:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from hybridlio.core.errors import DataError
 from hybridlio.datasets import open_sequence
+from hybridlio.datasets.rosbag.bag import Bag
 from hybridlio.datasets.rosbag.measurements import Log
 from hybridlio.datasets.rosbag.wire import Header
 
@@ -115,3 +117,12 @@ def test_a_time_of_receipt_that_no_stamp_can_hold_is_one_clear_error(received_ns
     with pytest.raises(DataError, match="after the year 2262"):
         log.add(header, received_ns)
     assert len(log) == 0
+
+
+def test_messages_whose_damaged_definition_lacks_fields_are_one_clear_error(
+    small: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = small.write(small.clouds(), small.imu(), [small.mount()])
+    monkeypatch.setattr(Bag, "decode", lambda *_: SimpleNamespace(header=None))
+    with pytest.raises(DataError, match=r"truncated or damaged \('types.SimpleNamespace' object has no attribute"):
+        open_sequence(path)
