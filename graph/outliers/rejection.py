@@ -8,7 +8,8 @@ alone), those that span the fewest edges before the others. The searches run on 
 condensed, ten to fifty times faster where loops are few, which leaves time for alternatives: each cluster of loops
 taken as correct or as wrong. Loops that confirm one another are not independent, so that rejecting a whole cluster
 costs less than rejecting as many single loops: otherwise a few wrong loops that agree outweigh the correct ones of a
-map that has few. An alternative with another map that costs hardly more makes the result doubtful.
+map that has few. Where pairs of loops show that all noise is stated too large, results are compared at the noise that
+they show. An alternative with another map that costs hardly more makes the result doubtful.
 """
 
 from __future__ import annotations
@@ -89,7 +90,7 @@ def reject_outliers(data: GraphData, start: Array | None, report: IterationProgr
     chain = GraphOdometry(data, odometry, co.to_matrices(along))
     support = loop_support(loops, chain, bound)
     small = condense(trusted, loops, odometry, chain)
-    solver = WeightedSolver(small.trusted, small.loops, small.odometry, bound, report, support.cluster)
+    solver = WeightedSolver(small.trusted, small.loops, small.odometry, bound, report, support)
     found, complete = _search(solver, solver.values(start[small.kept]), support)
     best = least(found)
     doubts = _doubts(solver, found, support, complete)
@@ -133,9 +134,7 @@ def _agreed(found: list[Found]) -> bool:
 
 def _doubts(solver: WeightedSolver, found: list[Found], support: LoopSupport, complete: bool) -> tuple[str, ...]:
     best, doubts = least(found), []
-    others = [
-        one for one in found if _other_map(solver, best, one) and one.cost < best.cost + solver.bound * support.scale
-    ]
+    others = [one for one in found if _other_map(solver, best, one) and one.cost < best.cost + solver.price]
     if others:
         doubts.append("another set of loops, with another map, fits as well but for less than one loop")
     if not complete:

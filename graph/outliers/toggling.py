@@ -65,7 +65,7 @@ def toggled(solver: WeightedSolver, start: Any, cluster: Index, found: list[Foun
             with_it = solver.found(best.values, best.correct | members)
             if not np.array_equal(with_it.correct, best.correct):  # no confirmation: it started from there
                 found.append(with_it)
-        again = (_around if move.correct else _without)(solver, start, members, best.cost + solver.bound)
+        again = (_around if move.correct else _without)(solver, start, members, best.cost + solver.price)
         if again is not None:
             found.append(again)
             left -= 1
@@ -112,7 +112,7 @@ def _around(solver: WeightedSolver, start: Any, cluster: Mask, limit: float) -> 
 
 def _without(solver: WeightedSolver, start: Any, cluster: Mask, limit: float) -> Found | None:
     """Graduate over all loops but some, as if they were known to be wrong; arguments as for :func:`_around`."""
-    if np.count_nonzero(cluster) * solver.bound > limit:
+    if np.count_nonzero(cluster) * solver.price > limit:
         return None
     values = solver.solve(start, (~cluster).astype(np.float64))
     return solver.found(*solver.graduate(values, ~cluster, solver.bound, GRADUATION))

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
 
-from hybridlio.core.arrays import Array, Index, Mask
+from hybridlio.core.arrays import Array, Mask
 from hybridlio.core.errors import GraphError
 from hybridlio.graph.base.isam import gtsam_message
 from hybridlio.graph.base.truncated_squares import graduate
@@ -18,6 +18,7 @@ from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.connectivity import components
 from hybridlio.graph.model.edge_arrays import Edges
 from hybridlio.graph.model.graph_data import GraphData
+from hybridlio.graph.outliers.loop_support import LoopSupport
 from hybridlio.graph.planar.edges import PlanarEdges
 from hybridlio.graph.planar.gauss_newton import as_planar, held_poses, planar_edges, solves
 from hybridlio.graph.planar.system import PlanarSystem
@@ -197,19 +198,22 @@ class WeightedSolver:
     Attributes:
         loops: the ``M`` between-factors of keys that are not consecutive.
         odometry: those of keys that are.
-        bound: χ² up to which a loop counts as correct, and the cost of rejecting one that no other confirms.
+        bound: χ² up to which a loop counts as correct.
+        price: cost of rejecting a loop that no other confirms, and the most that one costs: the bound, lowered where
+            loops show that all noise is stated too large, so that bending the map does not cost less than rejection.
         dimension: 2 or 3.
         size: number of poses.
     """
 
     def __init__(
         self, trusted: GraphData, loops: Edges, odometry: Edges, bound: float, report: IterationProgress,
-        cluster: Index | None = None,
+        support: LoopSupport | None = None,
     ) -> None:  # fmt: skip
         self.loops, self.odometry, self.bound = loops, odometry, bound
+        self.price = bound if support is None else bound * support.scale
         self.dimension, self._report = trusted.dimension, report
         self.size = len(trusted)
-        self._cluster = np.arange(len(loops.i)) if cluster is None else cluster
+        self._cluster = np.arange(len(loops.i)) if support is None else support.cluster
         self._descent: Descent = descent(trusted, loops)
         part = {key: number for number, keys in enumerate(components(trusted)) for key in keys}
         keys = trusted.keys
@@ -233,20 +237,16 @@ class WeightedSolver:
         return self.loops.chi2(self.poses(values))
 
     def cost(self, values: Any) -> float:
-        """Return the truncated cost: χ² of all trusted factors and of each loop up to the bound.
-
-        A cluster whose loops are rejected costs at most as much as :data:`_FURTHER_LOOP` says.
-        """
-        cost, _ = self._costs(values)
-        return cost
+        """Return χ² of trusted factors and of loops up to the price; of a rejected cluster as _FURTHER_LOOP says."""
+        return self._costs(values)[0]
 
     def _costs(self, values: Any) -> tuple[float, float]:
         """Return the truncated cost, and the same with every rejected loop counted in full."""
         chi2 = self.chi2(values)
         rejected = np.bincount(self._cluster, chi2 > self.bound)
         limits = 1 + _FURTHER_LOOP * (np.bincount(self._cluster) - 1)
-        kept = self._descent.trusted_chi2(values) + chi2[chi2 <= self.bound].sum()
-        return float(kept + self.bound * np.minimum(rejected, limits).sum()), float(kept + self.bound * rejected.sum())
+        kept = self._descent.trusted_chi2(values) + np.minimum(chi2, self.price)[chi2 <= self.bound].sum()
+        return float(kept + self.price * np.minimum(rejected, limits).sum()), float(kept + self.price * rejected.sum())
 
     def solve(self, values: Any, weights: Array, iterations: int = _ITERATIONS_PER_STEP) -> Any:
         """Return values after some iterations with loops of weights ``(M,)``.
@@ -257,8 +257,8 @@ class WeightedSolver:
         return self._descent.solve(values, np.maximum(weights, self._smallest_weight), iterations)
 
     def cost_with(self, values: Any, loops: Mask) -> float:
-        """Return χ² of all trusted factors and of some loops: no solution with these loops costs less."""
-        return float(self._descent.trusted_chi2(values) + self.chi2(values)[loops].sum())
+        """Return χ² of all trusted factors and of some loops up to the price: no solution with these costs less."""
+        return float(self._descent.trusted_chi2(values) + np.minimum(self.chi2(values)[loops], self.price).sum())
 
     def graduate(
         self, values: Any, candidates: Mask, bound: float, graduation: float, largest: float = np.inf,

@@ -39,7 +39,9 @@ from hybridlio.smoothing.calibration import IMU_SCALE, OF_GPS, OF_IMU, Calibrate
 
 _NEWEST = 3  # rounds that give the slope: earlier ones had another mounting
 _MOST_ROUNDS = 6  # one of them beside the others, for the share of an error that a round shows
-_SETTLED = 0.5  # standard deviations by which a round may still change a parameter and be the last
+# Two rounds are to follow. Where the share is small the clock creeps, and would not settle before without it.
+_LAST_PROBE = _MOST_ROUNDS - 2
+_SETTLED = 0.5  # stated standard deviations by which a round may still change a parameter and be the last
 _LEAST_SHARE = 0.1  # of a clock's error that a round shows: less cannot be told from noise
 # Beside the clock that a round found: ten times its usual standard deviation, so that the slope is known to a tenth,
 # and a twentieth of the time between two scans, over which motion hardly changes.
@@ -147,10 +149,10 @@ class _Search:
         record = replace(run.odometry.record(), imu_noise=self._config.imu_noise or self._now.imu_noise or ImuNoise())
         smoothed = smooth(record, gps=uses_gps, calibrate=self._priors)
         found: Calibrated = smoothed.found["calibration"]
+        sigmas = {one.name: one.sigmas for one in found.parameters}
         factor = smoothed.verdict.variance_factor
         found = replace(found, parameters=tuple(one.scaled(factor) for one in found.parameters))
         self._now = replace(self._now, calibration=found.calibration)
-        sigmas = {one.name: one.sigmas for one in found.parameters}
         moves = {one.name: one.change for one in found.parameters if one.name != _CLOCK}
         is_probed = True
         if "time_offset" in moves:
@@ -164,7 +166,7 @@ class _Search:
         if self._scale is not None:
             self._now = replace(self._now, imu=self._scale.correct(record.online, self._now))
             settled = settled and self._scale.is_settled
-        if settled and not is_probed and number < _MOST_ROUNDS - 1:
+        if not is_probed and (settled or number == _LAST_PROBE) and number <= _LAST_PROBE:
             self._move(_PROBE_S)
             return False
         return settled and is_probed

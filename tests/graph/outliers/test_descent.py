@@ -9,6 +9,7 @@ from hybridlio.core import se3
 from hybridlio.graph import PoseGraph
 from hybridlio.graph.model.edge_arrays import edges_of
 from hybridlio.graph.outliers import weighted_solver as descent
+from hybridlio.graph.outliers.loop_support import LoopSupport
 from hybridlio.graph.outliers.weighted_solver import _FURTHER_LOOP, WeightedSolver
 from hybridlio.graph.solve.settings import silent
 
@@ -68,11 +69,11 @@ def test_a_cluster_costs_less_to_reject_than_as_many_single_loops(rng):
     far = data.initial_values
     far[:, 2] += np.arange(COUNT)  # contradicts every loop
     plain = WeightedSolver(trusted, loops, odometry, bound, silent)
-    clustered = WeightedSolver(trusted, loops, odometry, bound, silent, cluster)
+    clustered = WeightedSolver(trusted, loops, odometry, bound, silent, LoopSupport(0.25, cluster > 0, cluster))
     state = plain.values(far)
     assert (plain.chi2(state) > bound).all()
     rejections = plain.cost(state) - plain.cost_with(state, np.zeros(count, dtype=bool))
     assert rejections == pytest.approx(bound * count)
     rejections = clustered.cost(state) - clustered.cost_with(state, np.zeros(count, dtype=bool))
-    assert rejections == pytest.approx(bound * (count - 10 + 1 + 9 * _FURTHER_LOOP))
+    assert rejections == pytest.approx(0.25 * bound * (count - 10 + 1 + 9 * _FURTHER_LOOP))  # at the loops' own noise
     assert 0 < _FURTHER_LOOP < 1

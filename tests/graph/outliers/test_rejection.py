@@ -73,6 +73,27 @@ def test_a_clean_graph_is_solved_as_in_batch(rng):
     assert rmse(solution.poses, batch.poses) < 0.01
 
 
+def test_where_loops_show_that_noise_is_overstated_a_wrong_one_does_not_bend_the_map(rng):
+    """It would cost less than its rejection at the stated noise, ten times that of the measurements."""
+    graph = PoseGraph(2)
+    graph.add_prior(0, np.eye(4), sigmas=1e-3)
+    step, stated = se3.exp([0, 0, 0, 1, 0, 0]), np.array([0.01, 0.05, 0.05])
+
+    def noisy(T):
+        return T @ se3.exp(np.r_[0, 0, 0.1 * stated * rng.standard_normal(3), 0])
+
+    for k in range(60):
+        graph.add_between(k, k + 1, noisy(step), sigmas=stated)
+    for k in range(4, 40):
+        graph.add_between(k - 4, k, noisy(se3.exp([0, 0, 0, 4, 0, 0])), sigmas=stated)
+    clean = graph.optimize()
+    off = se3.exp([0, 0, 0, 14, 0, 0]) @ se3.exp([0, 0, 0, 0.7, 0, 0])  # 0.19 m is one deviation of the odometry
+    wrong = graph.add_between(45, 59, off, sigmas=stated)
+    solution = graph.optimize("gnc")
+    assert solution.rejected == {wrong}
+    assert rmse(solution.poses, clean.poses) < 1e-3
+
+
 def test_a_loop_that_alone_joins_a_part_is_kept(rng):
     graph = laps(rng, 3, count=40)
     graph.add_between(5, 100, se3.exp([0, 0, 1, 2, 0, 0]), sigmas=0.1)
