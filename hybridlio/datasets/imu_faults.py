@@ -1,4 +1,4 @@
-"""IMU samples that were not measured: spikes, and gaps that a recorder filled by linear interpolation."""
+"""IMU samples that were not measured: spikes, gaps that a recorder filled by linear interpolation, and clipped ones."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from hybridlio.core.arrays import Mask, Stamps
+from hybridlio.core.arrays import Array, Mask, Stamps
 from hybridlio.core.sensors import NS_PER_S, ImuSamples
 
 _MEDIAN_WINDOW = 5  # samples: outvotes two spikes in a row
@@ -18,6 +18,9 @@ _MIN_LINE_S = 0.2  # vibration and sensor noise never lie on a line for this lon
 _MIN_LINE_SAMPLES = 8  # by chance, a deviation below 1/20 of the median in 6 channels does not happen 8 times in a row
 _LINE_SHARE = 0.05  # largest deviation from a line, relative to the channel's median deviation
 _NO_NOISE = 1e-9  # median deviation, relative to the largest value, below which a channel has no noise
+# Noise seldom repeats the largest value of a fine sensor, and reaches that of a coarse one by single steps. A clipped
+# signal arrives at its limit from further off, and stays. Limits of sensors too coarse for that are not found.
+_CLIPPED_RUN, _CLIPPED_STEPS = 3, 5
 
 
 def spikes(imu: ImuSamples) -> NDArray[np.intp]:
@@ -77,6 +80,31 @@ def without_filled_gaps(imu: ImuSamples) -> tuple[ImuSamples, list[tuple[int, in
     for first, last in gaps:
         keep[first + 1 : last] = False
     return _at_rows(imu, keep), [(int(imu.stamps_ns[a]), int(imu.stamps_ns[b])) for a, b in gaps]
+
+
+def clipped(values: Array) -> list[tuple[float, int]]:
+    """Return the limits at which a sensor's signals ``(N, A)`` are cut off, and the number of samples there.
+
+    A limit is the largest magnitude of an axis, repeated in three samples or more in a row, which the signal reaches or
+    leaves by more than five of its smallest steps.
+    """
+    out = []
+    for signal in values.T:
+        distinct = np.unique(signal)
+        if len(distinct) < _CLIPPED_STEPS:
+            continue
+        least_jump = _CLIPPED_STEPS * float(np.diff(distinct).min())
+        for limit in (distinct[0], distinct[-1]):
+            at_limit = signal == limit
+            ends = np.flatnonzero(np.diff(np.r_[0, at_limit.astype(np.int8), 0]))
+            padded = np.r_[limit, signal, limit]  # a run at either end of the recording has no jump there
+            is_cut = any(
+                b - a >= _CLIPPED_RUN and max(abs(padded[a] - limit), abs(padded[b + 1] - limit)) > least_jump
+                for a, b in zip(ends[::2], ends[1::2], strict=True)
+            )
+            if is_cut:
+                out.append((float(limit), int(at_limit.sum())))
+    return out
 
 
 def _at_rows(imu: ImuSamples, rows: Mask | NDArray[np.intp]) -> ImuSamples:

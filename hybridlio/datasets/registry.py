@@ -14,7 +14,7 @@ from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.tables import counted
 from hybridlio.datasets import folder
 from hybridlio.datasets.calibration_yaml import MAX_RATE_HZ
-from hybridlio.datasets.imu_faults import without_filled_gaps, without_spikes
+from hybridlio.datasets.imu_faults import clipped, without_filled_gaps, without_spikes
 from hybridlio.datasets.kitti import odometry, raw
 from hybridlio.datasets.kitti.vertical_angle import check_angle
 from hybridlio.datasets.notes import Notes
@@ -154,7 +154,7 @@ def reopen(source: Source, path: str | os.PathLike[str] | None = None) -> Sequen
 
 
 def without_false_samples(sequence: Sequence) -> Sequence:
-    """Return the sequence without IMU samples that were not measured, as all readers do, and note them.
+    """Return the sequence without IMU samples that were not measured, as all readers do; note them and clipped ones.
 
     Such are spikes, and stretches on a straight line: a recorder filled a gap, or a driver repeated its last sample.
     """
@@ -172,7 +172,13 @@ def without_false_samples(sequence: Sequence) -> Sequence:
             f"dropped the IMU samples of {counted(len(gaps), 'gap')}, {lost_s:.2f} s in all, that a straight line or a "
             f"repeated sample fills, the first {(gaps[0][0] - first_ns) / NS_PER_S:.2f} s after the first scan"
         )
-    return sequence if imu is sequence.imu else replace(sequence, imu=imu, notes=tuple(notes.texts))
+    for what, values, unit in (("angular rates", imu.gyro_rad_s, "rad/s"), ("accelerations", imu.accel_m_s2, "m/s²")):
+        for limit, count in clipped(values):
+            notes.add(
+                f"the IMU's {what} are clipped at {limit:.4g} {unit} in {counted(count, 'sample')}: the motion was "
+                "beyond its range there, and is underestimated; record with a larger range"
+            )
+    return replace(sequence, imu=imu, notes=tuple(notes.texts)) if len(notes.texts) > len(sequence.notes) else sequence
 
 
 def locate(path: str | os.PathLike[str], sequence: str | None = None, reader: str | None = None) -> tuple[str, Path]:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hybridlio.core.sensors import ImuSamples
-from hybridlio.datasets.imu_faults import spikes
-from hybridlio.datasets.registry import open_sequence
+from hybridlio.datasets.imu_faults import clipped, spikes
+from hybridlio.datasets.registry import open_sequence, without_false_samples
 
 
 def driving(rng: np.random.Generator, count: int = 1000) -> ImuSamples:
@@ -64,3 +65,29 @@ def test_opening_a_recording_drops_spikes_with_a_note(tiny_drive: Path, tmp_path
     assert np.abs(opened.imu.gyro_rad_s).max() < 2
     (note,) = set(opened.notes) - set(clean.notes)
     assert "dropped 1 IMU sample far from the neighbouring ones" in note
+
+
+@pytest.mark.parametrize("step", [None, 0.001])
+def test_clipped_rates_are_found_with_their_limit_and_others_are_not(rng, step):
+    rates = driving(rng).gyro_rad_s
+    rates = rates if step is None else step * np.round(rates / step)
+    assert clipped(rates) == []
+    limit = 1.0 if step is None else step * round(1.0 / step)
+    cut = np.clip(rates, -10, limit)
+    assert clipped(cut) == [(limit, int((cut[:, 2] == limit).sum()))]
+
+
+def test_a_sensor_at_rest_or_constant_is_not_clipped(rng):
+    assert clipped(np.zeros((100, 3))) == []
+    assert clipped(0.01 * rng.integers(-2, 3, (10000, 3))) == []
+
+
+def test_a_recording_whose_imu_is_clipped_says_so_in_one_line(rng, tiny_drive: Path):
+    sequence = open_sequence(tiny_drive)
+    imu = sequence.imu
+    rates = imu.gyro_rad_s.copy()
+    rates[:, 1] += np.sin(np.arange(len(rates)) / 5)
+    cut = replace(sequence, imu=replace(imu, gyro_rad_s=np.clip(rates, -5, 0.8)))
+    notes = [note for note in without_false_samples(cut).notes if "clipped" in note]
+    assert len(notes) == 1
+    assert "0.8 rad/s" in notes[0]
