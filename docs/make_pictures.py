@@ -1,12 +1,16 @@
-"""Make the pictures: of the README, the map and path of a simulated drive and one scan; and of a map file.
+"""Make the pictures: of the README, the map and path of a simulated drive and one scan; of a map file; of the viewer.
 
 python docs/make_pictures.py [FOLDER]
 python docs/make_pictures.py --map map.laz
+python docs/make_pictures.py --viewer RUN     # needs xvfb-run and a Vulkan driver, such as mesa-vulkan-drivers
+
+The viewer's is a screenshot of Rerun at the end of a run.
 """
 
 from __future__ import annotations
 
 import argparse
+import subprocess
 import tempfile
 from pathlib import Path
 
@@ -89,12 +93,37 @@ def draw_map_file(path: Path) -> None:
     figure.savefig(IMAGES / "map.png", dpi=75, facecolor=BACKGROUND)
 
 
+def take_viewer_picture(run: Path) -> None:
+    """Save a screenshot of Rerun, as `hybridlio view` opens it, at the end of a run."""
+    import rerun.blueprint as rrb
+    from PIL import Image
+
+    from hybridlio.viewing.rerun_layout import TIME, layout
+
+    with tempfile.TemporaryDirectory() as folder:
+        recording, blueprint, shot = (Path(folder) / name for name in ("run.rrd", "run.rbl", "shot.png"))
+        hl.view(run, save=recording)
+        at_the_end = layout()
+        at_the_end.time_panel = rrb.TimePanel(timeline=TIME, state="collapsed", play_state="following")
+        at_the_end.save("hybridlio", str(blueprint))
+        # a larger screen keeps the pointer, which is in its middle, out of the window
+        screen = ["xvfb-run", "-a", "-s", "-screen 0 5400x3400x24", "rerun", str(recording), str(blueprint)]
+        options = ["--screenshot-to", str(shot), "--window-size", "1280x800", "--renderer", "vulkan"]
+        subprocess.run([*screen, *options], check=True, timeout=600)
+        picture = Image.open(shot).convert("RGB").resize((1280, 800), Image.Resampling.LANCZOS)
+        picture.quantize(256, kmeans=3).save(IMAGES / "viewer.png", optimize=True)
+
+
 def main() -> None:
-    """Simulate the drive, run odometry and save the picture, or draw a map."""
+    """Simulate the drive, run odometry and save the picture, or draw a map, or the viewer."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, nargs="?", help="for the simulated drive (default: a temporary folder)")
     parser.add_argument("--map", type=Path, help="a .las or .laz file to draw instead")
+    parser.add_argument("--viewer", type=Path, help="a run folder to show in the viewer instead")
     options = parser.parse_args()
+    if options.viewer is not None:
+        take_viewer_picture(options.viewer)
+        return
     if options.map is not None:
         draw_map_file(options.map)
         return

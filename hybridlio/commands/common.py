@@ -97,9 +97,11 @@ Check = Annotated[
     ),
 ]
 Frames = Annotated[str | None, typer.Option("--frames", metavar="A:B", help="Use scans A to B-1 only, counted from 0.")]
-Start = Annotated[int | None, typer.Option("--start", metavar="N", min=0, help="Leave out the first N scans.")]
+Start = Annotated[
+    int | None, typer.Option("--start", "--jump", "-j", metavar="N", min=0, help="Leave out the first N scans.")
+]
 ScanCount = Annotated[int | None, typer.Option("--n-scans", "-n", metavar="N", min=1, help="Use N scans at most.")]
-Every = Annotated[int, typer.Option("--every", "--jump", metavar="N", min=1, help="Use one scan in N.")]
+Every = Annotated[int, typer.Option("--every", metavar="N", min=1, help="Use one scan in N.")]
 InitialPoseName = Annotated[
     str | None,
     typer.Option(

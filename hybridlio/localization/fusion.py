@@ -4,6 +4,9 @@ The errors of consecutive matches are not independent: they see the same stretch
 the same way. A Kalman filter would average them away and soon believe itself exact. Covariance intersection assumes
 nothing about their dependence, and its covariance is never smaller than it should be (Julier, Uhlmann, "A
 non-divergent estimation algorithm in the presence of unknown correlations", ACC 1997).
+
+``benchmarks/localization_fusion.py`` compares it with a graph that has the matches as factors: in two simulated towns
+the graph is no more accurate, and its ANEES is 4 to 7 times as large in position.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.errors import EstimationError
+from hybridlio.core.errors import ConfigError, EstimationError
 from hybridlio.core.progress import Progress
 from hybridlio.core.sensors import Frame
 from hybridlio.core.trajectory import Trajectory
@@ -116,9 +116,14 @@ def localize(
         progress: called after each scan.
 
     Raises:
+        ConfigError: ``sequence`` is no recording.
         DataError: the map cannot be read.
         EstimationError: the recording's place in the map was not found.
     """
+    if not isinstance(sequence, Sequence):
+        raise ConfigError(
+            f"localize takes a recording, got {type(sequence).__name__}; hl.open_sequence(path) opens one"
+        )
     prior = prior if isinstance(prior, PriorMap) else open_prior_map(prior)
     config = adapt_config(sequence, config or Config())
     followed = MapOdometry(Odometry(config=config), prior, start, settings)

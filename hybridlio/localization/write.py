@@ -18,7 +18,7 @@ from hybridlio.runs.whole_folder import replaced_folder
 from hybridlio.runs.write import notes
 
 
-def write_localization(folder: Path, localization: Localization, map_path: Path) -> None:
+def write_localization(folder: Path, localization: Localization, map_path: Path, crs: str | None = None) -> None:
     """Write poses in the map's frame, covariances, ``localization.csv`` and ``metrics.json``.
 
     The table has one row a scan: ``frame``, ``stamp_ns``, ``held`` (1 where the map held the pose), ``matched``,
@@ -28,6 +28,7 @@ def write_localization(folder: Path, localization: Localization, map_path: Path)
         folder: appears whole, or replaces an earlier run.
         localization: the result.
         map_path: where the map is, for the reader.
+        crs: the coordinate reference system that the map states, which maps of the run then state too.
 
     Raises:
         ConfigError: the folder is being written by another process.
@@ -52,6 +53,8 @@ def write_localization(folder: Path, localization: Localization, map_path: Path)
             "seconds": run.seconds,
             "notes": notes(run),
         }
+        if crs is not None:
+            metrics["crs"] = crs
         if run.sequence.source is not None:
             metrics["recording"] = run.sequence.source.to_json_dict()
         run_folder.write_metrics(part, metrics)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridlio.core.errors import ConfigError
+from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.geodesy import GeodeticPoint, geodetic_from_enu
 from hybridlio.mapping.point_map import PointMap
 
@@ -27,6 +28,33 @@ def utm_crs(origin: GeodeticPoint) -> CRS:
     """
     zone = int((origin.longitude_deg + 180.0) % 360.0 // _ZONE_DEG) + 1
     crs: CRS = _pyproj().CRS.from_epsg((_EPSG_UTM_NORTH if origin.latitude_deg >= 0 else _EPSG_UTM_SOUTH) + zone)
+    return crs
+
+
+def crs_of_file(path: Path) -> str | None:
+    """Return the coordinate reference system that a ``.las`` or ``.laz`` file states, for :func:`crs_of`; else None."""
+    if path.suffix.lower() not in (".las", ".laz"):
+        return None
+    import laspy
+
+    _pyproj()  # laspy would leave the system out without a word
+    with laspy.open(path) as file:
+        crs = file.header.parse_crs()
+    return None if crs is None else str(crs.to_string())
+
+
+def crs_of(text: str) -> CRS:
+    """Return the coordinate reference system of an authority's code, such as ``EPSG:32632``, or of its definition.
+
+    Raises:
+        ConfigError: pyproj is missing.
+        DataError: there is no such system.
+    """
+    pyproj = _pyproj()
+    try:
+        crs: CRS = pyproj.CRS.from_user_input(text)
+    except pyproj.exceptions.CRSError as error:
+        raise DataError(f"unknown coordinate reference system {text:.60}: {error}") from None
     return crs
 
 

@@ -42,7 +42,8 @@ def layout() -> rrb.Blueprint:
         name="World",
         overrides={entity: [until_now] for entity in _STAYS},
         background=_BACKGROUND,
-        eye_controls=rrb.EyeControls3D(position=_EYE_M, look_target=(0.0, 0.0, 0.0), tracking_entity=f"/{LIDAR}"),
+        # Rerun's distance follows the size of what it tracks: at the lidar's axes it would be too near to see anything.
+        eye_controls=rrb.EyeControls3D(position=_EYE_M, look_target=(0.0, 0.0, 0.0), tracking_entity=f"/{POINTS}"),
     )
     support = rrb.StateTimelineView(origin="scans", name="Support of the scans")
     return rrb.Blueprint(

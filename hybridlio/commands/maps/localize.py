@@ -69,18 +69,19 @@ def localize(
     from hybridlio.localization.localize import localize as localize_in
     from hybridlio.localization.open_map import open_prior_map
     from hybridlio.localization.write import write_localization
+    from hybridlio.mapping.map_projection import crs_of_file
     from hybridlio.runs.new_folder import new_run_folder
 
     place = None if start is None else _start(start)
     chosen = common.load_settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
     frames = common.range_of(frames, None, n_scans)
     recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle, topics, rate).every(every)
-    prior = open_prior_map(map_)
+    prior, crs = open_prior_map(map_), crs_of_file(map_)
     recording = common.check_data(recording, check)
     with new_run_folder(recording.name, out, overwrite, data) as folder:
         with progress("localising") as report:
             found = localize_in(recording, prior, place, chosen, progress=report)
-        write_localization(folder, found, map_)
+        write_localization(folder, found, map_, crs)
     _print_result(folder, found)
     if isinstance(found.run.stopped, KeyboardInterrupt):
         raise typer.Exit(common.INTERRUPTED)

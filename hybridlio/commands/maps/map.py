@@ -17,9 +17,9 @@ from hybridlio.core.errors import ConfigError
 from hybridlio.core.tables import counted
 
 if TYPE_CHECKING:
-    from hybridlio.core.geodesy import GeodeticPoint
     from hybridlio.core.progress import Progress
     from hybridlio.mapping.build import MapTiles
+    from hybridlio.runs.results.map_source import MapSource
 
 
 Run = Annotated[
@@ -109,7 +109,7 @@ def map_(
         progress("map", units={"tiles": "tiles"}) as report,
         map_tiles(part.sequence, part.trajectory, settings, skip=part.skip, progress=report) as built,
     ):
-        made = output.write(built, voxel, source.origin, report)
+        made = output.write(built, voxel, source, report)
     print_result(f"{source.name}: {counted(built.scans, 'scan')} by the poses of {source.poses_from}, {made}")
     if built.left_out:
         print_warning(f"{counted(built.left_out, 'scan')} left out: without a pose, bridged or unreadable")
@@ -147,16 +147,17 @@ class _Output:
         else:
             check_output(self.path, recording, may_hold=True)
 
-    def write(self, tiles: MapTiles, voxel_m: float, origin: GeodeticPoint | None, report: Progress) -> str:
+    def write(self, tiles: MapTiles, voxel_m: float, source: MapSource, report: Progress) -> str:
         """Write the map; return what it consists of."""
         from hybridlio.mapping.files import holds_crs, write_map
-        from hybridlio.mapping.map_projection import projected, utm_crs
+        from hybridlio.mapping.map_projection import crs_of, projected, utm_crs
         from hybridlio.mapping.mesh import write_mesh
         from hybridlio.mapping.point_map import PointMap
         from hybridlio.mapping.tile_folder import write_tiles
 
-        place = origin if origin is not None and holds_crs(self.tile_suffix or self.path.suffix) else None
-        crs = None if place is None else utm_crs(place)
+        keeps_crs = holds_crs(self.tile_suffix or self.path.suffix)
+        place, stated = (source.origin, source.crs) if keeps_crs else (None, None)
+        crs = utm_crs(place) if place is not None else None if stated is None else crs_of(stated)
         if self.tile_suffix is not None:
             project = None if place is None else partial(projected, origin=place)
             count = write_tiles(self.path, tiles, self.tile_suffix, self.colour, project, crs, report)

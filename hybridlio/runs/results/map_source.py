@@ -29,6 +29,7 @@ class MapSource:
         skip: frames whose pose is not supported by their scan; left out of a map.
         folder: the run folder, or None for poses from a file.
         origin: of the world frame on Earth, once georeferenced; then the frame is east-north-up.
+        crs: of the world frame, where the run was localised in a map that states one.
     """
 
     sequence: Sequence
@@ -37,6 +38,7 @@ class MapSource:
     skip: frozenset[int] = frozenset()
     folder: Path | None = None
     origin: GeodeticPoint | None = None
+    crs: str | None = None
 
     @property
     def name(self) -> str:
@@ -68,7 +70,7 @@ class MapSource:
         if path is None:
             raise DataError(f"{self.name}: georeferencing needs a run folder with {RECORD}, which holds the GPS fixes")
         placed = georeference(Record.load(path), self.trajectory)
-        return replace(self, trajectory=placed.trajectory, origin=placed.origin)
+        return replace(self, trajectory=placed.trajectory, origin=placed.origin, crs=None)
 
 
 def open_map_source(run: Path, data: Path | None = None, poses: Path | None = None) -> MapSource:
@@ -94,7 +96,7 @@ def open_map_source(run: Path, data: Path | None = None, poses: Path | None = No
         return MapSource(sequence, trajectory, poses, folder=run if stored else None)
     assert stored is not None
     skip = frozenset(int(k) for name in _UNSUPPORTED for k in stored.metrics.get(name, ()))
-    return MapSource(sequence, stored.trajectory, run, skip, run)
+    return MapSource(sequence, stored.trajectory, run, skip, run, crs=stored.metrics.get("crs"))
 
 
 def _sequence(run: Path, data: Path | None, stored: StoredRun | None) -> Sequence:

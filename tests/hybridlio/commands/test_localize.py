@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from command_line import ok, refused
 
+import hybridlio as hl
+from hybridlio.core.errors import ConfigError
 from hybridlio.runs.folder import read_run
 
 pytestmark = pytest.mark.usefixtures("plain_logging")
@@ -42,11 +44,16 @@ def test_the_table_says_for_each_scan_whether_the_map_held_it(localized: Path):
     assert {row["matched"] == "" for row in rows[: metrics["found"]]} == {True}
 
 
-def test_a_recording_is_found_in_a_map_file_and_holds_from_a_start(
+def test_a_recording_is_found_in_a_map_file_holds_from_a_start_and_takes_over_the_reference_system(
     tiny_drive: Path, finished_run: Path, tmp_path: Path
 ):
-    ok("map", finished_run, "-o", tmp_path / "map.ply", "--voxel", 0.3, "--no-normals")
-    words = ("localize", tiny_drive, "--map", tmp_path / "map.ply", "--no-check", "-o")
+    laspy, pyproj = pytest.importorskip("laspy"), pytest.importorskip("pyproj")
+    coarse = ("--voxel", 0.3, "--no-normals")
+    ok("map", finished_run, "-o", tmp_path / "map.laz", *coarse)
+    points = laspy.read(tmp_path / "map.laz")
+    points.header.add_crs(pyproj.CRS.from_epsg(32632))
+    points.write(tmp_path / "map.laz")
+    words = ("localize", tiny_drive, "--map", tmp_path / "map.laz", "--no-check", "-o")
     ok(*words, tmp_path / "found")
     found, run = read_run(tmp_path / "found").trajectory, read_run(finished_run).trajectory
     assert np.linalg.norm(found.poses[:, :3, 3] - run.poses[:, :3, 3], axis=1).max() < 0.05
@@ -54,6 +61,8 @@ def test_a_recording_is_found_in_a_map_file_and_holds_from_a_start(
     metrics = json.loads((tmp_path / "out/metrics.json").read_text())
     assert metrics["found"] == 1
     assert metrics["held_share"] > 0.8
+    ok("map", tmp_path / "out", "-o", tmp_path / "own.laz", *coarse)
+    assert laspy.read(tmp_path / "own.laz").header.parse_crs().to_epsg() == 32632
 
 
 def test_a_place_that_is_not_found_is_said_and_nothing_is_written(tiny_drive: Path, finished_run: Path, tmp_path: Path):
@@ -73,3 +82,8 @@ def test_wrong_maps_and_starts_are_refused(tiny_drive: Path, tmp_path: Path):
     assert "no such map" in refused(2, *words, tmp_path / "missing.ply")
     assert "not a run folder" in refused(2, *words, tiny_drive)
     assert "X,Y,YAW" in refused(2, *words, tmp_path, "--start", "1,2")
+
+
+def test_a_path_in_place_of_a_recording_is_refused_with_what_opens_it(tiny_drive: Path, finished_run: Path):
+    with pytest.raises(ConfigError, match=r"got str; hl\.open_sequence"):
+        hl.localize(str(tiny_drive), finished_run)  # type: ignore[arg-type]

@@ -27,7 +27,8 @@ QUICK = ("--residual", "none")
         (("-n", 4), slice(0, 4)),
         (("--start", 20), slice(20, None)),
         (("--every", 4), slice(None, None, 4)),
-        (("--jump", 2, "--frames", "1:9"), slice(1, 9, 2)),
+        (("--every", 2, "--frames", "1:9"), slice(1, 9, 2)),
+        (("--jump", 20), slice(20, None)),  # as in KISS-ICP
     ],
 )
 def test_the_scans_to_use_can_be_chosen(
