@@ -20,7 +20,7 @@ DOCS_READY := $(VENV)/.stamp-docs
 help:
 	@echo 'make demo     simulate a drive, run the odometry, smooth, evaluate, report   (DEMO_SECONDS=60 DEMO=demo)'
 	@echo 'make test     all tests   (WORKERS=2 ARGS="-k kalman")'
-	@echo 'make fuzz     damage the inputs of every reader   (FUZZ="--count 200 --seconds 60 --seed -1")'
+	@echo 'make fuzz     damage the inputs of every reader   (FUZZ="--count 200 --seconds 60 --seed -1"; GUIDED=600: Atheris too, 600 s each)'
 	@echo 'make lint     ruff: rules and format        make format   apply both'
 	@echo 'make types    mypy, strict, on all packages'
 	@echo 'make docs     build the documentation into site/, strictly'
@@ -36,6 +36,10 @@ test: $(READY)
 
 fuzz: $(READY)
 	$(RUN) tests/fuzz_readers.py $(FUZZ)
+ifdef GUIDED
+	@$(RUN) -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[fuzz]'
+	$(RUN) tests/fuzz_guided.py --seconds $(GUIDED)
+endif
 
 lint: $(READY)
 	$(RUN) -m ruff check .

@@ -4,7 +4,8 @@
 
 A tiny recording is written in each reader's layout, and every other kind of file that hybridlio reads. Each mutation
 changes one or two of the files (bits, lengths, numbers in headers, words of texts, files in each other's place) from
-its seed, and opens the recording and every scan, or reads the file. Workers are processes of their own, so that a
+its seed, and opens the recording and every scan, or reads the file. Before them, the cases kept in tests/corpora are
+repeated (see fuzz_guided.py). Workers are processes of their own, so that a
 crash, a hang over 10 s or memory over 2 GiB is seen; they continue behind it. Prints one line a reader, and each
 failure with its seed; exits with 1 if there is any.
 """
@@ -13,17 +14,17 @@ from __future__ import annotations
 
 import argparse
 import logging
+import multiprocessing
 import os
 import resource
-import select
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
 import warnings
 from collections import Counter
 from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -31,18 +32,17 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests/helpers")]
 
 import mutations  # noqa: E402
 import numpy as np  # noqa: E402
-from fuzz_files import FILES  # noqa: E402
+from fuzz_corpus import Corpus  # noqa: E402
 from fuzz_input import HANG_S, MEMORY_BYTES, outcome  # noqa: E402
-from fuzz_learned import LEARNED  # noqa: E402
-from fuzz_recordings import RECORDINGS  # noqa: E402
+from fuzz_inputs import INPUTS  # noqa: E402
 
-START_S = 300  # until the first line: a busy machine imports and writes the recording for a minute
-LOST_S = 3 * HANG_S  # without a line: the worker hangs where Python's alarm does not reach
-INPUTS = {**RECORDINGS, **FILES, **LEARNED}
+FORK = multiprocessing.get_context("fork")  # workers need not import everything again
+START_S = 120  # until the first message: a busy machine may write the files for long
+LOST_S = 3 * HANG_S  # without a message: the worker hangs where Python's alarm does not reach
 
 
-def work(name: str, start: int, count: int) -> None:
-    """Run mutations, one line each; the parent watches."""
+def work(name: str, start: int, count: int, pipe: Connection) -> None:
+    """Repeat the kept cases, then run mutations; send each seed, then what it gives, to the parent that watches."""
     logging.disable(logging.CRITICAL)
     warnings.simplefilter("error")
     warnings.simplefilter("ignore", ResourceWarning)  # of files that NumPy leaves to the collector after an error
@@ -52,13 +52,17 @@ def work(name: str, start: int, count: int) -> None:
         if (found := outcome(read, arguments)) != "ok":
             raise SystemExit(f"{name}: the undamaged files give {found}")
         shutil.copytree(root / "data", root / "whole")
+        corpus = Corpus(name, root / "data")
         vsize = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
         resource.setrlimit(resource.RLIMIT_AS, (vsize + MEMORY_BYTES,) * 2)
+        for case, content in corpus.cases().items():
+            pipe.send((f"case {case}", None))
+            with corpus.applied(content):
+                pipe.send((f"case {case}", outcome(read, arguments)))
         for seed in range(start, start + count):
-            print(f"{seed} starts", flush=True)
+            pipe.send((seed, None))
             changed = mutations.damage(root / "data", np.random.default_rng([seed, len(name)]))
-            text = outcome(read, arguments).replace("\n", " ")[:300]
-            print(f"{seed} {text}", flush=True)
+            pipe.send((seed, outcome(read, arguments).replace("\n", " ")[:300]))
             for path in changed:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_bytes((root / "whole" / path.relative_to(root / "data")).read_bytes())
@@ -66,50 +70,62 @@ def work(name: str, start: int, count: int) -> None:
 
 @dataclass
 class Result:
-    """What the mutations of one reader gave."""
+    """What the kept cases and the mutations of one reader gave."""
 
     counts: Counter[str] = field(default_factory=Counter)
     failures: list[str] = field(default_factory=list)
 
-    def add(self, seed: int, text: str) -> None:
-        self.counts[text if text in ("ok", "error") else "failed"] += 1
-        if text not in ("ok", "error"):
-            self.failures.append(f"seed {seed}: {text}")
+    def add(self, which: int | str, text: str) -> None:
+        kind = text if text in ("ok", "error") else "failed"
+        self.counts[kind] += isinstance(which, int) or kind == "failed"
+        if kind == "failed":
+            self.failures.append(f"{'seed ' if isinstance(which, int) else ''}{which}: {text}")
 
 
 def run(name: str, start: int, count: int, until: float | None) -> Result:
     """Run the mutations of a reader in workers, a new one behind each crash."""
     result, seed, end = Result(), start, start + count
     while seed < end and (until is None or time.monotonic() < until):
-        command = [sys.executable, __file__, "--worker", name, "--seed", str(seed), "--count", str(end - seed)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as worker:
-            assert worker.stdout is not None
-            assert worker.stderr is not None
-            began, last = False, ""
-            while True:
-                limit_s = LOST_S if began or result.counts else START_S
-                left = limit_s if until is None else min(limit_s, max(until - time.monotonic(), 0))
-                ready = select.select([worker.stdout], [], [], left)[0]
-                last = worker.stdout.readline() if ready else ""
-                if not last:
-                    break
-                number, _, text = last.strip().partition(" ")
-                began, seed = text == "starts", int(number)
-                if not began:
-                    result.add(seed, text)
-                    seed += 1
-            over = until is not None and (time.monotonic() >= until or not (ready or left == LOST_S))
-            hangs = worker.poll() is None and not ready and not over
-            worker.kill()
-            status, said = worker.wait(), worker.stderr.read().strip()
-        if over:
+        receive, send = FORK.Pipe(duplex=False)
+        worker = FORK.Process(target=work, args=(name, seed, end - seed, send), daemon=True)
+        worker.start()
+        send.close()
+        which: int | str | None = None
+        is_over = False
+        while not is_over:
+            left = START_S if which is None else LOST_S
+            has_come = receive.poll(left if until is None else max(min(left, until - time.monotonic()), 0))
+            message = _received(receive) if has_come else None
+            if message is None:
+                break
+            which, text = message
+            if text is not None:
+                result.add(which, text)
+                seed = which + 1 if isinstance(which, int) else seed
+                which = None if isinstance(which, str) else which
+            is_over = until is not None and time.monotonic() >= until
+        is_over = is_over or (until is not None and time.monotonic() >= until)
+        is_unfinished = isinstance(which, str) or which == seed
+        is_alive = worker.is_alive() and not receive.poll(0)
+        worker.kill()
+        worker.join()
+        if is_over or (seed == end and not is_unfinished):
             break
-        if not began and seed < end:
-            raise SystemExit(f"{name}: the worker ended ({status}) {said[-500:]}")
-        if began:
-            result.add(seed, "hangs" if hangs else f"the process ends with {status} {said[-200:]}")
-            seed += 1
+        if not is_unfinished:
+            raise SystemExit(f"{name}: the worker ended ({worker.exitcode})")
+        assert which is not None
+        result.add(which, "hangs" if is_alive else f"the process ends with {worker.exitcode}")
+        if isinstance(which, str):
+            break  # a kept case; a new worker would repeat it
+        seed += 1
     return result
+
+
+def _received(receive: Connection) -> tuple[int | str, str | None] | None:
+    try:
+        return receive.recv()  # type: ignore[no-any-return]
+    except EOFError:
+        return None
 
 
 def main() -> None:
@@ -118,11 +134,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=2000, help="mutations of each (default: %(default)s)")
     parser.add_argument("--seconds", type=float, help="stop after this time, shared by the readers")
     parser.add_argument("--seed", type=int, default=0, help="of the first mutation; -1 for fresh ones")
-    parser.add_argument("--worker", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.worker:
-        work(options.worker, options.seed, options.count)
-        return
     seed = options.seed if options.seed >= 0 else time.time_ns() // 10**9 % 10**9
     names, began, failed = options.readers or list(INPUTS), time.monotonic(), 0
     for number, name in enumerate(names):

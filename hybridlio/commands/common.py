@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import inspect
 import signal
@@ -212,7 +213,8 @@ def _describe(error: BaseException) -> str:
     if isinstance(error, HybridLioError):
         return str(error)
     if isinstance(error, OSError) and error.strerror:  # the system refused, such as a full disk: not a bug
-        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+        text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+        return f"{text}; make room there, or choose another place" if error.errno == errno.ENOSPC else text
     if isinstance(error, MemoryError):
         return "out of memory; process part of the recording with --frames"
     return f"{type(error).__name__}: {error} (a bug in hybridlio; run again with -vv for the traceback)"

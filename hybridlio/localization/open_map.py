@@ -73,7 +73,7 @@ def _points(path: Path) -> Array:
         raise DataError(f"{path}: no such map; give a run folder or a file of points")
     if path.suffix.lower() == ".npz":
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with np.errstate(all="ignore"), np.load(path, allow_pickle=False) as file:
                 points = np.asarray(file["points"], np.float64).reshape(-1, 3)
         except UNREADABLE_NPZ as error:
             raise DataError(f"{path}: not a map ({error}); `hybridlio map` writes one") from error
@@ -90,7 +90,8 @@ def _points(path: Path) -> Array:
 def _columns(path: Path) -> Array:
     try:
         columns = read_columns(path)
-        return np.column_stack([columns[axis] for axis in "xyz"]).astype(np.float64)
+        with np.errstate(all="ignore"):  # what is not finite is left out
+            return np.column_stack([columns[axis] for axis in "xyz"]).astype(np.float64)
     except KeyError as error:
         raise DataError(f"{path}: no column {error.args[0]}; a map has x, y and z") from error
     except DataError as error:

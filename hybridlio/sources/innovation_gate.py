@@ -181,7 +181,9 @@ class InnovationGate:
             relative, result = self._tested(measured, own, predicted, bridge, dt_s)
         self._note_path(own, result)
         self._note_fit(measured, result)
-        if result.verdict in ("untested", "IMU left out") and self._is_doubtful(own, predicted, dt_s):
+        if self._follows_misfit(measured, result) or (
+            result.verdict in ("untested", "IMU left out") and self._is_doubtful(own, predicted, dt_s)
+        ):
             self._doubt_m2, self._unconfirmed_m = self._doubt_m2 + self._unconfirmed_m**2, 0.0
         if measured.ok and result.verdict in _MOVES_ON:
             # the IMU confirms the path: then the step to this scan is from the bridge, not from a scan found wrongly
@@ -207,14 +209,19 @@ class InnovationGate:
         elif result.verdict in ("undecided", "rejected", "relocated") and (result.nis or 0.0) > GROSS_NIS:
             self._misfit = self._misfit or self._fit.is_poor(measured.details)
 
+    def _follows_misfit(self, measured: RelativePose, result: GateResult) -> bool:
+        """Whether the path goes on from a scan that did not fit the map, and by more than the IMU's bridge."""
+        if not self._misfit:
+            return False
+        is_followed = result.verdict == "down-weighted" and self._fit.is_poor(measured.details)
+        return is_followed or result.verdict in ("untested", "IMU left out", "relocated")
+
     def _is_doubtful(self, own: RelativePose, predicted: RelativePose | None, dt_s: float) -> bool:
         """Whether scans that are believed without the IMU contradict it grossly, and move abruptly at that.
 
         So they do after a false start, whose speed changes with every scan. The path since the IMU last confirmed it
-        may then be wrong by all its length. So may that from a scan which did not fit the map.
+        may then be wrong by all its length.
         """
-        if self._misfit:
-            return True
         if predicted is None or not _comparable(own, predicted) or not self._motion.is_abrupt(own.pose, dt_s):
             return False
         return normalised_innovation_squared(own, predicted) > GROSS_NIS

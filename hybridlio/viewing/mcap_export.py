@@ -70,7 +70,7 @@ def export_mcap(
     path = user_path(path)
     check_mcap_path(path)
     scene = scene_of(run, data, scans)
-    with atomic_path(path) as part, _topics(part) as topics:
+    with atomic_path(path) as part, _writing(path), _topics(part) as topics:
         _write_start(topics, scene)
         writer = _ScanWriter(topics)
         for row, (scan, points, _) in enumerate(scene.with_clouds(), 1):
@@ -117,6 +117,17 @@ class _Topics:
                 topic, schema=schema, message_encoding="json", context=self.context
             )
         self._channels[topic].log(message, log_time=stamp_ns)
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Turn an error of Foxglove's writer, such as of a full disk, into one that names the file."""
+    try:
+        yield
+    except RuntimeError as error:
+        if not str(error).startswith("FoxgloveError"):
+            raise
+        raise DataError(f"cannot write {path} ({error}); choose a place with free space") from error
 
 
 @contextmanager

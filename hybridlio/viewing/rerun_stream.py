@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import rerun as rr
 
 SUFFIX = ".rrd"
+_END, _END_BYTES = b"FOOT", 32  # of a whole file
 
 
 def import_rerun() -> Any:
@@ -84,3 +85,16 @@ def rerun_stream(name: str, save: str | Path | None = None) -> Iterator[rr.Recor
             yield stream
         finally:
             stream.disconnect()  # waits until all is written
+        _check_whole(part, path)
+
+
+def _check_whole(part: Path, path: Path) -> None:
+    """Check that a file ends as whole ones do: Rerun only logs that it could not write.
+
+    Raises:
+        DataError: it does not.
+    """
+    with part.open("rb") as file:
+        file.seek(max(part.stat().st_size - _END_BYTES, 0))
+        if _END not in file.read():
+            raise DataError(f"cannot write {path}: the file is cut off; choose a place with free space")

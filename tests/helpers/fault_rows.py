@@ -113,9 +113,9 @@ FLAGGED = {
     ),
     "kidnapped: carried to another place": Row(
         faults.carried(40, 20),
-        "scans are rejected, then a new map begins; the covariances grow by the path until the IMU agrees again",
+        "scans are left out, as they or the IMU may be wrong; the covariances grow by the path until both agree again",
         None,
-        "conflict with the IMU",
+        "as either may be wrong",
         scans=60,
     ),
     "extrinsics turned by 10 degrees": Row(

@@ -158,3 +158,17 @@ def test_without_foxgloves_library_one_line_says_what_to_install(
     monkeypatch.setitem(sys.modules, "foxglove", None)
     line = refused(1, "export", finished_run, "--mcap", tmp_path / "run.mcap")
     assert "pip install 'hybridlio[foxglove]'" in line
+
+
+def test_a_full_disk_and_an_existing_file_are_one_line(
+    finished_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise RuntimeError("FoxgloveError: MCAP error: I/O error")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("hybridlio.viewing.mcap_export._write_fixes", full)
+        assert "choose a place with free space" in refused(2, "export", finished_run, "--mcap", tmp_path / "a.mcap")
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "a.mcap").write_text("mine")
+    assert "exists; choose another file" in refused(2, "export", finished_run, "--mcap", tmp_path / "a.mcap")

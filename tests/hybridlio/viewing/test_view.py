@@ -14,6 +14,7 @@ from command_line import ok, refused
 from rerun_files import RerunFile
 
 from hybridlio.core import se3
+from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import GpsFix
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.odometry.odometry import Odometry
@@ -171,6 +172,22 @@ def test_the_odometry_writes_a_file_for_the_viewer(tiny_drive: Path, tmp_path: P
     ok("odometry", tiny_drive, "-n", 12, "--no-check", "-o", tmp_path / "run", "--save", tmp_path / "run.rrd")
     assert RerunFile(tmp_path / "run.rrd").scans(names.LIDAR, "translation") == list(range(12))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "run.rrd"]
+
+
+def test_an_existing_file_stays_without_overwrite(finished_run: Path, tmp_path: Path) -> None:
+    (tmp_path / "run.rrd").write_text("mine")
+    assert "exists; choose another file" in refused(2, "view", finished_run, "--save", tmp_path / "run.rrd")
+    assert (tmp_path / "run.rrd").read_text() == "mine"
+
+
+def test_a_file_that_a_full_disk_cuts_off_is_no_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hybridlio.viewing.rerun_stream._END", b"not what Rerun writes")
+    with (
+        pytest.raises(DataError, match="cut off; choose a place with free space"),
+        rerun_stream("x", tmp_path / "a.rrd"),
+    ):
+        pass
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
