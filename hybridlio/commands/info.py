@@ -44,6 +44,7 @@ def info(
     with notes_held_back():
         recording = common.open_data(data, sequence, reader, raw_root, None, None, topics, rate)
         summary = {"path": str(path), "reader": name, "topics": found, **summarise(recording)}
+        summary["is_checked"] = check and recording.imu_time_offset_s is None
         if check:
             _add_check(summary, recording)
     if as_json:
@@ -101,6 +102,8 @@ def _lines(summary: dict[str, Any]) -> list[tuple[str, str]]:
     if imu is not None:
         force, rate = imu["median_force_m_s2"], imu["largest_rate_rad_s"]
         lines += [("", f"median specific force {force:.2f} m/s², up to {rate:.2f} rad/s")]
+    if imu is not None and summary.get("is_checked") and "imu_clock" not in summary:
+        lines += [("", "clock offset not found: too few scans or turns to compare with; stamps are taken as they are")]
     if (clock := summary.get("imu_clock")) is not None:
         applied = "runs move the stamps by it" if clock["is_significant"] else "runs take the stamps as they are"
         lines += [("", f"clock offset {1e3 * clock['offset_s']:+.1f} ± {1e3 * clock['sigma_s']:.1f} ms, {applied}")]

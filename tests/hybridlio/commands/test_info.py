@@ -29,6 +29,8 @@ def test_a_bag_is_described_within_80_columns(bag: Path) -> None:
     for text in ("/points     sensor_msgs/PointCloud2", "6 scans in 0.5 s, 10.0 Hz", "x, y, z", "T_imu_lidar"):
         assert text in result.stdout
     assert "point times   none" in result.stdout
+    assert "clock offset not found: too few scans" in result.stdout  # of half a second
+    assert "clock offset" not in CliRunner().invoke(app, ["info", str(bag), "--no-check"]).stdout
 
 
 @pytest.mark.parametrize("kind", ["bag", "drive"])
