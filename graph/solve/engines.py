@@ -93,7 +93,10 @@ class Incremental:
         """See :class:`Engine`."""
         again = gtsam.ISAM2UpdateParams()
         again.force_relinearize = True
-        result = self.solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), again)
+        try:
+            result = self.solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), again)
+        except RuntimeError as error:
+            raise GraphError(f"the graph cannot be solved: {gtsam_message(error)}") from error
         return bool(result.getVariablesRelinearized())
 
     def restore(self, kept: Collection[int]) -> dict[int, int]:
@@ -139,7 +142,10 @@ class FixedLag:
 
     def iterate(self) -> bool:
         """See :class:`Engine`."""
-        self.solver.update()
+        try:
+            self.solver.update()
+        except RuntimeError as error:
+            raise GraphError(f"the graph cannot be solved: {gtsam_message(error)}") from error
         return bool(self.solver.getISAM2Result().getVariablesRelinearized())
 
     def restore(self, kept: Collection[int]) -> dict[int, int]:

@@ -183,3 +183,13 @@ def test_a_solution_refuses_unknown_keys_and_quantities():
     ]:
         with pytest.raises(GraphError, match=message):
             call()
+
+
+def test_a_heading_that_only_noise_determines_is_one_error_of_an_online_solver_too():
+    graph = PoseGraph(2)
+    graph.add_pose(0)
+    graph.add_factor(0, lambda P: P[:2, 3] - [18.0, 8.0], [0.1, 0.1])
+    for _ in range(2):
+        graph.add_gps(0, [17.99, 8.01], 0.1)
+    with pytest.raises(GraphError, match="cannot be solved|are free in"):
+        graph.optimize("incremental")
