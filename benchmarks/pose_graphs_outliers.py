@@ -15,8 +15,9 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.graph import PoseGraph
+from hybridlio.graph import OnlineSolver, PoseGraph
 from hybridlio.graph.model.coordinates import to_matrices
+from hybridlio.graph.model.measurements import Factor
 
 _GOOD_PERCENT = 1.0  # of the spread, from which a result counts as right
 
@@ -47,7 +48,26 @@ def _error(rng: np.random.Generator, covariance: Array) -> Array:
     return xi if len(xi) == 6 else np.r_[0, 0, xi, 0]
 
 
-def run(path: Path, share: float, group: int, seeds: range) -> None:
+def grown(graph: PoseGraph) -> OnlineSolver:
+    """Return a solver that tests outliers by ``gnc``, after the graph has grown pose by pose."""
+    order = {key: k for k, key in enumerate(graph.keys)}
+    complete: list[list[Factor]] = [[] for _ in order]
+    for factor in graph.factors.values():
+        complete[max(order[key] for key in factor.keys)].append(factor)
+    growing = PoseGraph(graph.dimension)
+    solver = growing.online(outliers="gnc")
+    for key, factors in zip(graph.keys, complete, strict=True):
+        growing.add_pose(key, graph.initial(key))
+        if key in graph.fixed:
+            growing.fix(key)
+        for factor in factors:
+            growing._data.add_factor(factor)
+        solver.update()
+    solver.update()
+    return solver
+
+
+def run(path: Path, share: float, group: int, seeds: range, online: bool) -> None:
     clean = PoseGraph.load(path).optimize().poses
     spread = np.sqrt(((clean[:, :3, 3] - clean[:, :3, 3].mean(axis=0)) ** 2).sum(axis=1).mean())
     errors, doubtful, spent_s = [], [], []
@@ -55,7 +75,7 @@ def run(path: Path, share: float, group: int, seeds: range) -> None:
         graph = PoseGraph.load(path)
         add_wrong_loops(graph, clean, share, group, seed)
         begin = time.process_time()
-        solution = graph.optimize("gnc")
+        solution = grown(graph) if online else graph.optimize("gnc")
         spent_s.append(time.process_time() - begin)
         rmse = np.sqrt(((solution.poses[:, :3, 3] - clean[:, :3, 3]) ** 2).sum(axis=1).mean())
         errors.append(100 * rmse / spread)
@@ -78,6 +98,7 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=0, help="of the runs (default: %(default)s)")
     parser.add_argument("--shares", type=float, nargs="+", default=[0.1, 0.3], help="of wrong loops")
     parser.add_argument("--groups", type=int, nargs="+", default=[1, 5], help="wrong loops that agree")
+    parser.add_argument("--online", action="store_true", help="pose by pose, by an online solver")
     options = parser.parse_args()
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     paths = [options.folder / f"{name}.g2o" for name in options.names] or sorted(options.folder.glob("*.g2o"))
@@ -88,7 +109,7 @@ def main() -> None:
     for path in paths:
         for share in options.shares:
             for group in options.groups:
-                run(path, share, group, seeds)
+                run(path, share, group, seeds, options.online)
 
 
 if __name__ == "__main__":
