@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import pickle
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -95,7 +96,9 @@ def load(path: str | os.PathLike[str]) -> Checkpoint:
     """
     path = Path(path)
     try:
-        values = torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():  # PyTorch's on a damaged file come before its error
+            warnings.simplefilter("ignore")
+            values = torch.load(path, map_location="cpu", weights_only=True)
         if values["format"] != FORMAT:
             raise DataError(f"{path}: format {values['format']}; this version reads format {FORMAT}")
         return Checkpoint(
