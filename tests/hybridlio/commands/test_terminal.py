@@ -7,7 +7,9 @@ from typing import Any
 
 import pytest
 from command_line import refused
+from rich.console import Console
 
+from hybridlio.commands import terminal
 from hybridlio.commands.terminal import print_message, print_result, print_table, progress
 from hybridlio.core.errors import strip_control
 from hybridlio.core.tables import for_terminal
@@ -45,6 +47,7 @@ TABLE = "choose a topic:\n  /points  100\n  /imu     10"
 def test_on_a_terminal_nothing_wraps_inside_a_word(
     show: Any, width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.setattr(terminal, "_stderr", lambda: Console(stderr=True))  # the one console reads the colours once
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("COLUMNS", str(width))
     text = f"error: {'a-well-known word ' * 30}/{'long-path' * 20}/x: {TABLE}"
