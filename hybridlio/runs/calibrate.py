@@ -33,7 +33,7 @@ from hybridlio.graph.run.smooth import smooth
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.odometry import Odometry
 from hybridlio.runs.recording_check import compare_imu
-from hybridlio.runs.run import run_odometry
+from hybridlio.runs.run import Run, run_odometry
 from hybridlio.runs.scale_search import ScaleSearch
 from hybridlio.smoothing.calibration import IMU_SCALE, OF_GPS, OF_IMU, Calibrated, CalibrationPriors, Parameter
 
@@ -41,6 +41,7 @@ _NEWEST = 3  # rounds that give the slope: earlier ones had another mounting
 _MOST_ROUNDS = 6  # one of them beside the others, for the share of an error that a round shows
 # Two rounds are to follow. Where the share is small the clock creeps, and would not settle before without it.
 _LAST_PROBE = _MOST_ROUNDS - 2
+_SCALE_ROUNDS = 3  # the first leaves a tenth of an error, the second what the path's noise allows
 _SETTLED = 0.5  # stated standard deviations by which a round may still change a parameter and be the last
 _LEAST_SHARE = 0.1  # of a clock's error that a round shows: less cannot be told from noise
 # Beside the clock that a round found: ten times its usual standard deviation, so that the slope is known to a tenth,
@@ -80,9 +81,11 @@ def calibrate(
     priors.check_sensors(has_imu=len(sequence.imu) > 0, has_gps=len(sequence.gps) > 0)
     if len(sequence) < _LEAST_SCANS:
         raise DataError(f"{sequence.name}: {len(sequence)} scans; calibration needs {_LEAST_SCANS} or more")
-    search = _Search(sequence, priors, config or Config(), progress or _silent, ScaleSearch() if with_scale else None)
+    search = _Search(sequence, priors, config or Config(), progress or _silent)
     search.start()
-    for number in range(1, _MOST_ROUNDS + 1):
+    if with_scale:
+        search.find_scale()
+    for number in range(1, _MOST_ROUNDS + 1 if priors.names else 1):
         if search.round(number):
             break
     return search.result()
@@ -98,14 +101,7 @@ def _priors(names: Items[str]) -> CalibrationPriors:
 class _Search:
     """The search, with the recording at the calibration that was found last."""
 
-    def __init__(
-        self,
-        sequence: Sequence,
-        priors: CalibrationPriors,
-        config: Config,
-        report: Progress,
-        scale: ScaleSearch | None = None,
-    ) -> None:
+    def __init__(self, sequence: Sequence, priors: CalibrationPriors, config: Config, report: Progress) -> None:
         self._stated, self._now = sequence.calibration, sequence
         self._priors, self._config, self._report = priors, config, report
         self._stated_offset_s = sequence.imu_time_offset_s or 0.0  # the reader has applied it, and the scale
@@ -115,7 +111,7 @@ class _Search:
         self._best_s = 0.0  # the clock that the rounds so far mean
         self._share = 1.0  # of a clock's error that a round shows
         self._found: Calibrated | None = None
-        self._scale = scale
+        self._scale: ScaleSearch | None = None
 
     def start(self) -> None:
         """Correct units, and take the clocks' offset from the check of recordings, which costs a part of a round.
@@ -135,15 +131,30 @@ class _Search:
             self._move(offset.offset_s)
         self._best_s = self._offset_s
 
+    def find_scale(self) -> None:
+        """Find the IMU's scale, before the graph compares samples with scans: a wrong one contradicts them.
+
+        The matrices also turn the IMU's axes into those of the stated extrinsics, so that what the extrinsics' rotation
+        is wrong by is found here.
+        """
+        self._scale = ScaleSearch()
+        for number in range(1, _SCALE_ROUNDS + 1):
+
+            def odometry(text: str, done: int, total: int, number: int = number) -> None:
+                self._report(f"scale, round {number}: {text}", done, total)
+
+            path = self._run(odometry).odometry.record().online
+            self._now = replace(self._now, imu=self._scale.correct(path, self._now))
+            if self._scale.is_settled:
+                break
+
     def round(self, number: int) -> bool:
         """Run odometry and smoothing once; return whether the calibration has settled."""
 
         def odometry(text: str, done: int, total: int) -> None:
             self._report(f"odometry, round {number}: {text}", done, total)
 
-        run = run_odometry(self._now, Odometry(config=self._config), odometry)
-        if run.stopped is not None:
-            raise run.stopped
+        run = self._run(odometry)
         uses_gps = bool(set(self._priors.names) & set(OF_GPS))
         # a run that trusts the IMU less does so for the wrong calibration, which here is a variable
         record = replace(run.odometry.record(), imu_noise=self._config.imu_noise or self._now.imu_noise or ImuNoise())
@@ -163,13 +174,16 @@ class _Search:
             sigmas["time_offset"] = sigmas["time_offset"] / self._share
         self._found = replace(found, parameters=tuple(self._against_stated(one, moves) for one in found.parameters))
         settled = all(bool((np.abs(move) <= _SETTLED * sigmas[name]).all()) for name, move in moves.items())
-        if self._scale is not None:
-            self._now = replace(self._now, imu=self._scale.correct(record.online, self._now))
-            settled = settled and self._scale.is_settled
         if not is_probed and (settled or number == _LAST_PROBE) and number <= _LAST_PROBE:
             self._move(_PROBE_S)
             return False
         return settled and is_probed
+
+    def _run(self, report: Progress) -> Run:
+        run = run_odometry(self._now, Odometry(config=self._config), report)
+        if run.stopped is not None:
+            raise run.stopped
+        return run
 
     def _take_clock(self, found_s: float, sigma_s: float) -> bool:
         """Move to the clock that a round's finding means; return whether rounds at different clocks show its share."""
@@ -190,8 +204,8 @@ class _Search:
 
     def result(self) -> Calibrated:
         """Return what the last round found."""
-        assert self._found is not None
-        found = replace(self._found, imu_time_offset_s=self._stated_offset_s + self._offset_s)
+        found = self._found or Calibrated(self._stated, 0.0, 0.0, ())
+        found = replace(found, imu_time_offset_s=self._stated_offset_s + self._offset_s)
         return found if self._scale is None else self._scale.added_to(found, self._stated_scale)
 
     def _move(self, seconds: float) -> None:

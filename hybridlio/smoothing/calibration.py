@@ -140,6 +140,9 @@ class Parameter(Estimated):
         """What is not known, or None."""
         if self.is_determined:
             return None
+        if len(self.change) == len(_AXES[9]):  # a matrix, whose elements have priors of their own
+            elements = ", ".join(map(_direction, self.undetermined))
+            return f"{self.name}: the motion hardly shows {elements}; known little better than from a data sheet"
         if len(self.undetermined) == len(self.change):
             return f"{self.name}: the motion does not determine it; it stays as stated"
         along = " and ".join(map(_direction, self.undetermined))

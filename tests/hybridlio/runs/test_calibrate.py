@@ -10,6 +10,7 @@ import pytest
 import hybridlio as hl
 from hybridlio.core import se3
 from hybridlio.core.errors import ConfigError, DataError
+from hybridlio.core.imu_scale import ImuScale
 from hybridlio.core.sensors import ImuSamples
 from hybridlio.datasets.calibration_yaml import read_calibration_yaml
 from hybridlio.datasets.sequence import Sequence
@@ -80,3 +81,15 @@ def test_a_round_that_shows_a_share_of_the_clocks_error_is_divided_by_it(wrong: 
     assert search._share == pytest.approx(share, rel=0.01)
     assert search._offset_s == pytest.approx(true_s, abs=1e-8)
     assert search._widened(found).sigmas[0] == pytest.approx(sigma_s / share, rel=0.01)
+
+
+def test_the_scale_alone_is_found_without_a_graph():
+    """25 s of a walk: what is left of 1.5 % is a tenth, and the extrinsics stay as stated."""
+    rng = np.random.default_rng(5)
+    walk = handheld.carried(rng, seconds=25.0)
+    scale = ImuScale(np.diag([1.015, 0.985, 1.015]))
+    sequence = handheld.as_sequence(rng, walk, scale.corrected(walk.imu))
+    found = hl.calibrate(sequence, ("imu_scale",))
+    assert np.abs(found.imu_scale.gyro - np.linalg.inv(scale.gyro)).max() < 4e-3
+    np.testing.assert_array_equal(found.calibration.T_imu_lidar, handheld.MOUNTING)
+    assert [one.name for one in found.parameters] == ["gyro_scale", "accel_scale"]

@@ -15,7 +15,7 @@ from hybridlio.core.sensors import Calibration
 from hybridlio.datasets.calibration_yaml import read_calibration_yaml
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.runs.scale_search import ScaleSearch
-from hybridlio.smoothing.calibration import Calibrated
+from hybridlio.smoothing.calibration import Calibrated, Parameter, undetermined_elements
 
 WRONG = ImuScale(np.eye(3) + 0.01 * np.array([[1.5, 0, 0.5], [0, -1.5, 0], [0, 0.5, 1]]))
 
@@ -52,3 +52,10 @@ def test_a_recording_that_is_too_short_is_named(walk: handheld.Handheld, sequenc
     short = type(path)(path.stamps_ns[:50], path.poses[:50])
     with pytest.raises(DataError, match="walk: too short to find the IMU's scale"):
         ScaleSearch().correct(short, sequence)
+
+
+def test_elements_that_the_motion_hardly_shows_are_named():
+    covariance = np.diag(np.r_[1e-4, np.full(8, 1e-8)])
+    undetermined = undetermined_elements(covariance, np.full(9, 0.01))
+    found = Parameter("gyro_scale", np.zeros(9), covariance, 0.01, undetermined)
+    assert found.doubt == "gyro_scale: the motion hardly shows xx; known little better than from a data sheet"
