@@ -29,6 +29,7 @@ from hybridlio.learned.setting_values import from_dict
 FORMAT = 1  # raise by 1 when the files of a shard change
 _STEP_M = 0.004  # a fifth of an HDL-64E's range noise; int16 then reaches 131 m, beyond the range limit of 120 m
 _LIMIT_M = 32767 * _STEP_M  # largest int16
+_LARGEST = 1e6  # of any value of a step in SI units; sensors and steps stay thousands of times below it
 _STEPS = ("imu", "imu_there", "dt_s", "velocity_m_s", "initial", "reference", "usable")
 
 
@@ -230,6 +231,8 @@ class Shard:
             raise DataError(
                 f"{path}: {values.dtype} of shape {values.shape} for {self.info.scans} scans; prepare the shard again"
             )
+        if values.dtype.kind == "f" and (np.abs(values[np.isfinite(values)]) > _LARGEST).any():
+            raise DataError(f"{path}: a value over {_LARGEST:g}; the file is damaged, prepare the shard again")
         return values
 
     def _raw(self, name: str, dtype: type[np.generic], shape: tuple[int, ...]) -> NDArray[Any]:

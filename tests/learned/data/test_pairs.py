@@ -180,3 +180,14 @@ def test_a_scan_that_cannot_be_read_stays_as_one_that_is_not_usable(tiny_drive, 
     shard = Shard(tmp_path / "s")
     assert shard.usable.tolist() == [True, False, True, True]
     assert len(Pairs([shard], SETTINGS)) == 1
+
+
+@pytest.mark.parametrize("name", ["reference", "initial", "velocity_m_s", "dt_s", "imu"])
+def test_values_that_no_sensor_gives_are_named_before_they_overflow(tmp_path, name: str):
+    shard_of(tmp_path, [record(k) for k in range(3)])
+    path = tmp_path / "shard" / f"{name}.npy"
+    values = np.load(path)
+    values.flat[-1] = 1e37
+    np.save(path, values)
+    with pytest.raises(DataError, match=rf"{name}\.npy: a value over 1e\+06"):
+        Shard(tmp_path / "shard")
