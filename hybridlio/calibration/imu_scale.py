@@ -84,9 +84,12 @@ def find_imu_scale(path: Trajectory, imu: ImuSamples, T_imu_lidar: Array) -> Fou
     Returns:
         The scale with its covariance; None where the path has fewer than 20 windows with samples.
     """
-    if len(imu) < 2 or len(path) < 2:
+    if len(path) < 2:
         return None
     path = _first_part(path)
+    imu = imu.between(int(path.stamps_ns[0]), int(path.stamps_ns[-1]))
+    if len(imu) < 2:
+        return None
     poses = path.poses @ se3.inverse(T_imu_lidar)
     times_s, samples_s = ((stamps - path.stamps_ns[0]) / NS_PER_S for stamps in (path.stamps_ns, imu.stamps_ns))
     gyro = _fit_gyro(times_s, poses[:, :3, :3], imu, int(path.stamps_ns[0]))
