@@ -24,7 +24,7 @@ help:
 	@echo 'make lint     ruff: rules and format        make format   apply both'
 	@echo 'make types    mypy, strict, on all packages'
 	@echo 'make docs     build the documentation into site/, strictly'
-	@echo 'make soak     kill six commands at random moments and compare their results, and use graphs at random   (KILLS=60 STEPS=600000 SOAK=soak)'
+	@echo 'make soak     kill seven commands at random moments and compare their results, and use graphs at random   (KILLS=60 STEPS=600000 SOAK=soak)'
 	@echo 'make audit    known vulnerabilities and licences of the dependencies'
 	@echo 'make clean    remove the environment and everything that was built'
 
