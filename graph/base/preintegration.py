@@ -98,7 +98,7 @@ def _integrate(pim: Any, imu: ImuSamples, state: State) -> None:
     gyro = (imu.gyro_rad_s[1:] + imu.gyro_rad_s[:-1]) / 2
     # GTSAM takes the specific force in the sensor's frame at the start of the step (Euler integration); the second
     # sample is measured at its end, so it is rotated back by the turn in between before the mean is taken
-    turned = se3.so3_exp((gyro - state.gyro_bias_rad_s) * steps_s[:, None])
+    turned = se3.so3_exp(imu.turns(state.gyro_bias_rad_s))
     accel = (imu.accel_m_s2[:-1] + (turned @ imu.accel_m_s2[1:, :, None])[..., 0]) / 2
     for step_s, a, w in zip(steps_s, accel, gyro, strict=True):
         pim.integrateMeasurement(a, w, step_s)
@@ -144,30 +144,31 @@ def predict_step(pim: gtsam.PreintegratedCombinedMeasurements, state: State) -> 
 
     The covariance propagates the state's (velocity, tilt, biases, gravity) and the noise of the samples.
     """
-    then, J = _after(pim, _navigation(state), state)
+    then, J = navigation_after(pim, navigation_of(state), gtsam_bias(state))
     return _step(state, then, J, pim.preintMeasCov(), pim.deltaTij())
 
 
 def predict_in_parts(imu: ImuSamples, state: State, noise: ImuNoise) -> tuple[Array, Array]:
     """Return what :func:`predict_step` does for samples of any turn: parts of a quarter turn, one after the other."""
-    then, J, added = _navigation(state), np.eye(15), np.zeros((15, 15))
+    then, J, added = navigation_of(state), np.eye(15), np.zeros((15, 15))
     for part in _parts(imu, state):
         pim = preintegrate(part, state, noise)
-        then, by_part = _after(pim, then, state)
+        then, by_part = navigation_after(pim, then, gtsam_bias(state))
         J, added = by_part @ J, by_part @ added @ by_part.T + pim.preintMeasCov()
     return _step(state, then, J, added, float(imu.stamps_ns[-1] - imu.stamps_ns[0]) / NS_PER_S)
 
 
-def _navigation(state: State) -> gtsam.NavState:
+def navigation_of(state: State) -> gtsam.NavState:
+    """Return pose and velocity as GTSAM's type."""
     return gtsam.NavState(gtsam.Pose3(state.T_world_imu), state.velocity_m_s)
 
 
-def _after(
-    pim: gtsam.PreintegratedCombinedMeasurements, before: gtsam.NavState, state: State
+def navigation_after(
+    pim: gtsam.PreintegratedCombinedMeasurements, before: gtsam.NavState, bias: gtsam.imuBias.ConstantBias
 ) -> tuple[gtsam.NavState, Array]:
     """Return the navigation state after samples, and its derivatives ``(15, 15)`` by that before and by the biases."""
     by_state, by_bias = np.zeros((9, 9), order="F"), np.zeros((9, 6), order="F")
-    then = pim.predict(before, gtsam_bias(state), by_state, by_bias)
+    then = pim.predict(before, bias, by_state, by_bias)
     J = np.eye(15)
     J[:9, :9], J[:9, 9:] = by_state, by_bias
     return then, J

@@ -12,7 +12,7 @@ import numpy as np
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import State
 from hybridlio.core.sensors import NS_PER_S, ImuNoise
-from hybridlio.graph.base.preintegration import gtsam_bias, preintegration_params
+from hybridlio.graph.base.preintegration import gtsam_bias, navigation_after, navigation_of, preintegration_params
 
 Values = Sequence[float]
 
@@ -29,7 +29,7 @@ class InertialPrediction:
         self.stamp_ns = state.stamp_ns  # of the last sample that was integrated
         self._state, self._noise, self._bias = state, noise, gtsam_bias(state)
         self._params: dict[float, gtsam.PreintegrationCombinedParams] = {}
-        self._nav = gtsam.NavState(gtsam.Pose3(state.T_world_imu), state.velocity_m_s)
+        self._nav = navigation_of(state)
         # GTSAM perturbs a NavState's velocity in the body frame; the state's covariance is of the velocity in world
         to_body = np.eye(15)
         to_body[6:9, 6:9] = state.T_world_imu[:3, :3].T
@@ -73,10 +73,7 @@ class InertialPrediction:
             gyro = (before[:3] + after[:3]) / 2
             turned = gtsam.Rot3.Expmap((gyro - self._state.gyro_bias_rad_s) * step_s).rotate(after[3:])
             pim.integrateMeasurement((before[3:] + turned) / 2, gyro, step_s)
-        by_state, by_bias = np.zeros((9, 9), order="F"), np.zeros((9, 6), order="F")
-        nav = pim.predict(self._nav, self._bias, by_state, by_bias)
-        J = np.eye(15)
-        J[:9, :9], J[:9, 9:] = by_state, by_bias
+        nav, J = navigation_after(pim, self._nav, self._bias)
         return nav, J @ self._covariance @ J.T + pim.preintMeasCov()
 
     def _params_for(self, longest_s: float) -> gtsam.PreintegrationCombinedParams:

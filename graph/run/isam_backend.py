@@ -12,7 +12,7 @@ from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.sensors import NS_PER_S, Frame
 from hybridlio.graph.base.isam import gtsam_message, incremental_solver, relinearising_solver
 from hybridlio.graph.base.marginals import step_covariance
-from hybridlio.graph.base.preintegration import gtsam_bias
+from hybridlio.graph.base.preintegration import gtsam_bias, navigation_of
 from hybridlio.graph.run import factors
 from hybridlio.graph.run.inertial_steps import InertialSteps
 from hybridlio.graph.run.scan_numbers import ScanNumbers
@@ -96,7 +96,7 @@ class IncrementalBackend:
         """Initial values of the new variables: from the relative pose, or from the IMU where that failed."""
         state, stamp_ns = self._state, frame.scan.stamp_ns
         if pim is not None and not relative.ok:
-            then = pim.predict(gtsam.NavState(gtsam.Pose3(state.T_world_imu), state.velocity_m_s), gtsam_bias(state))
+            then = pim.predict(navigation_of(state), gtsam_bias(state))
             T_world_imu, velocity = then.pose().matrix(), then.velocity()
         else:
             T_world_imu = state.T_world_imu @ self._T_imu_lidar @ relative.pose @ self._T_lidar_imu

@@ -34,7 +34,7 @@ from hybridlio.odometry.config import Config
 from hybridlio.odometry.odometry import Odometry
 from hybridlio.runs.recording_check import compare_imu
 from hybridlio.runs.run import Run, run_odometry
-from hybridlio.runs.scale_search import ScaleSearch
+from hybridlio.runs.scale_search import SETTLED_SIGMAS, ScaleSearch
 from hybridlio.smoothing.calibration import IMU_SCALE, OF_GPS, OF_IMU, Calibrated, CalibrationPriors, Parameter
 
 _NEWEST = 3  # rounds that give the slope: earlier ones had another mounting
@@ -42,7 +42,6 @@ _MOST_ROUNDS = 6  # one of them beside the others, for the share of an error tha
 # Two rounds are to follow. Where the share is small the clock creeps, and would not settle before without it.
 _LAST_PROBE = _MOST_ROUNDS - 2
 _SCALE_ROUNDS = 3  # the first leaves a tenth of an error, the second what the path's noise allows
-_SETTLED = 0.5  # stated standard deviations by which a round may still change a parameter and be the last
 _LEAST_SHARE = 0.1  # of a clock's error that a round shows: less cannot be told from noise
 # Beside the clock that a round found: ten times its usual standard deviation, so that the slope is known to a tenth,
 # and a twentieth of the time between two scans, over which motion hardly changes.
@@ -173,7 +172,7 @@ class _Search:
             found = replace(found, parameters=tuple(map(self._widened, found.parameters)))
             sigmas["time_offset"] = sigmas["time_offset"] / self._share
         self._found = replace(found, parameters=tuple(self._against_stated(one, moves) for one in found.parameters))
-        settled = all(bool((np.abs(move) <= _SETTLED * sigmas[name]).all()) for name, move in moves.items())
+        settled = all(bool((np.abs(move) <= SETTLED_SIGMAS * sigmas[name]).all()) for name, move in moves.items())
         if not is_probed and (settled or number == _LAST_PROBE) and number <= _LAST_PROBE:
             self._move(_PROBE_S)
             return False

@@ -14,7 +14,7 @@ from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.smoothing.calibration import Calibrated, Parameter, undetermined_elements
 
-_SETTLED = 0.5  # standard deviations by which a round may still change an element and be the last
+SETTLED_SIGMAS = 0.5  # by which a round may still change a component and be the last
 
 
 class ScaleSearch:
@@ -31,7 +31,7 @@ class ScaleSearch:
             return False
         changes = (self._newest.scale.gyro - np.eye(3), self._newest.scale.accel - np.eye(3))
         pairs = zip(changes, self._newest.sigmas, strict=True)
-        return all(bool((np.abs(change) <= _SETTLED * sigmas).all()) for change, sigmas in pairs)
+        return all(bool((np.abs(change) <= SETTLED_SIGMAS * sigmas).all()) for change, sigmas in pairs)
 
     def correct(self, path: Trajectory, sequence: Sequence) -> ImuSamples:
         """Return the samples of a recording, corrected by what a path through it shows.

@@ -72,7 +72,7 @@ def _numbers(rows: list[str]) -> NDArray[Any]:
 
 
 def _names(heads: list[str], count: int) -> list[str] | None:
-    """Return the names of ``count`` columns, from the last line that has so many and names x, y and z."""
+    """Return the names of ``count`` columns, from the last line with that number that names x, y and z."""
     for head in reversed(heads):
         parts = re.split(r"[\s,;]+" if _separator(head) is None else rf"\s*{_separator(head)}\s*", head.lstrip("#/ "))
         names = [part.strip(' "').lower() for part in parts if part.strip(' "')]
