@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hybridlio.commands.common import Verbose, guarded
+from hybridlio.commands.common import Overwrite, Verbose, guarded
 from hybridlio.commands.shared.gps_options import Antenna, MaxShift, gps_options
 from hybridlio.commands.terminal import print_result, print_warning
 from hybridlio.core.errors import ConfigError, DataError
@@ -38,17 +38,20 @@ def georeference(
     ] = None,
     antenna: Antenna = None,
     max_shift: MaxShift = None,
+    overwrite: Overwrite = False,
     _verbosity: Verbose = 0,
 ) -> None:
     """Align a run with its GPS fixes by one rigid motion; write it as CSV, GeoJSON and TUM."""
-    from hybridlio.datasets.protection import check_output
+    from hybridlio.datasets.protection import check_new_file, check_output
     from hybridlio.record.record import Record
     from hybridlio.runs.folder import RECORD, read_run
+    from hybridlio.smoothing.georeference import FILES, write_georeferenced
     from hybridlio.smoothing.georeference import georeference as place
-    from hybridlio.smoothing.georeference import write_georeferenced
 
     folder = run if out is None else out
     check_output(folder)
+    for name in FILES:
+        check_new_file(folder / name, overwrite)
     stored = read_run(run)
     path = next((p for p in (run / RECORD, run.parent / RECORD) if p.is_file()), None)
     if path is None:
@@ -66,8 +69,11 @@ def georeference(
         f"{stored.metrics['sequence']}: {int(fit.inliers.sum())} of {len(fit.used)} fixes are inliers, "
         f"{fit.rmse_m:.2f} m RMSE, clock offset {1e3 * fit.shift_s:.0f} ± {1e3 * fit.shift_sigma_s:.0f} ms"
     )
-    for written in write_georeferenced(folder, placed):
-        print_result(f"wrote   {written}")
+    written = write_georeferenced(folder, placed)
+    for stale in {folder / name for name in FILES} - set(written):
+        stale.unlink(missing_ok=True)  # of an alignment whose origin was known
+    for path in written:
+        print_result(f"wrote   {path}")
     if placed.origin is None:
         print_warning("the fixes have no geodetic origin; give --origin to get latitudes and longitudes")
 

@@ -93,7 +93,7 @@ def open_folder(
     else:
         notes.add(f"no inertial data: {folder / 'imu.csv'} does not exist")
     note_coverage(imu.stamps_ns, stamps, "inertial data", notes)
-    gps = read_gps_csv(folder / "gps.csv")
+    gps = read_gps_csv(folder / "gps.csv", notes)
     note_fixes(gps, stamps, notes)
     files = open_point_files(scans.paths, stamps, notes, stated.layout, stated.format)
     load = _with_others(raised(files, vertical_angle_deg), folder, scans, stated, vertical_angle_deg, notes)

@@ -13,13 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hybridlio.datasets.csv_times import ColumnError, TimeColumn, plain_name, time_column
+
 STANDARD_GRAVITY_M_S2 = 9.80665  # the unit g, by definition; not the gravity of a place
 
 _GYRO = "gyroscope|gyro|gyr|angularvelocity|angvel|angularrate|rotationrate|omega|wrss|w|g"
 _ACCEL = "linearacceleration|linacc|acceleration|accelerometer|accel|acc|specificforce|arss|a"
 _AXIS = re.compile(rf"(?P<gyro>{_GYRO})(?P<axis>[xyz])|(?P<accel>{_ACCEL})(?P<axis2>[xyz])")
 _UNIT = re.compile(r"(.*?)\s*(?:[\[(]([^\])]*)[\])]|_(rad_s|deg_s|dps|mdps|mrad_s|m_s2|g|mg))")
-_TIME_UNIT = re.compile(r"(.*?)\s*(?:[\[(]([^\])]*)[\])]|_(s|sec|ms|us|ns|nsec))")
 _RATES = {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": np.pi / 180, "mdeg/s": np.pi / 180_000}
 _FORCES = {"m/s2": 1.0, "g": STANDARD_GRAVITY_M_S2, "mg": STANDARD_GRAVITY_M_S2 * 1e-3}
 _SAME = {
@@ -27,13 +28,6 @@ _SAME = {
     **{"dps": "deg/s", "deg/sec": "deg/s", "degs-1": "deg/s", "mdps": "mdeg/s", "m_s2": "m/s2", "ms-2": "m/s2"},
     **{"m/s/s": "m/s2", "m/sec2": "m/s2", "g's": "g", "gs": "g"},
 }
-_TIMES = ("stamp", "headerstamp", "t", "time", "timestamp", "stamps", "timestamps")
-_TIME_UNITS = {"s": 10**9, "sec": 10**9, "ms": 10**6, "us": 1000, "µs": 1000, "ns": 1, "nsec": 1}
-_PAIRS = (("secs", "nsecs"), ("sec", "nsec"), ("sec", "nanosec"), ("seconds", "nanoseconds"))
-
-
-class ColumnError(ValueError):
-    """A header that lacks a column, or names an unknown unit; the message says which."""
 
 
 @dataclass(frozen=True)
@@ -41,15 +35,11 @@ class ImuColumns:
     """Where the values are in a row.
 
     Attributes:
-        time: column of the time; for a pair of seconds and nanoseconds, of the seconds.
-        time_unit_ns: nanoseconds of its unit; None if the header does not say.
-        nanoseconds: column of the nanoseconds of a pair, or None.
+        time: of the samples.
         values: for gx gy gz ax ay az the column and the factor to rad/s or m/s²; None if the header gives no unit.
     """
 
-    time: int
-    time_unit_ns: int | None
-    nanoseconds: int | None
+    time: TimeColumn
     values: tuple[tuple[int, float | None], ...]
 
 
@@ -70,25 +60,19 @@ def imu_columns(header: Sequence[str]) -> ImuColumns:
     lacking = [kind + axis for kind in "ga" for axis in "xyz" if kind + axis not in found]
     if lacking:
         raise ColumnError(f"lacks {', '.join(lacking)}")
-    time, unit_ns, nanoseconds = _time(header)
-    return ImuColumns(time, unit_ns, nanoseconds, tuple(found[kind + axis] for kind in "ga" for axis in "xyz"))
+    return ImuColumns(time_column(header), tuple(found[kind + axis] for kind in "ga" for axis in "xyz"))
 
 
 def _is_linear(name: str) -> bool:
     """Return whether a column is of a linear acceleration, which beside another one is that without gravity."""
-    return _plain(name).startswith("lin")
-
-
-def _plain(name: str) -> str:
-    """Return a name in lower case, without separators and the prefix of exported ROS messages."""
-    return re.sub(r"[\s._%\-]", "", name.lower().removeprefix("field."))
+    return plain_name(name).startswith("lin")
 
 
 def _axis(name: str) -> tuple[str, float | None] | None:
     """Return which of gx gy gz ax ay az a column is, and its factor; None for another column."""
     parts = _UNIT.fullmatch(name.lower())
     base, unit = (parts[1], parts[2] or parts[3]) if parts else (name, None)
-    match = _AXIS.fullmatch(_plain(base))
+    match = _AXIS.fullmatch(plain_name(base))
     if match is None:
         return None
     kind, units = ("g", _RATES) if match["gyro"] else ("a", _FORCES)
@@ -99,21 +83,3 @@ def _axis(name: str) -> tuple[str, float | None] | None:
     if plain not in units:
         raise ColumnError(f"has the unknown unit '{unit}' in '{name}'; known: {', '.join(units)}")
     return kind + match["axis" if kind == "g" else "axis2"], units[plain]
-
-
-def _time(header: Sequence[str]) -> tuple[int, int | None, int | None]:
-    plain = [_plain(name) for name in header]
-    for seconds, nanoseconds in _PAIRS:
-        for column, name in enumerate(plain):
-            partner = name.removesuffix(seconds) + nanoseconds
-            if name.endswith(seconds) and partner in plain:
-                return column, 10**9, plain.index(partner)
-    for wanted in _TIMES:
-        for column, name in enumerate(header):
-            parts = _TIME_UNIT.fullmatch(name.lower())
-            base, unit = (parts[1], parts[2] or parts[3]) if parts else (name, None)
-            if _plain(base) == wanted:
-                if unit is not None and unit.strip() not in _TIME_UNITS:
-                    raise ColumnError(f"has the unknown unit '{unit}' in '{name}'; known: {', '.join(_TIME_UNITS)}")
-                return column, None if unit is None else _TIME_UNITS[unit.strip()], None
-    raise ColumnError("lacks a time such as stamp_ns or t_s")

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from decimal import Decimal, InvalidOperation
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from hybridlio.core.arrays import Array, Stamps
 from hybridlio.core.errors import DataError
-from hybridlio.core.sensors import NS_PER_S, ImuSamples
+from hybridlio.core.sensors import ImuSamples
 from hybridlio.datasets.csv_rows import read_csv
-from hybridlio.datasets.imu_columns import STANDARD_GRAVITY_M_S2, ColumnError, ImuColumns, imu_columns
+from hybridlio.datasets.csv_times import ColumnError
+from hybridlio.datasets.imu_columns import STANDARD_GRAVITY_M_S2, ImuColumns, imu_columns
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.stamps import IMU_GAP_FACTOR, note_gaps, sorted_unique
 
@@ -26,7 +26,6 @@ _EXPECTED = (
     "a time (stamp_ns, t_s, timestamp …), gx gy gz (rad/s; or gx_deg_s …) and ax ay az (m/s²; or ax_g …), or the names "
     "of ROS or EuRoC"
 )
-_TIME_UNITS = {"ns": 1, "us": 1000, "ms": 1_000_000, "s": NS_PER_S}
 
 
 def read_imu_csv(path: Path, notes: Notes) -> ImuSamples:
@@ -55,47 +54,12 @@ def read_imu_csv(path: Path, notes: Notes) -> ImuSamples:
     values = np.empty((len(rows), 6))
     for k, (line, row) in enumerate(rows):
         try:
-            times.append(_time(row, columns))
+            times.append(columns.time.read(row))
             values[k] = [float(row[column]) * (scale or 1.0) for column, scale in columns.values]
         except (ValueError, InvalidOperation, OverflowError):
             raise DataError(f"{path}, line {line}: expected numbers, found {','.join(row)[:80]}") from None
-    stamps = _stamps(path, times, columns, header, notes)
+    stamps = columns.time.stamps(times, _STEPS_NS, "samples", str(path), notes)
     return clean_imu(str(path), stamps, _in_si_units(path, values, columns, notes), notes)
-
-
-def _time(row: list[str], columns: ImuColumns) -> int | Decimal:
-    """Return a row's time: an integer for nanoseconds, else decimal in the header's unit, both exact."""
-    text = row[columns.time].strip()
-    if columns.nanoseconds is not None:
-        return int(text) * NS_PER_S + int(row[columns.nanoseconds])
-    if columns.time_unit_ns == 1:
-        return int(text)
-    value = Decimal(text)
-    if not value.is_finite():
-        raise ValueError(text)
-    return value
-
-
-def _stamps(path: Path, times: list[int | Decimal], columns: ImuColumns, header: list[str], notes: Notes) -> Stamps:
-    """Return the stamps in nanoseconds; without a unit in the header, that in which samples are usually spaced."""
-    unit_ns = 1 if columns.nanoseconds is not None else columns.time_unit_ns
-    if unit_ns is None:
-        steps = [float(abs(Decimal(b) - Decimal(a))) for a, b in pairwise(times) if a != b]
-        step = float(np.median(steps)) if steps else 0.0
-        fitting = [unit for unit, ns in _TIME_UNITS.items() if _STEPS_NS[0] <= step * ns <= _STEPS_NS[1]]
-        if times and len(fitting) != 1:
-            name = header[columns.time]
-            raise DataError(
-                f"{path}: the unit of '{name}' cannot be told, samples are {step:g} apart; name the column {name}_s, "
-                f"{name}_ms, {name}_us or {name}_ns"
-            )
-        if times:
-            unit_ns = _TIME_UNITS[fitting[0]]
-            notes.found(f"{path}: '{header[columns.time]}' is read in {fitting[0]}, samples are {step:g} apart")
-    try:
-        return np.array([round(time * (unit_ns or 1)) for time in times], dtype=np.int64)
-    except OverflowError:
-        raise DataError(f"{path}: a time is beyond the range of int64 nanoseconds; check its unit") from None
 
 
 @np.errstate(over="ignore")  # damaged files hold any number

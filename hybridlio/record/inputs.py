@@ -88,7 +88,7 @@ def record_of(odometry: Odometry, inputs: OdometryInputs, with_keyframes: bool =
     imu = None if imu is None else stated.imu_scale.corrected(imu)
     poses = poses_of(cast("Any", odometry), inputs.get("stamps"), stated.calibration.T_camera_lidar)
     record = Record.from_odometry(
-        poses, imu, fixes_of(inputs.get("fixes")), stated.calibration,
+        poses, imu, fixes_of(inputs.get("fixes"), notes), stated.calibration,
         inputs.get("imu_noise", stated.imu_noise), inputs.get("covariances"),
         inputs.get("imu_time_offset_s", stated.imu_time_offset_s),
     )  # fmt: skip
@@ -184,14 +184,17 @@ def _imu(source: Any, notes: list[str]) -> ImuSamples | None:
     return measured
 
 
-def fixes_of(source: Any) -> tuple[GpsFix, ...]:
-    """Return fixes from a file, fixes, or rows; see :class:`OdometryInputs`."""
+def fixes_of(source: Any, notes: list[str]) -> tuple[GpsFix, ...]:
+    """Return fixes from a file, fixes, or rows, see :class:`OdometryInputs`; notes on a file are added to ``notes``."""
     if source is None:
         return ()
     if isinstance(source, str | os.PathLike):
         if not Path(source).is_file():
             raise DataError(f"{source}: no such file of GPS fixes")
-        return read_gps_csv(Path(source))
+        found = Notes(Path(source).name)
+        fixes = read_gps_csv(Path(source), found)
+        notes.extend(found.texts)
+        return fixes
     if isinstance(source, Sequence) and all(isinstance(fix, GpsFix) for fix in source):
         return tuple(source)
     rows = _rows(source, 5, "fixes", "t_s, east, north, up, sigma_m")

@@ -37,8 +37,8 @@ _PRECISE_S = 3e-4  # standard deviation with which 1 ms is exceeded once in 1,00
 def check_recording(sequence: Sequence, progress: Progress | None = None) -> Sequence:
     """Return a sequence whose IMU has been compared with its scans: stamps and units corrected, and notes added.
 
-    It is returned as it is if ``imu_time_offset_s`` of its calibration states the clocks' offset, without IMU samples,
-    and if fewer than 60 scans can be used.
+    It is returned as it is if ``imu_time_offset_s`` of its calibration states the clocks' offset, and without IMU
+    samples. Where fewer than 60 scans can be used, or they do not determine the offset, a note says so.
 
     Args:
         sequence: the recording, or a part of it.
@@ -47,9 +47,10 @@ def check_recording(sequence: Sequence, progress: Progress | None = None) -> Seq
     Raises:
         DataError: the IMU or its mounting is wrong; the message says what and what to do.
     """
-    check = compare_imu(sequence, progress) if is_comparable(sequence) else None
-    if check is None:
+    if sequence.imu_time_offset_s is not None or len(sequence.imu) < 2:
         return sequence
+    check = compare_imu(sequence, progress) if is_comparable(sequence) else None
+    check = check or ImuCheck(sequence.imu)
     if check.wrong:
         raise DataError(f"{sequence.name}: {check.wrong[0]}. To run all the same: --no-check")
     notes = Notes(sequence.name, list(sequence.notes))
@@ -57,9 +58,26 @@ def check_recording(sequence: Sequence, progress: Progress | None = None) -> Seq
         notes.corrected(text)
     for text in check.doubtful:
         notes.add(text)
+    if (reason := _why_not_found(check)) is not None:
+        notes.add(
+            f"the offset of the IMU's clock was not found: {reason}. Stamps are taken as they are; if the clocks may "
+            "differ, state imu_time_offset_s in calibration.yaml"
+        )
     is_moved = check.offset is not None and check.offset.is_significant
     applied_s = check.offset.offset_s if check.offset is not None and is_moved else None
     return replace(sequence, imu=check.imu, notes=tuple(notes.texts), imu_time_offset_s=applied_s)
+
+
+def _why_not_found(check: ImuCheck) -> str | None:
+    """Return why the offset of the clocks is not known; None where it is, or where the check says more of it."""
+    offset = check.offset
+    if offset is None:
+        return f"the motion of {_LEAST_SCANS} scans is needed"
+    if offset.is_determined or offset.is_significant or offset.contradicts:
+        return None
+    if offset.sigma_s < LEAST_OFFSET_S:
+        return "the gyroscope and the scans do not turn alike"
+    return f"the motion shows it only to {1e3 * offset.sigma_s:.0f} ms"
 
 
 def is_comparable(sequence: Sequence) -> bool:

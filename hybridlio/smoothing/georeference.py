@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 
 POSES_ENU, TABLE, MAP = "poses_enu_tum.txt", "georeferenced.csv", "georeferenced.geojson"
+FILES = (POSES_ENU, TABLE, MAP)
 # Of the mean specific force against the vertical: accelerations average out over a run, but an accelerometer bias of
 # 0.1 m/s² remains.
 _GRAVITY_SIGMA_RAD = 0.01
@@ -126,7 +127,7 @@ def write_georeferenced(folder: Path, placed: Georeferenced) -> list[Path]:
     geodetic = placed.geodetic
     write_atomically(folder / TABLE, _table(placed.trajectory, geodetic))
     write_atomically(folder / MAP, _geojson(placed, geodetic))
-    return [folder / name for name in (POSES_ENU, TABLE, MAP)]
+    return [folder / name for name in FILES]
 
 
 def _table(trajectory: Trajectory, geodetic: Array) -> str:

@@ -95,7 +95,7 @@ def open_drive(drive: Path, raw_root: Path | None = None, vertical_angle_deg: fl
     simulation = read_simulation(drive / "simulation.json")
     imu = drive_imu(drive, oxts, notes)
     note_coverage(imu.stamps_ns, stamps, "inertial data", notes)
-    gps = read_gps_csv(drive / "gps.csv")
+    gps = read_gps_csv(drive / "gps.csv", notes)
     note_fixes(gps, stamps, notes)
     return Sequence(
         name=notes.name,

@@ -13,6 +13,7 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.geodesy import GeodeticPoint, check_geodetic, enu_from_geodetic
 from hybridlio.core.sensors import NS_PER_S, GpsFix, ImuSamples
 from hybridlio.core.tables import counted
+from hybridlio.datasets.gps_csv import assumed_where_unknown, usable_covariance
 from hybridlio.datasets.imu_columns import STANDARD_GRAVITY_M_S2
 from hybridlio.datasets.imu_csv import ONE_G, clean_imu
 from hybridlio.datasets.notes import Notes
@@ -22,9 +23,7 @@ from hybridlio.datasets.stamps import sorted_unique
 
 _MAX_DELAY_S = 1.0  # between a stamp and its receipt; drivers and networks take milliseconds, other clocks are far off
 _MAX_DELAY_DIFFERENCE_S = 0.2  # between lidar and IMU; a sweep is stamped 0.1 s before it is sent
-_MIN_SIGMA_M = 1e-3  # a fix declared exact still needs an invertible covariance
 _IMU_PARTS = {"angular velocity": slice(0, 3), "linear acceleration": slice(3, 6)}  # of the values of a message
-_DEFAULT_SIGMA_M = 5.0  # of a fix without covariance: that of satellite navigation without corrections
 _LATEST_NS = 2**63 - 1  # of a stamp as an int64
 
 
@@ -141,7 +140,7 @@ def gps_fixes(log: Log, topic: str, notes: Notes) -> tuple[GpsFix, ...]:
     """
     stamps, known = stamps_of(log, topic, notes)
     rows = log.rows()
-    fixed = known & np.isfinite(rows[:, :3]).all(axis=1)
+    fixed = known & np.isfinite(rows[:, :3]).all(axis=1) & rows[:, :2].any(axis=1)  # some receivers write zeros
     if not fixed.all():
         notes.add(f"{topic}: {int((~fixed).sum())} of {len(log)} messages have no fix")
     if not fixed.any():
@@ -152,21 +151,11 @@ def gps_fixes(log: Log, topic: str, notes: Notes) -> tuple[GpsFix, ...]:
     for row in rows:
         check_geodetic(row[0], row[1], row[2], f"{notes.name}: {topic}")
     origin = GeodeticPoint(*rows[0, :3].tolist())
-    covariances = [_covariance(row[3:].reshape(3, 3)) for row in rows]
-    if unknown := sum(c is None for c in covariances):
-        notes.add(f"{topic}: {counted(unknown, 'fix').replace('fixs', 'fixes')} without covariance; 5 m are assumed")
+    covariances = assumed_where_unknown([usable_covariance(row[3:].reshape(3, 3)) for row in rows], topic, notes)
     return tuple(
-        GpsFix(int(t), position, _DEFAULT_SIGMA_M**2 * np.eye(3) if c is None else c, origin)
-        for t, position, c in zip(stamps, enu_from_geodetic(rows[:, :3], origin), covariances, strict=True)
+        GpsFix(int(t), position, covariance, origin)
+        for t, position, covariance in zip(stamps, enu_from_geodetic(rows[:, :3], origin), covariances, strict=True)
     )
-
-
-def _covariance(given: Array) -> Array | None:
-    """Return a fix's covariance, no smaller than 1 mm; None if it is unknown, zero or not positive."""
-    if not np.isfinite(given).all() or not (np.diag(given) > 0).all():
-        return None
-    raised = (given + given.T) / 2 + np.diag(np.maximum(_MIN_SIGMA_M**2 - np.diag(given), 0))
-    return raised if np.linalg.eigvalsh(raised)[0] > 0 else None
 
 
 def body_pose(message: Any, type_name: str) -> tuple[str, tuple[float, ...]]:

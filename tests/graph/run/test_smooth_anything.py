@@ -117,7 +117,7 @@ def test_speeds_that_no_step_has_and_gaps_are_left_out(files):
 
 def test_fixes_may_have_seconds_and_places_on_earth(files, tmp_path):
     (tmp_path / "gps.csv").write_text("t_s,sigma,latitude,longitude,height\n1600000000.123456789,1,49,8,100\n")
-    (fix,) = fixes_of(tmp_path / "gps.csv")
+    (fix,) = fixes_of(tmp_path / "gps.csv", [])
     assert fix.stamp_ns == 1600000000123456789
     assert fix.origin is not None
 

@@ -61,6 +61,14 @@ def test_georeference_passes_on_antenna_and_clock(with_fixes: Path, monkeypatch:
     assert given[0]["max_shift_s"] == 0
 
 
+def test_georeference_replaces_its_files_only_when_it_is_asked_to(with_fixes: Path) -> None:
+    ok("georeference", with_fixes, *OPTIONS, "--origin", "49,8,100")
+    assert "georeferenced.csv" in ok("georeference", with_fixes, *OPTIONS, "--origin", "49,8,100", "--overwrite")
+    assert "poses_enu_tum.txt exists" in refused(2, "georeference", with_fixes, *OPTIONS)
+    ok("georeference", with_fixes, *OPTIONS, "--overwrite")
+    assert not (with_fixes / "georeferenced.csv").exists(), "written for an origin that is no longer stated"
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -50,10 +50,24 @@ def test_wrong_data_end_the_run_with_what_to_do(rng: np.random.Generator, walk: 
         check_recording(as_sequence(rng, walk, swapped))
 
 
-def test_recordings_too_short_or_without_imu_pass_unchanged(rng: np.random.Generator, walk: Handheld):
-    whole = as_sequence(rng, walk)
-    for sequence in (whole.part(0, 40), replace(whole, imu=ImuSamples.empty())):
-        assert check_recording(sequence) is sequence
+def test_a_recording_without_imu_passes_unchanged(rng: np.random.Generator, walk: Handheld):
+    sequence = replace(as_sequence(rng, walk), imu=ImuSamples.empty())
+    assert check_recording(sequence) is sequence
+
+
+def test_a_recording_too_short_or_calm_to_find_the_offset_says_so(rng: np.random.Generator, walk: Handheld):
+    late = as_sequence(rng, walk, moved(walk.imu, 0.05))
+    calm = carried(np.random.default_rng(5), seconds=9.0, turning=0.002)
+    for sequence, reason in (
+        (late.part(0, 40), "the motion of 60 scans is needed"),
+        (as_sequence(rng, calm), "the motion shows it only to "),
+    ):
+        found = check_recording(sequence)
+        np.testing.assert_array_equal(found.imu.stamps_ns, sequence.imu.stamps_ns)
+        assert found.imu_time_offset_s is None
+        (note,) = found.notes
+        assert f"offset of the IMU's clock was not found: {reason}" in note
+        assert "state imu_time_offset_s" in note
 
 
 def test_unreadable_scans_are_passed_over(rng: np.random.Generator, walk: Handheld):

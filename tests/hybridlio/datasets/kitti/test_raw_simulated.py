@@ -70,7 +70,7 @@ class TestSimulatorsAdditions:
     @pytest.mark.parametrize(
         ("content", "says"),
         [
-            ("stamp_ns,east,north,up\n1,2,3,4\n", "sigma"),
+            ("stamp_ns,east,north,sigma\n1,2,3,4\n", "lacks up"),
             ("stamp_ns,east,north,up,sigma\n1,2,3,4,5\n1,2,x,4,5\n", "line 3"),
             ("stamp_ns,east,north,up,sigma\n1,2,nan,4,5\n", "line 2"),
             ("stamp_ns,east,north,up,sigma\n1,2\n", "line 2"),
