@@ -18,7 +18,7 @@ from hybridlio.core.arrays import Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import Scan
 from hybridlio.datasets.notes import Notes
-from hybridlio.datasets.points import pcd, ply, tables, text_rows
+from hybridlio.datasets.points import mesh_vertices, pcd, ply, tables, text_rows
 from hybridlio.datasets.points.bin_layout import BinLayout, column_names, find_layout
 from hybridlio.datasets.points.fields import Columns
 from hybridlio.datasets.points.point_format import PointFormat, StatedFormat, learn_format, sampled
@@ -34,6 +34,7 @@ _READERS: dict[str, Callable[[Path], Columns]] = {
     ".laz": tables.read_las,
     ".feather": tables.read_arrow,
     ".parquet": tables.read_arrow,
+    **dict.fromkeys(mesh_vertices.SUFFIXES, mesh_vertices.read_vertices),
 }
 
 

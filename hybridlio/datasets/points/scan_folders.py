@@ -13,13 +13,15 @@ from hybridlio.core.arrays import Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.datasets.notes import Notes
+from hybridlio.datasets.points import mesh_vertices, text_rows
 from hybridlio.datasets.points.point_files import SUFFIXES
-from hybridlio.datasets.points.text_rows import COMMON_SUFFIXES
 from hybridlio.datasets.stamps import MISSING_STAMP, SCAN_GAP_FACTOR, note_gaps, read_stamps, seconds_ns, usable_scans
 
 SCAN_FOLDERS = ("scans", "lidar", "points", "velodyne", "data", ".")  # the folder itself last: a map may be in it
 STAMP_FILES = ("timestamps.txt", "times.txt")
-_TEXT_FOLDERS = ("scans", "lidar", "points", "velodyne")  # `data` is of other sensors, too
+# Files of these kinds are scans only in these folders; `data` is of other sensors, too.
+_COMMON_SUFFIXES = (*text_rows.COMMON_SUFFIXES, *mesh_vertices.SUFFIXES)
+_OWN_FOLDERS = ("scans", "lidar", "points", "velodyne")
 
 _UNITS_NS = {19: 1, 16: 1000, 13: 1_000_000}  # by the digits of whole numbers that count from 1970
 # at the end of a name; seconds since 1970 or in GPS time: fewer digits may be the number of a frame
@@ -63,11 +65,11 @@ def has_scans(folder: Path) -> bool:
 
 
 def files_in(folder: Path) -> tuple[Path, ...]:
-    """Return the scan files directly in a folder, in natural order; ``.txt`` and ``.csv`` only in a folder of scans."""
+    """Return the scan files directly in a folder, in natural order; text and meshes only in a folder of scans."""
     files = [p for p in folder.glob("*") if not p.name.startswith(".") and p.name not in STAMP_FILES]
     found = [p for p in files if p.suffix.lower() in SUFFIXES]
-    if not found and folder.name in _TEXT_FOLDERS:
-        found = [p for p in files if p.suffix.lower() in COMMON_SUFFIXES]
+    if not found and folder.name in _OWN_FOLDERS:
+        found = [p for p in files if p.suffix.lower() in _COMMON_SUFFIXES]
     return tuple(sorted(found, key=_natural))
 
 

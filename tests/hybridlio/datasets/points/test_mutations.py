@@ -31,6 +31,16 @@ def write(path: Path) -> None:
         np.save(path, table)
     elif path.suffix == ".xyz":
         np.savetxt(path, np.column_stack([table[name] for name in table.dtype.names]), header="x y z intensity t")
+    elif path.suffix == ".obj":
+        path.write_text("".join(f"v {x} {y} {z}\n" for x, y, z in table[["x", "y", "z"]].tolist()))
+    elif path.suffix == ".off":
+        path.write_text(
+            f"OFF\n{COUNT} 0 0\n" + "".join(f"{x} {y} {z}\n" for x, y, z in table[["x", "y", "z"]].tolist())
+        )
+    elif path.suffix == ".stl":
+        triangles = np.zeros(COUNT // 3, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
+        triangles["corners"] = np.column_stack([table[axis] for axis in "xyz"]).reshape(-1, 3, 3)
+        path.write_bytes(bytes(80) + len(triangles).to_bytes(4, "little") + triangles.tobytes())
     elif path.suffix == ".bin":
         np.column_stack([table[name] for name in table.dtype.names[:4]]).astype("<f4").tofile(path)
     elif path.suffix == ".pcd":
@@ -67,7 +77,9 @@ def mutated(data: bytes, rng: np.random.Generator) -> bytes:
     return bytes(out)
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".bin", ".pcd", ".ply", ".las", ".laz", ".feather", ".xyz"])
+@pytest.mark.parametrize(
+    "suffix", [".npy", ".bin", ".pcd", ".ply", ".las", ".laz", ".feather", ".xyz", ".obj", ".off", ".stl"]
+)
 def test_a_damaged_file_gives_a_scan_or_one_error_that_names_it(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"scan{suffix}"
     write(path)
