@@ -25,10 +25,12 @@ from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.edge_arrays import edges_of
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.outliers.condensed import condense
+from hybridlio.graph.outliers.descents import descent
+from hybridlio.graph.outliers.exchange import exchanged
 from hybridlio.graph.outliers.loop_support import GraphOdometry, LoopSupport, loop_support
 from hybridlio.graph.outliers.search import all_at_once, nearest_first
 from hybridlio.graph.outliers.toggling import Alternatives, toggled
-from hybridlio.graph.outliers.weighted_solver import Found, WeightedSolver, least
+from hybridlio.graph.outliers.weighted_solver import Found, WeightedSolver, least, undominated
 from hybridlio.graph.solve.initial_values import find_initial_values
 from hybridlio.graph.solve.settings import IterationProgress
 
@@ -37,6 +39,10 @@ from hybridlio.graph.solve.settings import IterationProgress
 _CHANCE_OF_A_LOSS = 0.1
 _GROWTHS = 3.0, 2.0, 1.5  # of the rounds of the searches: the finer, the more of them
 _SAME_MAP = 0.01  # of the spread of positions, up to which two maps count as one: what benchmarks count as right
+# Difference of χ² within which another map makes the result doubtful: a twentieth of the best
+# map's likelihood.
+_RIVAL = 2 * np.log(20)
+_RESTING_ITERATIONS = 50  # before two maps are compared; MIT's needs tens
 _SAME_SHARE = 0.01  # of loops on which two searches may differ and still agree: some lie at the bound
 
 
@@ -81,7 +87,7 @@ def reject_outliers(data: GraphData, start: Array | None, report: IterationProgr
     if not len(loops.i):
         return Rejection(start, frozenset())
     trusted, bound = data.copy(without=loops.ids.tolist()), loop_bound(data.tangent_size, len(loops.i))
-    whole = WeightedSolver(trusted, loops, odometry, bound, report)
+    whole = WeightedSolver(descent(trusted, loops), odometry, bound, report)
     if along is None:
         best = all_at_once(whole, whole.values(start))
         return _rejection(
@@ -90,7 +96,7 @@ def reject_outliers(data: GraphData, start: Array | None, report: IterationProgr
     chain = GraphOdometry(data, odometry, co.to_matrices(along))
     support = loop_support(loops, chain, bound)
     small = condense(trusted, loops, odometry, chain)
-    solver = WeightedSolver(small.trusted, small.loops, small.odometry, bound, report, support)
+    solver = WeightedSolver(descent(small.trusted, small.loops), small.odometry, bound, report, support)
     found, complete = _search(solver, solver.values(start[small.kept]), support)
     best = least(found)
     doubts = _doubts(solver, found, support, complete)
@@ -123,7 +129,13 @@ def _search(solver: WeightedSolver, start: Any, support: LoopSupport) -> Alterna
         if _agreed(found):
             break
         found.append(nearest_first(solver, start, used, growth))
-    return toggled(solver, start, support.cluster, found)
+    margin = _rival_cost(solver)
+    found += exchanged(solver, support.cluster, least(found), margin)
+    before = least(found)
+    found, complete = toggled(solver, start, support.cluster, found)
+    if not np.array_equal(least(found).correct, before.correct):
+        found += exchanged(solver, support.cluster, least(found), margin)
+    return Alternatives(found, complete)
 
 
 def _agreed(found: list[Found]) -> bool:
@@ -134,9 +146,8 @@ def _agreed(found: list[Found]) -> bool:
 
 def _doubts(solver: WeightedSolver, found: list[Found], support: LoopSupport, complete: bool) -> tuple[str, ...]:
     best, doubts = least(found), []
-    others = [one for one in found if _other_map(solver, best, one) and one.cost < best.cost + solver.price]
-    if others:
-        doubts.append("another set of loops, with another map, fits as well but for less than one loop")
+    if _rivals(solver, found, best):
+        doubts.append("another set of loops, with another map, fits nearly as well")
     if not complete:
         doubts.append("not every group of rejected loops that confirm one another was tried")
     confirmed = support.supported
@@ -145,8 +156,28 @@ def _doubts(solver: WeightedSolver, found: list[Found], support: LoopSupport, co
     return tuple(doubts)
 
 
-def _other_map(solver: WeightedSolver, best: Found, other: Found) -> bool:
-    """Whether the positions of two results differ by more than a hundredth of their spread."""
-    a, b = solver.poses(best.values)[:, :3, 3], solver.poses(other.values)[:, :3, 3]
+def _rivals(solver: WeightedSolver, found: list[Found], best: Found) -> list[Found]:
+    """Return results with other loops and another map that cost hardly more; both maps are solved to the end first."""
+    most = best.cost + _rival_cost(solver)
+    sets = {one.correct.tobytes(): one for one in undominated(found) if one.cost < most}
+    del sets[best.correct.tobytes()]
+    if not sets:
+        return []
+    poses = solver.poses(_at_rest(solver, best))
+    return [one for one in sets.values() if _other_map(poses, solver.poses(_at_rest(solver, one)))]
+
+
+def _rival_cost(solver: WeightedSolver) -> float:
+    """Return the cost by which a rival exceeds the best result at most, at the noise that loops show."""
+    return float(_RIVAL * solver.price / solver.bound)
+
+
+def _at_rest(solver: WeightedSolver, one: Found) -> Any:
+    return solver.solve(one.values, one.correct.astype(np.float64), _RESTING_ITERATIONS)
+
+
+def _other_map(poses: Array, others: Array) -> bool:
+    """Whether the positions of poses ``(N, 4, 4)`` differ by more than a hundredth of their spread."""
+    a, b = poses[:, :3, 3], others[:, :3, 3]
     spread = np.sqrt(((a - a.mean(axis=0)) ** 2).sum(axis=1).mean())
     return bool(np.sqrt(((a - b) ** 2).sum(axis=1).mean()) > _SAME_MAP * spread)

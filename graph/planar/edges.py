@@ -8,8 +8,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
-from hybridlio.core.arrays import Array, Index
+from hybridlio.core.arrays import Array, Index, Mask
 
 _SMALL_ANGLE_RAD = 1e-4  # below it the next term of the series, θ³/360, is below double precision
 
@@ -56,6 +57,25 @@ class PlanarEdges(NamedTuple):
         by_i[:] = -by_j
         by_i[:2, 2] += times(inverse, np.array([[c * dy - s * dx], [-c * dx - s * dy]]))[:, 0]
         return by_i, by_j
+
+    def whitened(self, poses: Array, held: Mask) -> tuple[csr_matrix, Array]:
+        """Return the Jacobian ``(3 M, 3 K)`` of whitened residuals by the ``K`` poses that are not held, and these.
+
+        Args:
+            poses: ``(3, N)``.
+            held: ``(N,)`` which poses do not move.
+        """
+        lower = np.linalg.cholesky(np.moveaxis(self.information, 2, 0))
+        root = np.asarray(np.transpose(lower, (2, 1, 0)), dtype=np.float64)
+        residual = times(root, self.residuals(poses)[:, None])[:, 0]
+        blocks = np.concatenate([times(root, J) for J in self.jacobians(poses)], axis=2)
+        edge, pose = np.tile(np.arange(len(self.i)), 2), np.concatenate([self.i, self.j])
+        place = np.cumsum(~held) - 1
+        free = ~held[pose]
+        p, q = np.arange(3)[:, None, None], np.arange(3)[None, :, None]
+        at = np.broadcast_arrays(3 * edge[free] + p, 3 * place[pose[free]] + q)
+        shape = 3 * len(self.i), 3 * int(np.count_nonzero(~held))
+        return csr_matrix((blocks[..., free].ravel(), (at[0].ravel(), at[1].ravel())), shape), residual.T.ravel()
 
     def _errors(self, poses: Array) -> tuple[Array, Array]:
         """Return the translation ``(2, M)`` and the angle ``(M,)`` of ``measured⁻¹ · T_i⁻¹ · T_j``."""

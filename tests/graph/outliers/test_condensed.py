@@ -10,6 +10,7 @@ from hybridlio.graph import PoseGraph
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.edge_arrays import edges_of
 from hybridlio.graph.outliers.condensed import Condensed, condense
+from hybridlio.graph.outliers.descents import descent
 from hybridlio.graph.outliers.loop_support import GraphOdometry
 from hybridlio.graph.outliers.rejection import odometry_start
 from hybridlio.graph.outliers.weighted_solver import WeightedSolver
@@ -50,8 +51,8 @@ def condensed(graph: PoseGraph) -> tuple[Condensed, WeightedSolver, WeightedSolv
     small = condense(trusted, loops, odometry, chain)
     return (
         small,
-        WeightedSolver(small.trusted, small.loops, small.odometry, 20.0, silent),
-        WeightedSolver(trusted, loops, odometry, 20.0, silent),
+        WeightedSolver(descent(small.trusted, small.loops), small.odometry, 20.0, silent),
+        WeightedSolver(descent(trusted, loops), odometry, 20.0, silent),
     )
 
 

@@ -8,7 +8,7 @@ import pytest
 from hybridlio.core import se3
 from hybridlio.graph import PoseGraph
 from hybridlio.graph.model.edge_arrays import edges_of
-from hybridlio.graph.outliers import weighted_solver as descent
+from hybridlio.graph.outliers.descents import GtsamDescent, PlanarDescent, descent
 from hybridlio.graph.outliers.loop_support import LoopSupport
 from hybridlio.graph.outliers.weighted_solver import _FURTHER_LOOP, WeightedSolver
 from hybridlio.graph.solve.settings import silent
@@ -35,7 +35,7 @@ def test_arrays_and_gtsam_descend_to_the_same_poses(rng):
     weights = rng.uniform(0, 1, len(loops.i))
     weights[::5] = 0.0
     ends = []
-    for make in (descent.GtsamDescent, descent.PlanarDescent):
+    for make in (GtsamDescent, PlanarDescent):
         way = make(trusted, loops)
         end = way.solve(way.state(data.initial_values), weights, 50)
         ends.append((way.coordinates(end), way.trusted_chi2(end)))
@@ -50,7 +50,7 @@ def test_the_system_follows_the_loops_that_have_a_weight(rng):
     data = laps(rng)._data
     edges = edges_of(data)
     loops, trusted = edges.where(~edges.consecutive), data.copy(without=edges.ids[~edges.consecutive].tolist())
-    way, weights = descent.PlanarDescent(trusted, loops), np.ones(len(loops.i))
+    way, weights = PlanarDescent(trusted, loops), np.ones(len(loops.i))
     state = way.solve(way.state(data.initial_values), weights, 30)
     without = way.solve(state, np.zeros(len(weights)), 30)
     assert way.trusted_chi2(without) == pytest.approx(0, abs=1e-6)
@@ -68,8 +68,10 @@ def test_a_cluster_costs_less_to_reject_than_as_many_single_loops(rng):
     cluster[:10] = 0
     far = data.initial_values
     far[:, 2] += np.arange(COUNT)  # contradicts every loop
-    plain = WeightedSolver(trusted, loops, odometry, bound, silent)
-    clustered = WeightedSolver(trusted, loops, odometry, bound, silent, LoopSupport(0.25, cluster > 0, cluster))
+    plain = WeightedSolver(descent(trusted, loops), odometry, bound, silent)
+    clustered = WeightedSolver(
+        descent(trusted, loops), odometry, bound, silent, LoopSupport(0.25, cluster > 0, cluster)
+    )
     state = plain.values(far)
     assert (plain.chi2(state) > bound).all()
     rejections = plain.cost(state) - plain.cost_with(state, np.zeros(count, dtype=bool))

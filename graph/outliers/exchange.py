@@ -1,0 +1,63 @@
+"""Improving a set of correct loops by what some of them would change: left out, if accepted, or taken in, if not.
+
+In a linear model the total χ² falls by ``rᵀ (I − J P Jᵀ)⁻¹ r`` where a measurement is left out, and rises by
+``rᵀ (I + J P Jᵀ)⁻¹ r`` where one is taken in, with its whitened residual ``r``, Jacobian ``J`` and the covariance ``P``
+of the solution. The first is the χ² of its deleted residual, the test of Baarda's data snooping ("A testing procedure
+for use in geodetic networks", 1968). A wrong loop that bends the map has a small residual and a large deleted one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hybridlio.core.arrays import Index, Mask
+from hybridlio.graph.outliers.linear_changes import LinearChanges
+from hybridlio.graph.outliers.weighted_solver import LARGEST_GROUP, Found, WeightedSolver, least
+
+_ROUNDS = 5  # of improvements: each lowers the cost; one or two suffice where any does
+_TRIED = 5  # exchanges of a round that are solved, those that promise most
+_NEAR = 2.0  # factor on the price within which the exchange of one loop is followed further
+
+
+def exchanged(solver: WeightedSolver, cluster: Index, best: Found, margin: float) -> list[Found]:
+    """Return results that differ from the best one by few loops, and cost less or hardly more, to first order.
+
+    Args:
+        solver: of the graph.
+        cluster: ``(M,)`` cluster of each loop.
+        best: the result to improve.
+        margin: cost by which another result may exceed the best one, and still be of interest.
+    """
+    found: list[Found] = []
+    for _ in range(_ROUNDS):
+        found += [solver.found(best.values, best.correct ^ some) for some in _promising(solver, cluster, best, margin)]
+        better = least([best, *found])
+        if not better.cost < best.cost:
+            break
+        best = better
+    return found
+
+
+def _promising(solver: WeightedSolver, cluster: Index, best: Found, margin: float) -> list[Mask]:
+    """Return sets of loops ``(M,)`` to exchange, those that lower the cost most first."""
+    try:
+        changes = LinearChanges(solver.linear(best.values), best.correct, solver.price)
+    except RuntimeError:  # singular: loops with a trace of weight alone determine some pose
+        return []
+    single = changes.single
+    wrong, missed = best.correct & (single > solver.price), ~best.correct & (single < solver.price)
+    sets = [some for some in (wrong, missed) if np.count_nonzero(some) > 1]
+    near = np.where(best.correct, single > solver.price / _NEAR, single < solver.price * _NEAR)
+    sets += [np.arange(len(cluster)) == k for k in np.flatnonzero(near)]
+    sizes, accepted = np.bincount(cluster), np.bincount(cluster, weights=best.correct)
+    whole = (sizes > 1) & (sizes <= LARGEST_GROUP) & (sizes == accepted)
+    sets += [cluster == number for number in np.flatnonzero(whole)]
+    before = solver.cost_of_rejecting(~best.correct)
+    exchanges = [changes.exchange(some) for some in sets]
+    costs = [
+        change + solver.cost_of_rejecting(~best.correct ^ some) - before
+        for some, (change, _) in zip(sets, exchanges, strict=True)
+    ]
+    promising = [k for k in np.argsort(costs, kind="stable")[:_TRIED].tolist() if costs[k] < margin]
+    followed = [sets[k] | exchanges[k][1] for k in promising if exchanges[k][1].any()]
+    return [*(sets[k] for k in promising), *followed]
