@@ -72,7 +72,7 @@ def _why_not_found(check: ImuCheck) -> str | None:
     """Return why the offset of the clocks is not known; None where it is, or where the check says more of it."""
     offset = check.offset
     if offset is None:
-        return f"the motion of {_LEAST_SCANS} scans is needed"
+        return f"too few scans could be compared; {_LEAST_SCANS + _QUIET_SCANS} in a row are enough"
     if offset.is_determined or offset.is_significant or offset.contradicts:
         return None
     if offset.sigma_s < LEAST_OFFSET_S:
