@@ -15,7 +15,10 @@ from hybridlio.graph.outliers.linear_changes import LinearChanges
 from hybridlio.graph.outliers.weighted_solver import LARGEST_GROUP, Found, WeightedSolver, least
 
 _ROUNDS = 5  # of improvements: each lowers the cost; one or two suffice where any does
-_TRIED = 5  # exchanges of a round that are solved, those that promise most
+_GAIN = 0.01  # of the price: less is a descent that went on, or a loop at the bound
+_TRIED = 3  # exchanges of a round that are solved, those that promise most
+_RESISTING = 3  # loops, and clusters, without which a group is tested
+_SURE = 10.0  # factor on the price from which a group is contradicted to first order: far off, the model is a poor one
 _NEAR = 2.0  # factor on the price within which the exchange of one loop is followed further
 
 
@@ -32,7 +35,7 @@ def exchanged(solver: WeightedSolver, cluster: Index, best: Found, margin: float
     for _ in range(_ROUNDS):
         found += [solver.found(best.values, best.correct ^ some) for some in _promising(solver, cluster, best, margin)]
         better = least([best, *found])
-        if not better.cost < best.cost:
+        if not better.cost < best.cost - _GAIN * solver.price:
             break
         best = better
     return found
@@ -53,7 +56,7 @@ def _promising(solver: WeightedSolver, cluster: Index, best: Found, margin: floa
     whole = (sizes > 1) & (sizes <= LARGEST_GROUP) & (sizes == accepted)
     sets += [cluster == number for number in np.flatnonzero(whole)]
     before = solver.cost_of_rejecting(~best.correct)
-    exchanges = [changes.exchange(some) for some in sets]
+    exchanges = [_followed(changes, best.correct, some, solver.price) for some in sets]
     costs = [
         change + solver.cost_of_rejecting(~best.correct ^ some) - before
         for some, (change, _) in zip(sets, exchanges, strict=True)
@@ -61,3 +64,50 @@ def _promising(solver: WeightedSolver, cluster: Index, best: Found, margin: floa
     promising = [k for k in np.argsort(costs, kind="stable")[:_TRIED].tolist() if costs[k] < margin]
     followed = [sets[k] | exchanges[k][1] for k in promising if exchanges[k][1].any()]
     return [*(sets[k] for k in promising), *followed]
+
+
+def _followed(changes: LinearChanges, correct: Mask, some: Mask, price: float) -> tuple[float, Mask]:
+    """Return the change of χ² and prices where some loops change sides and others follow, and these ``(M,)``.
+
+    Others follow where that lowers the cost; each counts as if it were the only one.
+    """
+    change, single = changes.exchange(some)
+    gains = np.nan_to_num(np.where(correct, single - price, price - single))
+    followers = ~some & (gains > 0)
+    return change - float(gains[followers].sum()), followers
+
+
+def contradicted(solver: WeightedSolver, cluster: Index, best: Found, groups: list[Mask]) -> bool:
+    """Whether the result contradicts each of some rejected groups, to first order, also without what resists it most.
+
+    What resists a group are the accepted loops and clusters whose residuals it raises most. Taking in a group saves the
+    price of its rejection, which pays for few of them.
+
+    Args:
+        solver: of the graph.
+        cluster: ``(M,)`` cluster of each loop.
+        best: the result.
+        groups: masks ``(M,)``.
+    """
+    try:
+        changes = LinearChanges(solver.linear(best.values), best.correct, solver.price)
+    except RuntimeError:
+        return False
+    return all(_contradicts(changes, solver, cluster, best.correct, group) for group in groups)
+
+
+def _contradicts(changes: LinearChanges, solver: WeightedSolver, cluster: Index, correct: Mask, group: Mask) -> bool:
+    enough = _SURE * solver.cost_of_rejecting(group)
+    _, after = changes.exchange(group)
+    if not np.isfinite(after[correct]).all():  # the work did not suffice
+        return False
+    stress = np.where(correct, after, 0.0)
+    loops = [np.arange(len(cluster)) == k for k in np.argsort(-stress)[:_RESISTING]]
+    clusters = [correct & (cluster == k) for k in np.argsort(-np.bincount(cluster, stress))[:_RESISTING]]
+    small = [some for some in clusters if 1 < np.count_nonzero(some) <= LARGEST_GROUP]
+    for resisting in [np.zeros_like(group), *loops, *small]:
+        change, single = changes.exchange(group | resisting)
+        joining = np.maximum(solver.price - single[~(correct | group)], 0)  # rejected loops that would fit then
+        if not change - float(np.nansum(joining)) > enough:
+            return False
+    return True

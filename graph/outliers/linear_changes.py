@@ -55,7 +55,7 @@ class LinearChanges:
         kept = linear.jacobian[used]
         self._jacobian = linear.jacobian[linear.trusted :]
         self._residuals = linear.residual[linear.trusted :].reshape(count, self._size)
-        self._correct, self._price = correct, price
+        self._price = price
         self._sign = np.where(correct, -1.0, 1.0)  # of an information matrix that an exchange adds
         self._solver = splu(
             (kept.T @ kept).tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
@@ -65,14 +65,14 @@ class LinearChanges:
         self._find_spreads()
         self.single = self._chi2(self._residuals, self._spreads)
 
-    def exchange(self, some: Mask) -> tuple[float, Mask]:
-        """Return the change of χ² and prices where some loops change sides and others follow, and these ``(M,)``.
+    def exchange(self, some: Mask) -> tuple[float, Array]:
+        """Return the change of χ² where some loops change sides, and :attr:`single` of the others after that.
 
-        Others follow where that lowers the cost; each counts as if it were the only one, so that no change is larger.
+        The change is infinite where the work does not suffice, and nothing is known after it.
         """
         rows = np.flatnonzero(some)
         if len(rows) > self._left or not np.isfinite(self._spreads[rows]).all():
-            return np.inf, np.zeros(len(some), dtype=bool)
+            return np.inf, np.full(len(some), np.nan)
         self._left -= len(rows)
         r = self._residuals[rows].ravel()
         cross = self._predicted(rows)  # of all loops
@@ -83,10 +83,7 @@ class LinearChanges:
         residuals = self._residuals - (cross @ pulled[:, 0]).reshape(self._residuals.shape)
         blocks = cross.reshape(len(some), self._size, -1), pulled[:, 1:].reshape(len(r), len(some), self._size)
         spreads = self._spreads - np.einsum("mik,kmj->mij", *blocks)
-        single = self._chi2(residuals, spreads)
-        gains = np.nan_to_num(np.where(self._correct, single - self._price, self._price - single))
-        followers = ~some & (gains > 0)
-        return change - float(gains[followers].sum()), followers
+        return change, np.where(some, np.nan, self._chi2(residuals, spreads))
 
     def _chi2(self, residuals: Array, spreads: Array) -> Array:
         """Return the change of χ² for each loop, with its residual and the covariance of its prediction."""

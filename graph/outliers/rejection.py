@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hybridlio.core.arrays import Array
+from hybridlio.core.arrays import Array, Mask
 from hybridlio.core.chi_square import chi_square_quantile
 from hybridlio.core.errors import GraphError
 from hybridlio.graph.model import coordinates as co
@@ -26,7 +26,7 @@ from hybridlio.graph.model.edge_arrays import edges_of
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.outliers.condensed import condense
 from hybridlio.graph.outliers.descents import descent
-from hybridlio.graph.outliers.exchange import exchanged
+from hybridlio.graph.outliers.exchange import contradicted, exchanged
 from hybridlio.graph.outliers.loop_support import GraphOdometry, LoopSupport, loop_support
 from hybridlio.graph.outliers.search import all_at_once, nearest_first
 from hybridlio.graph.outliers.toggling import Alternatives, toggled
@@ -97,9 +97,9 @@ def reject_outliers(data: GraphData, start: Array | None, report: IterationProgr
     support = loop_support(loops, chain, bound)
     small = condense(trusted, loops, odometry, chain)
     solver = WeightedSolver(descent(small.trusted, small.loops), small.odometry, bound, report, support)
-    found, complete = _search(solver, solver.values(start[small.kept]), support)
+    found, untried = _search(solver, solver.values(start[small.kept]), support)
     best = least(found)
-    doubts = _doubts(solver, found, support, complete)
+    doubts = _doubts(solver, found, support, untried)
     values = whole.values(small.expand(solver.coordinates(best.values)))
     return _rejection(whole, whole.found(values, best.correct), doubts)
 
@@ -132,10 +132,10 @@ def _search(solver: WeightedSolver, start: Any, support: LoopSupport) -> Alterna
     margin = _rival_cost(solver)
     found += exchanged(solver, support.cluster, least(found), margin)
     before = least(found)
-    found, complete = toggled(solver, start, support.cluster, found)
+    found, untried = toggled(solver, start, support.cluster, found)
     if not np.array_equal(least(found).correct, before.correct):
         found += exchanged(solver, support.cluster, least(found), margin)
-    return Alternatives(found, complete)
+    return Alternatives(found, untried)
 
 
 def _agreed(found: list[Found]) -> bool:
@@ -144,11 +144,11 @@ def _agreed(found: list[Found]) -> bool:
     return bool(np.mean(best.correct != second.correct) <= _SAME_SHARE)
 
 
-def _doubts(solver: WeightedSolver, found: list[Found], support: LoopSupport, complete: bool) -> tuple[str, ...]:
+def _doubts(solver: WeightedSolver, found: list[Found], support: LoopSupport, untried: list[Mask]) -> tuple[str, ...]:
     best, doubts = least(found), []
     if _rivals(solver, found, best):
         doubts.append("another set of loops, with another map, fits nearly as well")
-    if not complete:
+    if untried and not contradicted(solver, support.cluster, best, untried):
         doubts.append("not every group of rejected loops that confirm one another was tried")
     confirmed = support.supported
     if confirmed.any() and np.mean(~best.correct[confirmed]) > 0.5:

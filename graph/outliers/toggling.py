@@ -23,11 +23,11 @@ class Alternatives(NamedTuple):
 
     Attributes:
         found: results of all searches.
-        complete: whether every group of loops that the best result rejects was tried.
+        untried: masks ``(M,)`` of the groups of loops that the best result rejects, and that were not tried.
     """
 
     found: list[Found]
-    complete: bool
+    untried: list[Mask]
 
 
 class Move(NamedTuple):
@@ -54,10 +54,10 @@ def toggled(solver: WeightedSolver, start: Any, cluster: Index, found: list[Foun
         best = least(found)
         groups = [move for move in _rejected_groups(best.correct, cluster) if move not in tried]
         if not left or not (groups or not _confirmed(best, found)):
-            return Alternatives(found, not groups)
+            return Alternatives(found, [cluster == move.cluster for move in groups])
         moves = groups or [move for move in _other_moves(best.correct, cluster) if move not in tried]
         if not moves:
-            return Alternatives(found, True)
+            return Alternatives(found, [])
         move = moves[0]
         tried.add(move)
         members = cluster == move.cluster

@@ -9,9 +9,9 @@ from hybridlio.core import se3
 from hybridlio.graph import PoseGraph
 from hybridlio.graph.model.edge_arrays import edges_of
 from hybridlio.graph.outliers.descents import GtsamDescent, PlanarDescent, descent
-from hybridlio.graph.outliers.exchange import exchanged
+from hybridlio.graph.outliers.exchange import contradicted, exchanged
 from hybridlio.graph.outliers.linear_changes import LinearChanges
-from hybridlio.graph.outliers.weighted_solver import LARGEST_GROUP, WeightedSolver, least
+from hybridlio.graph.outliers.weighted_solver import LARGEST_GROUP, Found, WeightedSolver, least
 from hybridlio.graph.solve.settings import silent
 
 SIGMA, COUNT = 0.05, 72
@@ -68,12 +68,13 @@ def test_loops_that_are_left_out_together_change_the_error_as_solving_again_does
     everything = np.ones(len(solver.loops.i), dtype=bool)
     values = solver.solve(solver.values(graph._data.initial_values), everything.astype(float), 50)
     some = np.isin(np.arange(len(everything)), (0, 1, 2, 5))
-    change, followers = LinearChanges(solver.linear(values), everything, 1e9).exchange(some)
-    assert not followers.any()  # at that price none is rejected
+    change, single = LinearChanges(solver.linear(values), everything, 1e9).exchange(some)
     without = chi2_of(solver, values, ~some)
     assert change == pytest.approx(without - chi2_of(solver, values, everything), rel=0.1)
-    others = LinearChanges(solver.linear(values), everything, 0.0).exchange(some)[1]
-    np.testing.assert_array_equal(others, ~some)  # where rejection is free every other loop follows
+    assert np.isnan(single[some]).all()
+    for k in (6, 7):  # after the exchange
+        saved = without - chi2_of(solver, values, ~some ^ (np.arange(len(some)) == k))
+        assert single[k] == pytest.approx(saved, rel=0.1, abs=0.05)
 
 
 def test_arrays_and_gtsam_have_the_same_whitened_residuals(rng):
@@ -113,3 +114,22 @@ def test_rejecting_a_large_cluster_is_discounted_for_one_misleading_place_alone(
     everything = np.ones(count, dtype=bool)
     saved = 20.0 * count - solver.cost_of_rejecting(everything)
     assert saved == pytest.approx(20.0 * 0.75 * (LARGEST_GROUP - 1))
+
+
+def test_a_group_is_contradicted_unless_it_fits_without_one_loop_that_resists_it(rng):
+    graph = corridor(rng, 2)
+    resisting = graph.add_between(56, 70, se3.exp([0, 0, 0, 14.1, 0, 0]), sigmas=SIGMA / 10)
+    for k in range(2):  # fits the path, but for the loop above
+        graph.add_between(56 + k, 69 + k, se3.exp([0, 0, 0, 13.6, 0, 0]), sigmas=SIGMA)
+    for k in range(2):  # fits nothing
+        graph.add_between(4 + k, 20 + k, se3.exp([0, 0, 0, 2, 0, 0]), sigmas=SIGMA)
+    solver = solver_of(graph, 10.0)
+    cluster = np.arange(len(solver.loops.i))
+    fitting, wrong = np.zeros((2, len(cluster)), dtype=bool)
+    fitting[-4:-2], wrong[-2:] = True, True
+    values = solver.solve(solver.values(graph._data.initial_values), (~fitting & ~wrong).astype(float), 50)
+    best = Found(values, ~fitting & ~wrong, 0.0, 0.0)
+    assert best.correct[solver.loops.ids == resisting].all()
+    assert contradicted(solver, cluster, best, [wrong])
+    assert not contradicted(solver, cluster, best, [fitting])
+    assert not contradicted(solver, cluster, best, [wrong, fitting])
