@@ -87,9 +87,9 @@ def main() -> None:
         return
     if find_spec("atheris") is None:
         raise SystemExit("Atheris is not installed: pip install 'hybridlio[fuzz]'")
-    from fuzz_inputs import INPUTS
+    from fuzz_inputs import chosen
 
-    held = [run(name, options.seconds, options.keep) for name in options.readers or INPUTS]
+    held = [run(name, options.seconds, options.keep) for name in chosen(parser, options.readers)]
     raise SystemExit(0 if all(held) else 1)
 
 

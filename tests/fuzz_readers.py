@@ -4,10 +4,10 @@
 
 A tiny recording is written in each reader's layout, and every other kind of file that hybridlio reads. Each mutation
 changes one or two of the files (bits, lengths, numbers in headers, words of texts, files in each other's place) from
-its seed, and opens the recording and every scan, or reads the file. Before them, the cases kept in tests/corpora are
-repeated (see fuzz_guided.py). Workers are processes of their own, so that a
-crash, a hang over 10 s or memory over 2 GiB is seen; they continue behind it. Prints one line a reader, and each
-failure with its seed; exits with 1 if there is any.
+its seed, and opens the recording and every scan, or reads the file. Before them come the cases kept in tests/corpora
+(see fuzz_guided.py), and those that are made of the whole files (see tests/helpers/fuzz_corpus.py). Workers are
+processes of their own, so that a crash, a hang, more than 10 s of processor time or memory over 2 GiB is seen; they
+continue behind it. Prints one line a reader, and each failure with its seed; exits with 1 if there is any.
 """
 
 from __future__ import annotations
@@ -34,31 +34,32 @@ import mutations  # noqa: E402
 import numpy as np  # noqa: E402
 from fuzz_corpus import Corpus  # noqa: E402
 from fuzz_input import HANG_S, MEMORY_BYTES, outcome  # noqa: E402
-from fuzz_inputs import INPUTS  # noqa: E402
+from fuzz_inputs import INPUTS, chosen  # noqa: E402
 
 FORK = multiprocessing.get_context("fork")  # workers need not import everything again
 START_S = 120  # until the first message: a busy machine may write the files for long
-LOST_S = 3 * HANG_S  # without a message: the worker hangs where Python's alarm does not reach
+LOST_S = 6 * HANG_S  # without a message: the worker hangs where Python's alarm does not reach, or waits
 
 
-def work(name: str, start: int, count: int, pipe: Connection) -> None:
-    """Repeat the kept cases, then run mutations; send each seed, then what it gives, to the parent that watches."""
+def work(name: str, start: int, count: int, done: set[str], pipe: Connection) -> None:
+    """Try the cases that are not done, then run mutations; send each, then what it gives, to the parent."""
     logging.disable(logging.CRITICAL)
     warnings.simplefilter("error")
     warnings.simplefilter("ignore", ResourceWarning)  # of files that NumPy leaves to the collector after an error
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         arguments, read = INPUTS[name].write(root / "data"), INPUTS[name].read
-        if (found := outcome(read, arguments)) != "ok":
+        if (found := outcome(read, arguments, limit_s=0)) != "ok":  # without a limit, as it may import PyTorch
             raise SystemExit(f"{name}: the undamaged files give {found}")
         shutil.copytree(root / "data", root / "whole")
         corpus = Corpus(name, root / "data")
         vsize = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
         resource.setrlimit(resource.RLIMIT_AS, (vsize + MEMORY_BYTES,) * 2)
         for case, content in corpus.cases().items():
-            pipe.send((f"case {case}", None))
-            with corpus.applied(content):
-                pipe.send((f"case {case}", outcome(read, arguments)))
+            if case not in done:
+                pipe.send((case, None))
+                with corpus.applied(content):
+                    pipe.send((case, outcome(read, arguments)))
         for seed in range(start, start + count):
             pipe.send((seed, None))
             changed = mutations.damage(root / "data", np.random.default_rng([seed, len(name)]))
@@ -79,15 +80,16 @@ class Result:
         kind = text if text in ("ok", "error") else "failed"
         self.counts[kind] += isinstance(which, int) or kind == "failed"
         if kind == "failed":
-            self.failures.append(f"{'seed ' if isinstance(which, int) else ''}{which}: {text}")
+            self.failures.append(f"{'seed' if isinstance(which, int) else 'case'} {which}: {text}")
 
 
 def run(name: str, start: int, count: int, until: float | None) -> Result:
     """Run the mutations of a reader in workers, a new one behind each crash."""
     result, seed, end = Result(), start, start + count
+    done: set[str] = set()  # of the cases
     while seed < end and (until is None or time.monotonic() < until):
         receive, send = FORK.Pipe(duplex=False)
-        worker = FORK.Process(target=work, args=(name, seed, end - seed, send), daemon=True)
+        worker = FORK.Process(target=work, args=(name, seed, end - seed, done, send), daemon=True)
         worker.start()
         send.close()
         which: int | str | None = None
@@ -102,7 +104,9 @@ def run(name: str, start: int, count: int, until: float | None) -> Result:
             if text is not None:
                 result.add(which, text)
                 seed = which + 1 if isinstance(which, int) else seed
-                which = None if isinstance(which, str) else which
+                if isinstance(which, str):
+                    done.add(which)
+                    which = None
             is_over = until is not None and time.monotonic() >= until
         is_over = is_over or (until is not None and time.monotonic() >= until)
         is_unfinished = isinstance(which, str) or which == seed
@@ -116,8 +120,9 @@ def run(name: str, start: int, count: int, until: float | None) -> Result:
         assert which is not None
         result.add(which, "hangs" if is_alive else f"the process ends with {worker.exitcode}")
         if isinstance(which, str):
-            break  # a kept case; a new worker would repeat it
-        seed += 1
+            done.add(which)
+        else:
+            seed += 1
     return result
 
 
@@ -136,7 +141,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the first mutation; -1 for fresh ones")
     options = parser.parse_args()
     seed = options.seed if options.seed >= 0 else time.time_ns() // 10**9 % 10**9
-    names, began, failed = options.readers or list(INPUTS), time.monotonic(), 0
+    names, began, failed = chosen(parser, options.readers), time.monotonic(), 0
     for number, name in enumerate(names):
         until = None
         if options.seconds is not None:

@@ -39,6 +39,10 @@ _CONTRADICTS = (
     "frame %d: the IMU's %s contradict the scans, which move on smoothly; its samples are left out until they agree "
     "again. If this happens often, check T_imu_lidar, units and clock"
 )
+_DOUBTED = (
+    "frame %d: scans, map and IMU contradict each other, as where scans jump, the sensor was carried or the start "
+    "failed; positions from here on may be off by %.1f m (standard deviation per axis), relative to those before"
+)
 _NOISY = (
     "frame %d: the IMU's %s differ from the scans' motion %.0f times as much as their stated noise explains; they are "
     "believed that much less. State their noise (imu_noise), or check T_imu_lidar, units and clock"
@@ -154,7 +158,10 @@ class Pipeline:
         """
         predicted = self.setup.predict_from_imu(frame, state) if state.has_imu else None
         dt_s = (frame.scan.stamp_ns - state.stamp_ns) / NS_PER_S
+        doubted_m = self.gate.doubt.lasting_m
         relative, result = self.gate.apply(measured, predicted, initial, dt_s, self.trust.left_out)
+        if self.gate.doubt.lasting_m > doubted_m:
+            _log.log(logging.INFO if doubted_m else logging.WARNING, _DOUBTED, frame.index, self.gate.doubt.lasting_m)
         if result.takes_back and isinstance(self.residual, TakesBack):
             self.residual.take_back(initial)
         return relative, result
@@ -190,7 +197,7 @@ class Pipeline:
         T_imu_lidar = self.calibration.T_imu_lidar
         T_lidar_imu = se3.inverse(T_imu_lidar)
         covariance = se3.rotate_covariance(state.covariance[:6, :6], T_lidar_imu)
-        covariance = covariance + np.diag(np.r_[np.zeros(3), np.full(3, self.gate.doubt_m2)])
+        covariance = covariance + np.diag(np.r_[np.zeros(3), np.full(3, self.gate.doubt.m2)])
         return T_lidar_imu @ state.T_world_imu @ T_imu_lidar, covariance
 
     def inertial_state(self, state: State) -> InertialState | None:

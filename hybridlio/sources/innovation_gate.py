@@ -9,9 +9,7 @@ if the path that they found is smooth while the IMU contradicts two steps of it 
 jumps, or moves on beside its jump as the IMU predicts, the scan is. Scans that leave a direction unconstrained, as
 those of a narrow lidar on open ground do, drift smoothly and are no judges of the IMU.
 
-Where neither is shown to be right, the position is doubted (:attr:`InnovationGate.doubt_m2`): because scans that are
-believed without the IMU move abruptly and contradict it grossly, as after a false start; or because the contradiction
-began with a scan that fits the map poorly, as where the scans jump to another place.
+Where neither is shown to be right, the position is doubted (:mod:`hybridlio.sources.position_doubt`).
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.motion_limits import UNKNOWN_TRANSLATION_SIGMA_M
 from hybridlio.sources.motion_change import MotionChange
-from hybridlio.sources.usual_fit import UsualFit
+from hybridlio.sources.position_doubt import PositionDoubt
 
 Verdict = Literal["untested", "accepted", "undecided", "IMU left out", "down-weighted", "rejected", "relocated"]
 
@@ -131,24 +129,11 @@ class InnovationGate:
         self._steps = 0
         self._rejected_in_a_row = 0
         self._undecided = False
-        self._accepted_in_a_row = 0
-        self._doubt_m2 = 0.0  # that stays
-        self._unconfirmed_m = 0.0  # length of the path since the IMU last confirmed it
         self._motion = MotionChange()
-        self._fit = UsualFit()
-        self._misfit = False  # a scan that fits poorly has contradicted the IMU grossly, which has not agreed since
+        self.doubt = PositionDoubt(WARM_UP_STEPS)
         self._determined_in_a_row = 0  # scans until now that constrain every direction
         # the last scan, where it was found, in the pose that the source's path has for it; None if they are the same
         self._found: Array | None = None
-
-    @property
-    def doubt_m2(self) -> float:
-        """Variance of the position, per axis, by which poses may be wrong beside what the graph knows.
-
-        Scans and IMU have contradicted each other, and neither was shown to be right. While scans that fit poorly are
-        bridged, the next one may still show that nothing was lost.
-        """
-        return self._doubt_m2 + (self._unconfirmed_m**2 if self._misfit and self._accepted_in_a_row == 0 else 0.0)
 
     def apply(
         self,
@@ -179,12 +164,9 @@ class InnovationGate:
             relative, result = measured, GateResult("IMU left out", nis)
         else:
             relative, result = self._tested(measured, own, predicted, bridge, dt_s)
-        self._note_path(own, result)
-        self._note_fit(measured, result)
-        if self._follows_misfit(measured, result) or (
-            result.verdict in ("untested", "IMU left out") and self._is_doubtful(own, predicted, dt_s)
-        ):
-            self._doubt_m2, self._unconfirmed_m = self._doubt_m2 + self._unconfirmed_m**2, 0.0
+        is_believed = result.verdict in ("untested", "IMU left out")
+        is_doubtful = is_believed and self._is_doubtful(own, predicted, dt_s)
+        self.doubt.learn(measured, own, result.verdict, (result.nis or 0.0) > GROSS_NIS, is_doubtful)
         if measured.ok and result.verdict in _MOVES_ON:
             # the IMU confirms the path: then the step to this scan is from the bridge, not from a scan found wrongly
             step = measured.pose if result.verdict == "accepted" else own.pose
@@ -194,34 +176,8 @@ class InnovationGate:
         self._found = se3.between(bridge.pose, measured.pose) if taken_back else None
         return relative, result
 
-    def _note_path(self, own: RelativePose, result: GateResult) -> None:
-        """Add the step to the path that the IMU has not confirmed; it confirms the path by agreeing for a while."""
-        self._accepted_in_a_row = self._accepted_in_a_row + 1 if result.verdict == "accepted" else 0
-        self._unconfirmed_m += float(np.linalg.norm(own.pose[:3, 3])) if own.ok else 0.0
-        if self._accepted_in_a_row >= WARM_UP_STEPS:
-            self._unconfirmed_m = 0.0
-
-    def _note_fit(self, measured: RelativePose, result: GateResult) -> None:
-        """Note whether a gross contradiction began with a scan that fits the map poorly; the IMU may end it."""
-        if result.verdict == "accepted":
-            self._fit.learn(measured.details)
-            self._misfit = self._misfit and self._accepted_in_a_row < WARM_UP_STEPS
-        elif result.verdict in ("undecided", "rejected", "relocated") and (result.nis or 0.0) > GROSS_NIS:
-            self._misfit = self._misfit or self._fit.is_poor(measured.details)
-
-    def _follows_misfit(self, measured: RelativePose, result: GateResult) -> bool:
-        """Whether the path goes on from a scan that did not fit the map, and by more than the IMU's bridge."""
-        if not self._misfit:
-            return False
-        is_followed = result.verdict == "down-weighted" and self._fit.is_poor(measured.details)
-        return is_followed or result.verdict in ("untested", "IMU left out", "relocated")
-
     def _is_doubtful(self, own: RelativePose, predicted: RelativePose | None, dt_s: float) -> bool:
-        """Whether scans that are believed without the IMU contradict it grossly, and move abruptly at that.
-
-        So they do after a false start, whose speed changes with every scan. The path since the IMU last confirmed it
-        may then be wrong by all its length.
-        """
+        """Whether scans that are believed without the IMU contradict it grossly, and move abruptly at that."""
         if predicted is None or not _comparable(own, predicted) or not self._motion.is_abrupt(own.pose, dt_s):
             return False
         return normalised_innovation_squared(own, predicted) > GROSS_NIS

@@ -18,6 +18,7 @@ from hybridlio.registration.local_map import LocalMap
 from hybridlio.registration.motion_search import best_start, coarse_kernel_m, fits_better, motions
 from hybridlio.sources import map_errors
 from hybridlio.sources.matching_state import MatchingState, PathPoint
+from hybridlio.sources.position_doubt import NEW_MAP
 from hybridlio.sources.recent_points import RecentPoints
 from hybridlio.sources.refinding import REFOUND_COST, has_vague_start, starts_within
 from hybridlio.sources.scene_scale import SceneScale
@@ -188,24 +189,18 @@ class ScanMatching:
 
     def _bridge(self, scan: ThinnedScan, initial: RelativePose, observed: ObservedRegistration | None) -> RelativePose:
         """Move the state on by the initial pose and return that pose as a failed step."""
-        is_first = self._map.surface is None  # no scan so far had planes to match
-        self._state = self._state.bridged(initial, scan.points if is_first else None)
-        drift, points = self._drift(_FLOOR_COVARIANCE, map_changed=False), len(scan.points)
-        if observed is not None:
-            self._state = replace(self._state, unmatched=self._state.unmatched + 1)
-            if self._state.unmatched >= _LOST_SCANS:
-                # the new map lies beside the old one by the error of all bridges since the last match
-                drift = None if drift is None else self._state.current.bridge_covariance
-                self._state = self._state.restarted(scan.points)
-        return RelativePose(
-            initial.pose,
-            initial.covariance,
-            source=initial.source,
-            ok=False,
-            drift=drift,
-            from_imu=initial.from_imu,
-            details={"points": float(points), **(observed.registration.diagnostics if observed else {})},
-        )
+        first = scan.points if self._map.surface is None else None  # no scan so far had planes to match
+        self._state = self._state.bridged(initial, first)
+        drift = self._drift(_FLOOR_COVARIANCE, map_changed=False)
+        details = {"points": float(len(scan.points)), **(observed.registration.diagnostics if observed else {})}
+        self._state = replace(self._state, unmatched=self._state.unmatched + (observed is not None))
+        if self._state.unmatched >= _LOST_SCANS:
+            # the new map lies beside the old one by the error of all bridges since the last match
+            drift = None if drift is None else self._state.current.bridge_covariance
+            self._state = self._state.restarted(scan.points)
+            details[NEW_MAP] = 1.0
+        bridge = RelativePose(initial.pose, initial.covariance, initial.source, ok=False, drift=drift, details=details)
+        return replace(bridge, from_imu=initial.from_imu)
 
     @property
     def _keyframes(self) -> int:

@@ -6,10 +6,8 @@ off by more than three standard deviations, something is said in the run's notes
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import fault_rows
@@ -17,18 +15,17 @@ import faults
 import numpy as np
 import pytest
 from fault_rows import FLAGGED, LONG, REFUSED, SURVIVED
+from fault_runs import GROSS_NEES, Outcome, run_row
 
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.odometry.odometry import Odometry
-from hybridlio.runs.run import Run, run_odometry
-from hybridlio.runs.write import notes
+from hybridlio.runs.run import run_odometry
 from hybridlio.simulation import SimulationConfig, simulate
 
-_THREE_SIGMAS = 14.16  # 99.73 % quantile of χ² with three degrees of freedom
 _SILENT_SHARE = 0.02
-_GROSS_NEES, _GROSS_SHARE = 25.0, 0.01  # of the scans of all rows together
+_GROSS_SHARE = 0.01  # of the scans of all rows together
 
 
 @pytest.fixture(scope="module")
@@ -44,65 +41,29 @@ def long_drive(tmp_path_factory: pytest.TempPathFactory) -> Sequence:
     return open_sequence(simulate(Path(tmp_path_factory.mktemp("long")), settings))
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """A run with a fault, and what the run and the log say beside what the drive's own notes say."""
-
-    run: Run
-    said: str
-
-
 Find = Callable[[str], Outcome]
 _ROWS = {**SURVIVED, **FLAGGED, **LONG}
 _done: dict[str, Outcome] = {}
 
 
 @pytest.fixture
-def outcome(drive: Sequence, long_drive: Sequence, caplog: pytest.LogCaptureFixture) -> Find:
+def outcome(drive: Sequence, long_drive: Sequence) -> Find:
     """Return a function that runs the odometry on the drive with a row's fault; each once."""
 
     def find(name: str) -> Outcome:
         if name not in _done:
-            caplog.clear()
-            row, whole = _ROWS[name], long_drive if name in LONG else drive
-            run = run_odometry(row.inject(whole), Odometry())
-            assert run.stopped is None
-            assert run.done == row.scans
-            warnings = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
-            added = [line for line in notes(run)[len(whole.notes) :] if "injected fault" not in line]
-            _done[name] = Outcome(run, "; ".join([*added, *warnings]))
+            _done[name] = run_row(_ROWS[name], long_drive if name in LONG else drive)
         return _done[name]
 
     return find
-
-
-def errors_m(run: Run) -> np.ndarray:  # type: ignore[type-arg]
-    reference = run.sequence.reference
-    assert reference is not None
-    return np.asarray(run.trajectory.poses[:, :3, 3] - reference.poses[: run.done, :3, 3])
-
-
-def position_nees(run: Run) -> np.ndarray:  # type: ignore[type-arg]
-    """Return the normalised squared error of each position after the first."""
-    trajectory = run.trajectory
-    assert trajectory.covariances is not None
-    R = trajectory.poses[1:, :3, :3]
-    covariances = R @ trajectory.covariances[1:, 3:, 3:] @ R.transpose(0, 2, 1)
-    off = errors_m(run)[1:]
-    return np.asarray(np.einsum("ni,ni->n", off, np.linalg.solve(covariances, off[..., None])[..., 0]))
-
-
-def off_share(run: Run) -> float:
-    """Return the share of the positions after the first that are off by more than three standard deviations."""
-    return float(np.mean(position_nees(run) > _THREE_SIGMAS))
 
 
 @pytest.mark.parametrize("name", [*SURVIVED, *LONG])
 def test_a_fault_is_survived_within_its_bound(name: str, outcome: Find) -> None:
     row, found = _ROWS[name], outcome(name)
     assert row.within_m is not None
-    assert np.linalg.norm(errors_m(found.run)[:, :2], axis=1).max() < row.within_m
-    assert off_share(found.run) <= _SILENT_SHARE
+    assert found.largest_m < row.within_m
+    assert found.off_share <= _SILENT_SHARE
     assert row.said in found.said
 
 
@@ -114,7 +75,7 @@ def test_a_fault_that_is_not_survived_is_flagged(name: str, outcome: Find) -> No
 @pytest.mark.parametrize("name", _ROWS)
 def test_nothing_is_wrong_in_silence(name: str, outcome: Find) -> None:
     found = outcome(name)
-    share = off_share(found.run)
+    share = found.off_share
     assert share <= _SILENT_SHARE or found.said, f"{share:.0%} of the positions are off, and nothing is said"
 
 
@@ -123,13 +84,13 @@ _COVERED = [name for name in (*FLAGGED, *LONG) if "IMU for 2 s" in name or "scan
 
 @pytest.mark.parametrize("name", _COVERED)
 def test_covariances_cover_the_error_of_what_was_bridged_or_jumped(name: str, outcome: Find) -> None:
-    assert off_share(outcome(name).run) <= _SILENT_SHARE
+    assert outcome(name).off_share <= _SILENT_SHARE
 
 
 def test_over_all_faults_together_few_positions_are_far_outside_their_covariance(outcome: Find) -> None:
     as_users_run = [name for name in _ROWS if "--no-check" not in name]
-    nees = np.concatenate([position_nees(outcome(name).run) for name in as_users_run])
-    assert np.mean(nees > _GROSS_NEES) <= _GROSS_SHARE
+    nees = np.concatenate([outcome(name).nees for name in as_users_run])
+    assert np.mean(nees > GROSS_NEES) <= _GROSS_SHARE
 
 
 @pytest.mark.parametrize("name", REFUSED)

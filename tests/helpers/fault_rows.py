@@ -113,9 +113,9 @@ FLAGGED = {
     ),
     "kidnapped: carried to another place": Row(
         faults.carried(40, 20),
-        "scans are left out, as they or the IMU may be wrong; the covariances grow by the path until both agree again",
+        "the covariances grow by the path until both agree again, relative to the positions before; a warning says so",
         None,
-        "as either may be wrong",
+        "positions from here on may be off by",
         scans=60,
     ),
     "extrinsics turned by 10 degrees": Row(

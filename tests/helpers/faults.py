@@ -207,7 +207,11 @@ def rearranged(source: Callable[[int], int]) -> Fault:
 
 
 def carried(frame: int, frames: int) -> Fault:
-    """From a frame on, scans and samples are those of some frames later: the sensor was switched off and carried."""
+    """From a frame on, scans and samples are those of some frames later: the sensor was switched off and carried.
+
+    Nothing measures how it was carried. The reference is the path that scans and samples show: it goes on from where
+    the sensor was switched off, by the motion from where it was switched on.
+    """
 
     def inject(sequence: Sequence) -> Sequence:
         stamps, imu = sequence.stamps_ns, sequence.imu
@@ -218,7 +222,13 @@ def carried(frame: int, frames: int) -> Fault:
             np.vstack([imu.gyro_rad_s[before], imu.gyro_rad_s[after]]),
             np.vstack([imu.accel_m_s2[before], imu.accel_m_s2[after]]),
         )
-        return replace(rearranged(lambda k: k if k < frame else k + frames)(sequence), imu=left)
+        reference = sequence.reference
+        assert reference is not None
+        poses = reference.poses.copy()
+        back = poses[frame] @ se3.inverse(poses[frame + frames])
+        poses[frame:-frames] = back @ poses[frame + frames :]
+        path = replace(reference, poses=poses)
+        return replace(rearranged(lambda k: k if k < frame else k + frames)(sequence), imu=left, reference=path)
 
     return inject
 
