@@ -3,15 +3,15 @@
 Two of its scans fit each other nearly as well metres away as where they were. Taken for sure, a false fit makes a false
 map, which later scans then fit, too. So all scans since the first are placed by one smooth motion
 (:mod:`hybridlio.registration.joint_motion`), from many starts. Each new scan is one more to agree, and motions under
-which the points fit significantly worse are dropped. While several are left, or there are few scans, the step is that
-of the slowest motion, with a covariance that spans the others. When one is left, scan matching gets a map of all scans
-so far, and the step brings relative poses to them, by which the graph corrects the steps before.
+which the points fit significantly worse are dropped. While several are left, there are few scans, or a new one
+still moves the one before, the step is that of the slowest motion, with a covariance that spans the others. When one is
+left, scan matching gets a map of all scans so far, and the step brings relative poses to them, by which the graph
+corrects the steps before.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -19,16 +19,17 @@ from scipy.linalg import block_diag
 from hybridlio.cloud.deskew import deskew
 from hybridlio.cloud.voxel import voxel_pick
 from hybridlio.core import se3
-from hybridlio.core.arrays import Array, Index
+from hybridlio.core.arrays import Array
+from hybridlio.core.chi_square import chi_square_quantile
 from hybridlio.core.estimates import EarlierScanPose, RelativePose, State
 from hybridlio.core.motion_limits import (
     MEAN_ACCELERATION_SIGMA_M_S2,
     MEASUREMENT_FLOOR_SIGMAS,
     UNKNOWN_SPEED_SIGMA_M_S,
 )
-from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples, Scan
-from hybridlio.core.trajectory import Trajectory
+from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples
 from hybridlio.odometry.inertial_motion import inertial_motion
+from hybridlio.registration.base_motion import BaseMotion
 from hybridlio.registration.cost_profile import PROBE_STEP_M
 from hybridlio.registration.joint_motion import SIZE, JointMotion, JointPoints, JointProblem
 from hybridlio.sources.settings import ScanMatchingSettings
@@ -39,6 +40,9 @@ _LONGEST_S = 2.0  # over which one acceleration and one rate of turn describe wh
 # (hybridlio/registration/cost_profile.py). From three scans on: the minima of two are where they like.
 _DROPPED_RATIO = 4.5
 _DROPPING_SCANS = 3
+# Of the squared normalised change of the scan before by a new one, and scans in a row below it. The first scans of a
+# lidar of few rings have a flat valley of costs, in which the minimum still moves by ten standard deviations.
+_SETTLED, _SETTLED_SCANS = chi_square_quantile(0.99, 6), 2
 _TEMPERATURE = 1.5  # of the weights of motions that are left, as there
 _FEW_JUDGED, _JUDGED = 500, 2000  # points to compare starts, some hundreds of a scan; and to find each minimum
 _COARSE_STEPS, _FINE_STEPS = 6, 5  # the kernel is halved from 1 m to 0.1 m in four
@@ -58,6 +62,7 @@ class StartEstimate:
         relative: the step to it. Once decided it carries the poses relative to all scans before.
         frames: all frames so far, compensated by that motion.
         poses: ``(K, 4, 4)`` their lidar poses in the frame of the first.
+        covariance: ``(6, 6)`` of the last, as if the motion had settled.
         is_decided: whether one motion is left, and the scans observe it in every direction.
         is_last: whether the search ends here even if undecided.
     """
@@ -65,6 +70,7 @@ class StartEstimate:
     relative: RelativePose
     frames: list[Frame]
     poses: Array
+    covariance: Array
     is_decided: bool
     is_last: bool
 
@@ -92,6 +98,7 @@ class StartSearch:
         self._settings, self._calibration, self._noise = settings, calibration, noise
         self._frames = [first]
         self._motions: list[JointMotion] = []
+        self._settled = 0  # scans in a row that left the one before where it was
         self.last: StartEstimate | None = None
 
     def add(self, frame: Frame, start: State, source: str) -> StartEstimate | None:
@@ -110,18 +117,22 @@ class StartSearch:
         self._motions = self._minima(problem)
         is_last = len(self._frames) >= _MOST_SCANS
         is_unique = len(self._motions) == 1 and len(self._frames) >= _LEAST_SCANS
-        is_decided = is_unique and self._is_observed(problem, self._motions[0])
         slowest = min(range(len(self._motions)), key=lambda i: float(np.linalg.norm(self._motions[i].motion[3:6])))
         chosen = 0 if is_last else slowest
-        spread = _Spread(base, self._motions, [base.poses_beside(one.motion) for one in self._motions], chosen)
+        poses = [base.poses_beside(one.motion) for one in self._motions]
+        unsettled = self._unsettled(poses[chosen])
+        self._settled = 0 if self.last is None or unsettled.any() else self._settled + 1
+        is_decided = is_unique and self._settled >= _SETTLED_SCANS and self._is_observed(problem, self._motions[0])
+        spread = _Spread(base, self._motions, poses, chosen)
         motion = self._motions[chosen]
         self.last = StartEstimate(
             replace(
-                spread.step(source, is_decided or is_last),
+                replace(spread, unsettled=unsettled).step(source, is_decided or is_last),
                 details={"motions": float(len(self._motions)), "cost": float(motion.costs.mean())},
             ),
             [replace(one, scan=base.compensated(one.scan, k, motion.motion)) for k, one in enumerate(self._frames)],
-            spread.poses[chosen],
+            poses[chosen],
+            spread.covariance(0, len(self._frames) - 1),
             is_decided,
             is_last,
         )
@@ -131,7 +142,7 @@ class StartSearch:
         since_s = (frame.scan.stamp_ns - self._frames[0].scan.stamp_ns) / NS_PER_S
         return len(frame.scan) >= self._settings.min_points and since_s < _LONGEST_S
 
-    def _base(self, last: Frame, start: State) -> _Base | None:
+    def _base(self, last: Frame, start: State) -> BaseMotion | None:
         """Return the motion by the IMU that starts and ends at the origin; None where its samples have gaps."""
         first, after = self._frames[0], [*self._frames[1:], last]
         before = first.sweep_imu.between(first.scan.stamp_ns - NS_PER_S, first.scan.stamp_ns)
@@ -139,9 +150,9 @@ class StartSearch:
         motion = None
         if start.has_imu:
             motion = inertial_motion(samples, start, np.eye(4), last.scan.stamp_ns, self._calibration)
-        return None if motion is None else _Base(motion, [frame.scan.stamp_ns for frame in (first, *after)])
+        return None if motion is None else BaseMotion(motion, [frame.scan.stamp_ns for frame in (first, *after)])
 
-    def _problem(self, base: _Base) -> JointProblem:
+    def _problem(self, base: BaseMotion) -> JointProblem:
         parts = []
         for k, frame in enumerate(self._frames):
             points = deskew(frame.scan, base.motion).points.astype(np.float64)
@@ -180,6 +191,15 @@ class StartSearch:
             return found
         return [one for one in found if one.rise_over_scatter(found[0]) < _DROPPED_RATIO]
 
+    def _unsettled(self, poses: Array) -> Array:
+        """Return how fast ``(6,)`` a new scan has moved the one before; 0 where its covariance allows that."""
+        if self.last is None:
+            return np.zeros(6)
+        since_s = (self._frames[-2].scan.stamp_ns - self._frames[0].scan.stamp_ns) / NS_PER_S
+        moved = se3.log(se3.between(self.last.poses[-1], poses[-2]))
+        is_allowed = moved @ np.linalg.solve(self.last.covariance, moved) < _SETTLED
+        return np.zeros(6) if is_allowed else moved / since_s
+
     def _is_observed(self, problem: JointProblem, found: JointMotion) -> bool:
         """Return whether costs rise on both sides of the motion, along the direction that constrains it least."""
         last_s = float(problem.points.times_s.max())
@@ -206,61 +226,17 @@ def _displacement_m(motion: Array, time_s: float) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Base:
-    """The motion by the IMU, and the stamps of the scans on it."""
-
-    motion: Trajectory
-    stamps_ns: list[int]
-
-    @cached_property
-    def times_s(self) -> Array:
-        """``(K,)`` of the scans since the first."""
-        return (np.array(self.stamps_ns) - self.stamps_ns[0]) / NS_PER_S
-
-    @cached_property
-    def from_first(self) -> Array:
-        """``(S, 4, 4)`` all poses, in the frame of the first scan."""
-        first = int(np.searchsorted(self.motion.stamps_ns, self.stamps_ns[0]))
-        return np.asarray(se3.inverse(self.motion.poses[first]) @ self.motion.poses)
-
-    @property
-    def poses(self) -> Array:
-        """``(K, 4, 4)`` of the scans."""
-        return np.asarray(self.from_first[np.searchsorted(self.motion.stamps_ns, self.stamps_ns)])
-
-    def poses_beside(self, xi: Array) -> Array:
-        """Return the scans' poses ``(K, 4, 4)`` by the base and a motion ``(9,)`` beside it."""
-        t, poses = self.times_s[:, None], self.poses
-        turned = se3.so3_exp(t * xi[:3]) @ poses[:, :3, :3]
-        return np.asarray(se3.make(turned, poses[:, :3, 3] + t * xi[3:6] + t**2 / 2 * xi[6:]))
-
-    def place(self, scan: Scan, points: Array, k: int, kept: Index) -> JointPoints:
-        """Return some of scan ``k``'s points ``(N, 3)``, which are compensated, as the base places them."""
-        times_s = np.full(len(kept), self.times_s[k])
-        if scan.time_offsets_ns is not None:
-            times_s = times_s + scan.time_offsets_ns[kept] / NS_PER_S
-        knots_s = (self.motion.stamps_ns - self.stamps_ns[0]) / NS_PER_S
-        centres = np.column_stack([np.interp(times_s, knots_s, self.from_first[:, i, 3]) for i in range(3)])
-        return JointPoints(se3.transform(self.poses[k], points[kept]), centres, times_s, np.full(len(kept), k))
-
-    def compensated(self, scan: Scan, k: int, xi: Array) -> Scan:
-        """Return scan ``k`` compensated by the base and a motion ``(9,)`` beside it."""
-        if scan.time_offsets_ns is None:
-            return scan
-        by_base = deskew(scan, self.motion)
-        placed = self.place(scan, by_base.points.astype(np.float64), k, np.arange(len(scan)))
-        points = se3.transform(se3.inverse(self.poses_beside(xi)[k]), placed.moved(xi))
-        return replace(by_base, points=points.astype(np.float32))
-
-
-@dataclass(frozen=True, eq=False)
 class _Spread:
-    """The uncertainty of relative poses: that of the chosen motion, and its distance from the others."""
+    """The uncertainty of relative poses: of the chosen motion, its distance from the others, and what it still moves.
 
-    base: _Base
+    ``unsettled`` ``(6,)`` is by how much the last scan has moved the motion, per second since the first.
+    """
+
+    base: BaseMotion
     motions: list[JointMotion]
     poses: list[Array]
     chosen: int
+    unsettled: Array = field(default_factory=lambda: np.zeros(6))
 
     def step(self, source: str, is_decided: bool) -> RelativePose:
         """Return the step to the last scan; once decided, with its poses relative to all scans before."""
@@ -284,10 +260,10 @@ class _Spread:
         weights = np.exp(-rises / _TEMPERATURE)
         weights /= weights.sum()
         step = se3.between(self.poses[self.chosen][j], self.poses[self.chosen][k])
-        total = _FLOOR + self._of_motion(j, k)
+        time_s = self.base.times_s[k] - self.base.times_s[j]
+        total = _FLOOR + self._of_motion(j, k) + _two_blocks(time_s * self.unsettled)
         for weight, poses in zip(weights, self.poses, strict=True):
-            apart = se3.log(se3.between(step, se3.between(poses[j], poses[k])))
-            total = total + weight * block_diag(*(np.outer(part, part) for part in (apart[:3], apart[3:])))
+            total = total + weight * _two_blocks(se3.log(se3.between(step, se3.between(poses[j], poses[k]))))
         return np.asarray(total)
 
     def _of_motion(self, j: int, k: int) -> Array:
@@ -298,3 +274,8 @@ class _Spread:
         to_step[3:, 3:6] = (t[k] - t[j]) * R.T
         to_step[3:, 6:] = (t[k] ** 2 - t[j] ** 2) / 2 * R.T
         return np.asarray(to_step @ self.motions[self.chosen].covariance @ to_step.T)
+
+
+def _two_blocks(apart: Array) -> Array:
+    """Return the covariance ``(6, 6)`` of a displacement ``(6,)`` with its rotation and translation independent."""
+    return np.asarray(block_diag(*(np.outer(part, part) for part in (apart[:3], apart[3:]))))

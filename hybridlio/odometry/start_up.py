@@ -75,8 +75,9 @@ def measure_step(
 ) -> tuple[Frame, RelativePose]:
     """Return the compensated frame and the step to it: of the search of the start, if there is one, else refined.
 
-    Lidars that do not repeat their pattern start by the search. Those that do, start by two scans; if these leave a
-    direction open, such as the vertical between walls, or do not fit each other, the search goes along and mends it.
+    Lidars that do not repeat their pattern start by the search. Those that do, start by two scans; if these do not fit
+    each other the search leads, and if they leave a direction open, such as the vertical between walls, it goes along
+    and mends it.
 
     Args:
         pipeline: its residual source refines.
@@ -97,14 +98,14 @@ def measure_step(
     answer = pipeline.refine(frame, initial, before, seconds)
     if is_first_step:
         answer = repeat_first_step(pipeline, frame, answer, before)
-        is_open = len(answer[1].degenerate) > 0 or answer[1].details.get("cost", 0.0) > LOST_COST
-        if is_open and isinstance(residual, ScanMatching):
-            pipeline.start_search = _search(pipeline, residual, leads=False)
+        is_lost = not answer[1].ok or answer[1].details.get("cost", 0.0) > LOST_COST
+        if isinstance(residual, ScanMatching) and (is_lost or len(answer[1].degenerate)):
+            pipeline.start_search = _search(pipeline, residual, leads=is_lost)
     elif isinstance(residual, RefinesAgain):
         motion = motion_for_second_pass(frame, initial, answer[1], before.stamp_ns)
         answer = answer if motion is None else pipeline.refine(frame, motion, before, {}, again=initial)
     if pipeline.start_search is not None:
-        own = _pose_after(pipeline, before, answer[1])
+        own = None if pipeline.start_search.leads else _pose_after(pipeline, before, answer[1])
         return _searched(pipeline, pipeline.start_search, frame, seconds, own) or answer
     return answer
 

@@ -22,6 +22,8 @@ AMBIGUOUS = PlatformConfig(scene="campus", platform="handheld", lidar="mid360", 
 # 16 beams see neither floor nor ceiling here, and two scans do not tell how high the second is.
 OPEN_ABOVE = PlatformConfig(scene="office", platform="handheld", lidar="vlp-16", seconds=15.0, seed=8001)
 OPEN_ABOVE_FROM = 60
+# Here the first two scans do not fit each other, and four leave a flat valley of costs: heights with rotations.
+VALLEY = PlatformConfig(scene="office", platform="handheld", lidar="vlp-16", seconds=1.2, seed=8101)
 
 
 @pytest.fixture(scope="module")
@@ -71,12 +73,20 @@ def test_a_scan_without_points_ends_the_search_and_is_bridged(frames: list[Frame
     assert estimates[cut + 1].relative is not None
 
 
-def test_a_false_fit_of_two_scans_is_mended_by_the_next() -> None:
+def test_a_false_fit_of_two_scans_is_not_believed() -> None:
     recording = walk(OPEN_ABOVE, OPEN_ABOVE_FROM, 7)
     estimates = estimated(list(recording))
     errors_m = [np.linalg.norm(error[3:]) for error in errors_of(estimates, recording.reference)]
-    assert max(errors_m[:3]) > 0.3
-    assert max(errors_m[4:]) < 0.05
+    assert max(errors_m) < 0.05
+
+
+def test_a_start_in_a_flat_valley_waits_for_scans_that_settle_it() -> None:
+    recording = walk(VALLEY)
+    estimates = estimated(list(recording))
+    errors = errors_of(estimates, recording.reference)
+    assert squared_position_errors(estimates, errors).max() < 9
+    assert max(np.linalg.norm(error[3:]) for error in errors) < 0.05
+    assert max(np.linalg.norm(error[:3]) for error in errors[8:]) < 0.006
 
 
 def test_a_false_start_that_the_imu_contradicts_is_not_claimed_to_be_sure(

@@ -9,6 +9,7 @@ from hybridlio.simulation.platforms.scenes.forest import forest
 from hybridlio.simulation.platforms.scenes.halls import garage, warehouse
 from hybridlio.simulation.platforms.scenes.house import house
 from hybridlio.simulation.platforms.scenes.office import office
+from hybridlio.simulation.platforms.scenes.room import room
 from hybridlio.simulation.platforms.scenes.scene import BuildScene
 from hybridlio.simulation.platforms.scenes.stairs import stairs
 from hybridlio.simulation.platforms.scenes.underground import mine, tunnel
@@ -31,6 +32,7 @@ class SceneKind:
 
 SCENES: dict[str, SceneKind] = {
     "office": SceneKind("an office floor: furnished rooms of 4 to 8 m, doors, corridors", office, "handheld"),
+    "room": SceneKind("one furnished room of 5 by 4 m", room, "handheld"),
     "stairs": SceneKind("a stairwell over four storeys, with a small hall on each", stairs, "handheld"),
     "house": SceneKind("furnished rooms on two floors, with a staircase", house, "handheld"),
     "warehouse": SceneKind("racks of pallets 7 m high, and aisles", warehouse, "robot"),
