@@ -34,6 +34,7 @@ from hybridlio.odometry.config import Config
 from hybridlio.odometry.odometry import Odometry
 from hybridlio.runs.recording_check import compare_imu
 from hybridlio.runs.run import Run, run_odometry
+from hybridlio.runs.run_log import HeldBack
 from hybridlio.runs.scale_search import SETTLED_SIGMAS, ScaleSearch
 from hybridlio.smoothing.calibration import IMU_SCALE, OF_GPS, OF_IMU, Calibrated, CalibrationPriors, Parameter
 
@@ -111,6 +112,7 @@ class _Search:
         self._share = 1.0  # of a clock's error that a round shows
         self._found: Calibrated | None = None
         self._scale: ScaleSearch | None = None
+        self._warnings: HeldBack | None = None  # of the last round; those before concern what was replaced
 
     def start(self) -> None:
         """Correct units, and take the clocks' offset from the check of recordings, which costs a part of a round.
@@ -142,7 +144,8 @@ class _Search:
             def odometry(text: str, done: int, total: int, number: int = number) -> None:
                 self._report(f"scale, round {number}: {text}", done, total)
 
-            path = self._run(odometry).odometry.record().online
+            with HeldBack() as self._warnings:
+                path = self._run(odometry).odometry.record().online
             self._now = replace(self._now, imu=self._scale.correct(path, self._now))
             if self._scale.is_settled:
                 break
@@ -153,11 +156,12 @@ class _Search:
         def odometry(text: str, done: int, total: int) -> None:
             self._report(f"odometry, round {number}: {text}", done, total)
 
-        run = self._run(odometry)
         uses_gps = bool(set(self._priors.names) & set(OF_GPS))
         # a run that trusts the IMU less does so for the wrong calibration, which here is a variable
-        record = replace(run.odometry.record(), imu_noise=self._config.imu_noise or self._now.imu_noise or ImuNoise())
-        smoothed = smooth(record, gps=uses_gps, calibrate=self._priors)
+        imu_noise = self._config.imu_noise or self._now.imu_noise or ImuNoise()
+        with HeldBack() as self._warnings:
+            record = replace(self._run(odometry).odometry.record(), imu_noise=imu_noise)
+            smoothed = smooth(record, gps=uses_gps, calibrate=self._priors)
         found: Calibrated = smoothed.found["calibration"]
         sigmas = {one.name: one.sigmas for one in found.parameters}
         factor = smoothed.verdict.variance_factor
@@ -202,7 +206,9 @@ class _Search:
         return replace(found, covariance=found.covariance / self._share**2)
 
     def result(self) -> Calibrated:
-        """Return what the last round found."""
+        """Return what the last round found, after its warnings."""
+        if self._warnings is not None:
+            self._warnings.show()
         found = self._found or Calibrated(self._stated, 0.0, 0.0, ())
         found = replace(found, imu_time_offset_s=self._stated_offset_s + self._offset_s)
         return found if self._scale is None else self._scale.added_to(found, self._stated_scale)

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from pathlib import Path
+from typing import Any
 
 import handheld
 import numpy as np
@@ -14,6 +16,7 @@ from hybridlio.core.imu_scale import ImuScale
 from hybridlio.core.sensors import ImuSamples
 from hybridlio.datasets.calibration_yaml import read_calibration_yaml
 from hybridlio.datasets.sequence import Sequence
+from hybridlio.graph.run.smooth import smooth
 from hybridlio.odometry.config import Config
 from hybridlio.runs.calibrate import _Search
 from hybridlio.smoothing.calibration import OF_IMU, Calibrated, CalibrationPriors, Parameter
@@ -34,8 +37,28 @@ def wrong() -> Sequence:
 
 
 @pytest.fixture(scope="module")
-def found(wrong: Sequence) -> Calibrated:
-    return hl.calibrate(wrong)
+def searched(wrong: Sequence) -> tuple[Calibrated, list[str], int]:
+    """The calibration that is found, the log where every round warns, and the number of rounds."""
+    shown, rounds, log = list[str](), list[int](), logging.getLogger("hybridlio")
+
+    def smooth_with_warning(*arguments: Any, **options: Any) -> Any:
+        rounds.append(len(rounds))
+        logging.getLogger("hybridlio.graph.run.smooth").warning("of round %d", len(rounds))
+        return smooth(*arguments, **options)
+
+    handler = logging.Handler()
+    handler.emit = lambda record: shown.append(record.getMessage())  # type: ignore[method-assign]
+    log.addHandler(handler)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hybridlio.runs.calibrate.smooth", smooth_with_warning)
+        found = hl.calibrate(wrong)
+    log.removeHandler(handler)
+    return found, shown, len(rounds)
+
+
+@pytest.fixture(scope="module")
+def found(searched: tuple[Calibrated, list[str], int]) -> Calibrated:
+    return searched[0]
 
 
 def test_a_walk_through_a_room_gives_the_mounting_and_the_clock(found: Calibrated):
@@ -67,6 +90,13 @@ def test_a_recording_without_what_is_needed_is_refused(wrong: Sequence):
         hl.calibrate(dataclasses.replace(wrong, imu=ImuSamples.empty()))
     with pytest.raises(ConfigError, match="lever_arm needs GPS fixes"):
         hl.calibrate(wrong, ("lever_arm",))
+
+
+def test_warnings_of_rounds_before_the_last_are_not_shown(searched: tuple[Calibrated, list[str], int]):
+    """They concern a calibration that the next round replaced."""
+    _, shown, rounds = searched
+    assert rounds > 2
+    assert [text for text in shown if text.startswith("of round")] == [f"of round {rounds}"]
 
 
 @pytest.mark.parametrize("share", [0.15, 0.4, 1.0])
