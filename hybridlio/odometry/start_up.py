@@ -17,7 +17,7 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RefinesAgain, RelativePose, State
 from hybridlio.core.motion_limits import BRIDGED_ACCELERATION_SIGMA_M_S2
-from hybridlio.core.sensors import NS_PER_S, Frame, ImuSamples, Scan
+from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuSamples, Scan
 from hybridlio.core.start_state import start_state
 from hybridlio.odometry.pipeline import Pipeline, timed
 from hybridlio.odometry.second_pass import motion_for_second_pass
@@ -34,6 +34,12 @@ _log = logging.getLogger(__name__)
 # after three repetitions, each from the answer before, it no longer changes.
 _REPETITIONS_WITHOUT_IMU = 3
 _LEVELLING_NS = NS_PER_S  # samples this long before the first scan help to find the direction of gravity
+# Of a platform at rest: standard deviations of its samples within a step, over those of consumer IMUs (0.003 rad/s and
+# 0.03 m/s² at 200 Hz) and a standing person's tremor, and below those of a walk (from 0.3 m/s²) or of motors.
+_QUIET_RAD_S, _QUIET_M_S2, _FEWEST_QUIET, _BIAS_SIGMAS = 0.02, 0.15, 5, 3.0
+_REST_M_S = 0.1  # 1 cm at 10 Hz, the error of a step; a standing person sways by less
+_MOST_LEVEL = 0.5  # sine of the angle between an open direction and the vertical
+_ANY_TURN_RAD = 10.0
 
 
 def start_residual(pipeline: Pipeline) -> None:
@@ -86,6 +92,13 @@ def measure_step(
         before: the backend's state at the scan before.
         seconds: gets the time spent.
     """
+    compensated, step = _measured(pipeline, frame, initial, before, seconds)
+    return compensated, held_at_rest(pipeline.calibration, frame, step, before)
+
+
+def _measured(
+    pipeline: Pipeline, frame: Frame, initial: RelativePose, before: State, seconds: dict[str, float]
+) -> tuple[Frame, RelativePose]:
     residual, is_first_step = pipeline.residual, pipeline.state is None
     repeats = not is_first_step or repeats_pattern(pipeline.first.scan, frame.scan)
     if not repeats and isinstance(residual, ScanMatching):
@@ -108,6 +121,44 @@ def measure_step(
         own = None if pipeline.start_search.leads else _pose_after(pipeline, before, answer[1])
         return _searched(pipeline, pipeline.start_search, frame, seconds, own) or answer
     return answer
+
+
+def held_at_rest(calibration: Calibration, frame: Frame, step: RelativePose, before: State) -> RelativePose:
+    """Return the step with no motion along directions that the scan leaves open, if the platform is at rest.
+
+    A lidar that sees neither floor nor ceiling does not observe its height, and the speed upwards at the start is not
+    known otherwise. At rest the IMU is quiet and the scans show no motion on the level. A body that moves so does not
+    rise or sink steadily. Along the level it may: a car in a smooth tunnel looks the same.
+
+    Args:
+        calibration: the extrinsics.
+        frame: with the samples of the step.
+        step: as the scans give it.
+        before: the state at the scan before.
+    """
+    if not (step.ok and len(step.degenerate) and _is_quiet(frame.imu, before)):
+        return step
+    up = (before.T_world_imu[:3, :3] @ calibration.T_imu_lidar[:3, :3]).T @ before.gravity_m_s2
+    level = np.eye(3) - np.outer(up, up) / (up @ up)
+    step_s = (frame.scan.stamp_ns - before.stamp_ns) / NS_PER_S
+    is_still = np.linalg.norm(level @ step.pose[:3, 3]) < _REST_M_S * step_s
+    if not is_still or np.linalg.norm(step.degenerate[:, 3:] @ level, axis=1).max() > _MOST_LEVEL:
+        return step
+    moved, rest = se3.log(step.pose), np.diag(np.r_[np.full(3, _ANY_TURN_RAD), np.full(3, _REST_M_S * step_s)] ** 2)
+    kept = rest @ np.linalg.inv(step.covariance + rest)  # the rest has no motion
+    covariance = kept @ step.covariance
+    drift = None if step.drift is None else kept @ step.drift @ kept.T
+    return replace(step, pose=se3.exp(kept @ moved), covariance=(covariance + covariance.T) / 2, drift=drift)
+
+
+def _is_quiet(imu: ImuSamples, state: State) -> bool:
+    """Return whether samples show neither a turn nor anything that shakes the platform."""
+    if len(imu) < _FEWEST_QUIET:
+        return False
+    bias_sigma = float(np.sqrt(np.diag(state.covariance)[12:15].max()))
+    turns = np.abs(imu.gyro_rad_s.mean(axis=0) - state.gyro_bias_rad_s).max()
+    shaken = imu.gyro_rad_s.std(axis=0).max() > _QUIET_RAD_S or imu.accel_m_s2.std(axis=0).max() > _QUIET_M_S2
+    return bool(not shaken and turns < _QUIET_RAD_S + _BIAS_SIGMAS * bias_sigma)
 
 
 def _search(pipeline: Pipeline, residual: ScanMatching, leads: bool) -> StartSearch:
