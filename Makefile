@@ -22,7 +22,7 @@ help:
 	@echo 'make test     all tests   (WORKERS=2 ARGS="-k kalman")'
 	@echo 'make fuzz     damage the inputs of every reader   (FUZZ="--count 200 --seconds 60 --seed -1"; GUIDED=600: Atheris too, 600 s each)'
 	@echo 'make lint     ruff: rules and format        make format   apply both'
-	@echo 'make types    mypy, strict, on all packages'
+	@echo 'make types    mypy, strict, on all packages and benchmarks'
 	@echo 'make docs     build the documentation into site/, strictly'
 	@echo 'make soak     kill seven commands at random moments and compare their results, and use graphs at random   (KILLS=60 STEPS=600000 SOAK=soak)'
 	@echo 'make audit    known vulnerabilities and licences of the dependencies'
@@ -51,6 +51,7 @@ format: $(READY)
 
 types: $(READY)
 	$(RUN) -m mypy
+	$(RUN) -m mypy benchmarks
 
 docs: $(DOCS_READY)
 	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet

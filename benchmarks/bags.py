@@ -14,6 +14,7 @@ import resource
 import struct
 import time
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -118,12 +119,11 @@ def print_types(path: Path, repeats: int) -> None:
     reader.open()
     kinds = {name: kind for kind, names in TYPES.items() for name in names}
     for topic in (topic for topic in bag.topics.values() if topic.type in kinds):
-        tasks: list[Callable[[], object]] = [lambda t=topic: iterate(reader, t.name)]
+        tasks: list[Callable[[], object]] = [partial(iterate, reader, topic.name)]
         is_cloud = kinds[topic.type] == "lidar"
-        tasks.append((lambda: load(sequence)) if is_cloud else (lambda t=topic: measure(bag, t)))
+        tasks.append(partial(load, sequence) if is_cloud else partial(measure, bag, topic))
         if topic.type == "sensor_msgs/PointCloud2":
-            loader = RosbagDataset(path, topic.name)
-            tasks.append(lambda loader=loader: kiss_icp(loader))
+            tasks.append(partial(kiss_icp, RosbagDataset(path, topic.name)))
         rates = [f"{topic.count / spent:,.0f}" for spent in seconds(tasks, repeats)]
         print(f"| {path.name} | `{topic.type}` | {' | '.join([*rates, '–'][:3])} |")
     reader.close()

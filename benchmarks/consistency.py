@@ -90,14 +90,17 @@ def measure(seeds: range, steps: int, drift_share: float | None) -> dict[str, tu
         true_steps = se3.between(true[:-1], true[1:])
         for backend in BACKENDS:
             odometry, estimates = run(drive, backend)
-            for errors, truth, found in zip(
-                out[backend], (true[1:], true_steps), (estimates[1:], [e.step for e in estimates[1:]]), strict=True
+            of_poses, of_steps = out[backend]
+            for errors, truth, found in (
+                (of_poses, true[1:], [(e.pose, e.covariance) for e in estimates[1:]]),
+                (of_steps, true_steps, [(e.step.pose, e.step.covariance) for e in estimates[1:] if e.step]),
             ):
-                errors.add(truth, np.array([e.pose for e in found]), np.array([e.covariance for e in found]))
+                errors.add(truth, *(np.array(part) for part in zip(*found, strict=True)))
         smoothed = hl.smooth(odometry.record())
         of_poses, of_steps = out["smoothed"]
-        poses = smoothed.trajectory.poses
-        of_poses.add(true[1:], poses[1:], smoothed.trajectory.covariances[1:])
+        poses, covariances = smoothed.trajectory.poses, smoothed.trajectory.covariances
+        assert covariances is not None
+        of_poses.add(true[1:], poses[1:], covariances[1:])
         of_steps.add(true_steps, se3.between(poses[:-1], poses[1:]), smoothed.step_covariances)
     return out
 

@@ -16,6 +16,7 @@ import logging
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -75,7 +76,7 @@ def main() -> None:
     options = parser.parse_args()
     logging.disable(logging.INFO)
     rows: dict[str, Row] = {k: row for k, row in _ROWS.items() if any(words in k for words in options.rows)}
-    pooled: list[np.ndarray] = []  # type: ignore[type-arg]
+    pooled: list[Any] = []
     for is_long in (False, True):
         chosen = {name: row for name, row in rows.items() if (name in LONG) == is_long}
         for place, sequence in recordings(options, is_long) if chosen else ():

@@ -12,6 +12,7 @@ import argparse
 import tempfile
 import time
 from pathlib import Path
+from typing import Self
 
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import part_of
@@ -27,6 +28,11 @@ class TimedKeeper(Keeper):
     """Adds up what the run waits for it, and what it computes."""
 
     waited_s = computed_s = beside_s = 0.0
+
+    def __enter__(self) -> Self:
+        """As in the base class."""
+        super().__enter__()
+        return self
 
     def after_scan(self) -> None:
         """As in the base class."""

@@ -71,12 +71,13 @@ def gaps(sequence: Sequence, source: str) -> Iterator[tuple[float, RelativePose,
         if state is not None and source == "lstm":
             learned.predict(frame, state)
         estimate = odometry.step(frame)
-        if source == "lstm":
+        if source == "lstm" and estimate.relative is not None:
             learned.correct(frame, estimate.relative)
         state = odometry.last_state
         if state is None or (frame.scan.stamp_ns - sequence.stamps_ns[0]) / NS_PER_S < next_s:
             continue
         next_s += EVERY_S
+        assert odometry.imu_noise is not None
         steps = InertialSteps(sequence.calibration, odometry.imu_noise)
         for gap_s in GAPS_S:
             end_ns = frame.scan.stamp_ns + round(gap_s * NS_PER_S)

@@ -23,7 +23,7 @@ import argparse
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -53,7 +53,7 @@ class Surfaces:
     def __init__(self, drive: Drive, points: Array) -> None:
         import open3d as o3d
 
-        self._tensor = o3d.core.Tensor
+        self._tensor = cast("Any", o3d.core.Tensor)  # its stubs know no arrays
         self._T_world_first = lidar_poses(drive)[0]
         at = se3.transform(self._T_world_first, points)
         low, high = (np.floor((f(at[:, :2], axis=0)) / TILE_M).astype(int) for f in (np.min, np.max))

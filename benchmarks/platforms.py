@@ -108,7 +108,7 @@ def measure(cell: Cell, options: argparse.Namespace) -> dict[str, Figures]:
 def summary(cells: dict[str, dict[str, Figures]]) -> dict[str, Figures]:
     """Return for each system the means over all cells, and the mean and worst ratio of ours to it."""
     names = list(next(iter(cells.values())))
-    out = {}
+    out: dict[str, Figures] = {}
     for name in names:
         rows = [rows[name] for rows in cells.values()]
         pairs = [(rows[names[0]], rows[name]) for rows in cells.values()]

@@ -46,7 +46,8 @@ def road(kind: str, seed: int, length_m: float) -> tuple[Sequence, Both]:
 
     def both(k: int) -> tuple[Scan, Scan]:
         seen, bare = hits_at(drive, k, pattern, config), hits_at(still, k, pattern, config)
-        return tuple(measured_scan(hits, drive, k, pattern, config) for hits in (seen, standing(seen, bare)))
+        rest = standing(seen, bare)
+        return measured_scan(seen, drive, k, pattern, config), measured_scan(rest, drive, k, pattern, config)
 
     return drive_recording(drive, config), both
 

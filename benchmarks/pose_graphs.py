@@ -13,6 +13,7 @@ import argparse
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -40,9 +41,11 @@ def gtsam_alone(path: Path, is_3d: bool, start: str, optimiser: str = "Levenberg
     graph, values = gtsam.readG2o(str(path), is_3d)
     read_s = time.process_time() - begin
     first = min(values.keys())
-    prior = gtsam.PriorFactorPose3 if is_3d else gtsam.PriorFactorPose2
-    pose = values.atPose3(first) if is_3d else values.atPose2(first)
-    graph.add(prior(first, pose, gtsam.noiseModel.Isotropic.Sigma(6 if is_3d else 3, 1e-6)))
+    noise = gtsam.noiseModel.Isotropic.Sigma(6 if is_3d else 3, 1e-6)
+    if is_3d:
+        graph.add(gtsam.PriorFactorPose3(first, values.atPose3(first), noise))
+    else:
+        graph.add(gtsam.PriorFactorPose2(first, values.atPose2(first), noise))
     begin = time.process_time()
     if start == "own":
         values = gtsam.InitializePose3.initialize(graph) if is_3d else lago(graph)
@@ -58,7 +61,7 @@ def lago(graph: gtsam.NonlinearFactorGraph) -> gtsam.Values:
     """Initialise a 2-D graph by LAGO, with the diagonals of its information matrices."""
     diagonal = gtsam.NonlinearFactorGraph()
     for k in range(graph.size()):
-        factor = graph.at(k)
+        factor: Any = graph.at(k)
         keys = factor.keys()
         if len(keys) == 2:
             sigmas = 1 / np.sqrt(np.diag(factor.noiseModel().information()))
@@ -113,7 +116,7 @@ def bad_starts(count: int, extent_m: float, seeds: int) -> dict[str, np.ndarray]
 def compare_bad_starts(path: Path, seeds: int) -> None:
     best = min(gtsam_alone(path, True, "given").error, gtsam_alone(path, True, "own").error, ours(path).error)
     graph = PoseGraph.load(path)
-    extent_m = float(np.ptp([graph.initial(key)[:3, 3] for key in graph.keys], axis=0).max())
+    extent_m = float(np.ptp([np.asarray(graph.initial(key))[:3, 3] for key in graph.keys], axis=0).max())
     for name, poses in bad_starts(len(graph), extent_m, seeds).items():
         for key, pose in zip(graph.keys, poses, strict=True):
             graph.set_initial(key, pose)

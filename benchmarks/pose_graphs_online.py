@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import time
+from typing import Literal
 
 import numpy as np
 from common import resident_mib
@@ -25,7 +26,14 @@ _SIGMAS = np.r_[np.full(3, 1e-3), np.full(3, 0.02)]  # of a step: rad, m
 _LOOP_SIGMAS = 5 * _SIGMAS
 
 
-def drive(backend: str, poses: int, first: int, loop_every: int, lag: int, robust: str | None) -> None:
+def drive(
+    backend: Literal["incremental", "fixed-lag"],
+    poses: int,
+    first: int,
+    loop_every: int,
+    lag: int,
+    robust: str | None,
+) -> None:
     rng = np.random.default_rng(0)
     step = np.array([0, 0, 2 * np.pi / _LAP, 1.0, 0, 0])
     graph = PoseGraph()

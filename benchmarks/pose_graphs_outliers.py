@@ -22,24 +22,32 @@ from hybridlio.graph.model.measurements import Factor
 _GOOD_PERCENT = 1.0  # of the spread, from which a result counts as right
 
 
+def _length(factor: Factor) -> int:
+    i, j = factor.keys
+    assert isinstance(i, int)
+    assert isinstance(j, int)
+    return abs(i - j)
+
+
 def add_wrong_loops(graph: PoseGraph, poses: Array, share: float, group: int, seed: int) -> set[int]:
     """Add wrong loops, a share of the right ones, in groups; return their ids."""
     rng, keys = np.random.default_rng(seed), graph.keys
     if len(keys) < 3 * group:
         raise SystemExit(f"{len(keys)} poses are too few for groups of {group} wrong loops")
     between = [factor for factor in graph.factors.values() if factor.kind == "between"]
-    loops = [factor for factor in between if abs(factor.keys[0] - factor.keys[1]) != 1]
+    loops = [factor for factor in between if _length(factor) != 1]
     wrong: set[int] = set()
     while len(wrong) < round(share * len(loops)):
         i, j = (int(k) for k in rng.choice(len(keys) - group, 2, replace=False))
         copied = loops[rng.integers(len(loops))]
         if abs(i - j) <= group:
             continue
-        T_i_j = to_matrices(copied.measured[None])[0]
+        T_i_j, noise = to_matrices(copied.measured[None])[0], copied.noise
+        assert noise is not None
         for k in range(group):
             step = se3.inverse(se3.between(poses[i], poses[i + k])) @ T_i_j @ se3.between(poses[j], poses[j + k])
-            step = step @ se3.exp(_error(rng, copied.noise.covariance)) if k else step
-            wrong.add(graph.add_between(keys[i + k], keys[j + k], step, information=copied.noise.information))
+            step = step @ se3.exp(_error(rng, noise.covariance)) if k else step
+            wrong.add(graph.add_between(keys[i + k], keys[j + k], step, information=noise.information))
     return wrong
 
 

@@ -20,6 +20,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +35,7 @@ Planned = tuple[SimulationConfig, LidarModel]
 
 VALIDATION_DRIVES = 10
 PATHS = ("00", "02", "03", "05", "07", "08")  # 01 and 06 are test drives
-TESTS = {
+TESTS: dict[int, dict[str, Any]] = {
     3006: {"poses": "06"},
     3011: {"poses": "01"},
     3021: {"speed_m_s": 12.0, "length_m": 1200.0},
@@ -56,6 +57,10 @@ def drive_of(seed: int, poses: Path | None, folder: Path) -> Planned:
     return SimulationConfig(
         **config.model_dump(include={"seed", "seconds", "traffic_per_km", "parked"}), poses=part
     ), lidar
+
+
+def _planned_test(seed: int, poses: Path, _: Path) -> Planned:
+    return test_drive(seed, poses)
 
 
 def test_drive(seed: int, poses: Path) -> Planned:
@@ -112,7 +117,7 @@ def main() -> None:
     if options.poses is None:
         parser.error("--test needs --poses: two test drives follow real paths")
     for seed in TESTS:
-        write(options.folder / "test", lambda _, seed=seed: test_drive(seed, options.poses))
+        write(options.folder / "test", partial(_planned_test, seed, options.poses))
 
 
 if __name__ == "__main__":

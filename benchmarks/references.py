@@ -34,7 +34,7 @@ def difference(a: Array, b: Array, steps: int) -> Array:
     """Return the RMS difference of the motions over ``steps`` scans: rotation in degrees, translation in metres."""
     ours, theirs = (se3.between(poses[:-steps], poses[steps:]) for poses in (a, b))
     square = (se3.log(se3.between(ours, theirs)) ** 2).reshape(-1, 2, 3).sum(axis=2).mean(axis=0)
-    return np.sqrt(square) * [180 / np.pi, 1.0]
+    return np.asarray(np.sqrt(square) * [180 / np.pi, 1.0])
 
 
 def error_of_reference(reference: Array, a: Array, b: Array, steps: int) -> Array:
@@ -82,8 +82,8 @@ def scatter_of_drift(stamps_ns: NDArray[np.int64], a: Array, b: Array, error: Ar
     for _ in range(_DRAWS):
         noisy = midway @ se3.exp(sigmas * rng.standard_normal((len(midway), 6)))
         reference = Trajectory(stamps_ns, se3.between(noisy[0], noisy))
-        one, other = (drift_of(evaluate(Trajectory(stamps_ns, poses), reference)) for poses in (a, b))
-        found.append(np.subtract(one, other))
+        one, other = (np.array(drift_of(evaluate(Trajectory(stamps_ns, poses), reference)), float) for poses in (a, b))
+        found.append(one - other)
     return np.asarray(np.std(found, axis=0))
 
 

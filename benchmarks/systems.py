@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -193,7 +193,11 @@ def our_systems(initial_poses: str, residuals: str, backends: str) -> dict[str, 
     """
     default = Config()
     asked = {"initial_pose": initial_poses, "residual": residuals, "backend": backends}
-    known = {"initial_pose": INITIAL_POSE_SOURCES, "residual": RESIDUAL_SOURCES, "backend": BACKENDS}
+    known: dict[str, Iterable[str]] = {
+        "initial_pose": INITIAL_POSE_SOURCES,
+        "residual": RESIDUAL_SOURCES,
+        "backend": BACKENDS,
+    }
     named = {seam: text.split(",") if text != "each" else [getattr(default, seam)] for seam, text in asked.items()}
     chosen = [dict(zip(named, names, strict=True)) for names in product(*named.values())]
     for seam in (seam for seam, text in asked.items() if text == "each"):

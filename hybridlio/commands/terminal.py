@@ -5,11 +5,13 @@ from __future__ import annotations
 import functools
 import io
 import logging
+import os
 import sys
 import textwrap
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from typing import IO, Any, cast
 
 from rich.console import Console
 from rich.measure import Measurement
@@ -25,14 +27,25 @@ _WIDEST_TABLE = 240  # columns; more than any table here needs
 
 def print_result(text: str) -> None:
     """Print a line to stdout without markup; on a terminal it wraps between words, elsewhere not at all."""
-    _print(Console(), Text(strip_control(text)))
+    with _named_stdout():
+        _print(Console(), Text(strip_control(text)))
+
+
+@contextmanager
+def _named_stdout() -> Iterator[None]:
+    """Name stdout in an error of the system's, such as of a full disk."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, "<stdout>") from None
 
 
 def print_table(table: Table) -> None:
     """Print a table to stdout at its full width, even where the terminal is narrower."""
     console, wide = Console(), Console(width=_WIDEST_TABLE)
     needed = Measurement.get(wide, wide.options, table).maximum
-    (console if needed <= console.width else Console(width=needed)).print(table)
+    with _named_stdout():
+        (console if needed <= console.width else Console(width=needed)).print(table)
 
 
 def print_message(text: str, style: str = "red") -> None:
@@ -211,7 +224,41 @@ class _Pace:
         return units / max(self._per_s, 1e-9)
 
 
+class _LastingStderr:
+    """stderr as it is at each use. Once it takes nothing more (a closed pipe, a full disk), it is silent.
+
+    Progress that nobody sees must not stop a run of hours.
+    """
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    @property
+    def _stream(self) -> Any:
+        return getattr(sys.stderr, "rich_proxied_file", sys.stderr)  # below what a bar puts in its place
+
+    def write(self, text: str) -> int:
+        """Write text, or mute stderr."""
+        with self._muted_if_broken():
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush, or mute stderr."""
+        with self._muted_if_broken():
+            self._stream.flush()
+
+    @contextmanager
+    def _muted_if_broken(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError:
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, self._stream.fileno())  # what is buffered would fail again at the end of the process
+            os.close(nowhere)
+
+
 @functools.cache
 def _stderr() -> Console:
     """Return the one console for stderr, which keeps bars and lines apart; it looks stderr up at each print."""
-    return Console(stderr=True)
+    return Console(file=cast("IO[str]", _LastingStderr()))

@@ -76,7 +76,7 @@ def locked(lock_file: Path, wait: bool = True) -> Iterator[str | None]:
         None if the lock is held, as always with ``wait``; else the process that holds it.
 
     Raises:
-        DataError: the file cannot be created.
+        DataError: the file cannot be created or written.
     """
     while True:
         make_folder(lock_file.parent)
@@ -96,13 +96,19 @@ def locked(lock_file: Path, wait: bool = True) -> Iterator[str | None]:
             if not _is_same_file(file, lock_file):
                 continue  # the process that held the lock has removed the file meanwhile
             try:
-                file.truncate(0)
-                file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
-                file.flush()
+                _sign(file, lock_file)
                 yield None
             finally:
                 lock_file.unlink(missing_ok=True)  # before it is released: nobody acquires a lock that is then removed
             return
+
+
+def _sign(file: IO[str], lock_file: Path) -> None:
+    try:
+        file.truncate(0)
+        os.write(file.fileno(), f"process {os.getpid()} on {socket.gethostname()}\n".encode())  # at once, or not at all
+    except OSError as error:
+        raise DataError(f"cannot write to {lock_file.parent}: {error.strerror}; choose another folder") from None
 
 
 def _is_same_file(file: IO[str], path: Path) -> bool:

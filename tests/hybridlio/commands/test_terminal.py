@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -73,3 +76,22 @@ def test_progress_says_what_each_stage_counts_and_begins_anew_with_it(capsys: py
         "map: 40/40 tiles",
     ]
     assert "tiles/s" in lines[-1]
+
+
+def test_progress_that_cannot_be_written_stops_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Path("/dev/full").open("w") as full:
+        monkeypatch.setattr(sys, "stderr", full)
+        for _ in range(2):
+            print_message("a line")
+        with progress("a run") as report:
+            report("", 1, 1)
+
+
+def test_results_that_cannot_be_written_are_an_error_that_names_stdout(monkeypatch: pytest.MonkeyPatch) -> None:
+    full = Path("/dev/full").open("w")  # noqa: SIM115  closing it fails too
+    monkeypatch.setattr(sys, "stdout", full)
+    with pytest.raises(OSError, match="No space left") as caught:
+        print_result("a line")
+    assert caught.value.filename == "<stdout>"
+    with contextlib.suppress(OSError):
+        full.close()

@@ -1,3 +1,4 @@
+import errno
 import os
 import socket
 import stat
@@ -102,3 +103,15 @@ def test_a_lock_that_cannot_be_created_names_its_place(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match="file"), locked(tmp_path / "file" / "lock"):
         pass
+
+
+def test_a_lock_on_a_full_disk_is_an_error_that_names_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "write", full)
+    with pytest.raises(DataError, match=f"cannot write to {tmp_path}: No space left"), locked(tmp_path / "lock"):
+        pass
+    assert not (tmp_path / "lock").exists()
