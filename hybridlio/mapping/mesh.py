@@ -67,6 +67,7 @@ def write_mesh(path: Path, points: PointMap, voxel_m: float, colour: str = "heig
     density = np.asarray(raw, dtype=np.float64)
     mesh.remove_vertices_by_mask((density < np.quantile(density, _UNSUPPORTED)).tolist())
     mesh.compute_vertex_normals()
+    mesh.vertex_colors = o3d.utility.Vector3dVector(np.clip(np.asarray(mesh.vertex_colors), 0.0, 1.0))  # extrapolated
     with atomic_path(path) as part:
         if not o3d.io.write_triangle_mesh(part, mesh):
             raise DataError(f"{path}: the mesh cannot be written; choose a place with free space")
