@@ -29,8 +29,8 @@ from hybridlio.commands.terminal import progress
 from hybridlio.core import se3, tables
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import InitialPoseSource, RelativePose, State
-from hybridlio.core.imu_scale import ImuScale
-from hybridlio.core.sensors import NS_PER_S, Frame, Scan
+from hybridlio.core.imu_scale import KNOWN_SCALE_SIGMA, ImuScale
+from hybridlio.core.sensors import NS_PER_S, Frame, ImuNoise, Scan
 from hybridlio.datasets.registry import open_sequence
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.graph.run.inertial_steps import InertialSteps
@@ -120,10 +120,18 @@ def measure(folder: Path, kind: str, lidar: str, seed: int, seconds: float) -> d
     sources = {
         "preintegration": (wrong, "preintegration"),
         "lstm": (wrong, "lstm"),
-        "preintegration, scale found": (replace(wrong, imu=correction.corrected(wrong.imu)), "preintegration"),
-        "preintegration, exact IMU": (second, "preintegration"),
+        "preintegration, scale found": (
+            with_scale_sigma(replace(wrong, imu=correction.corrected(wrong.imu)), KNOWN_SCALE_SIGMA),
+            "preintegration",
+        ),
+        "preintegration, exact IMU": (with_scale_sigma(second, 0.0), "preintegration"),
     }
     return {name: errors_of(sequence, source) for name, (sequence, source) in sources.items()}
+
+
+def with_scale_sigma(sequence: Sequence, sigma: float) -> Sequence:
+    """Return the recording with another standard deviation of its gyroscope's scale."""
+    return replace(sequence, imu_noise=replace(sequence.imu_noise or ImuNoise(), gyro_scale_sigma=sigma))
 
 
 def main() -> None:

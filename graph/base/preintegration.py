@@ -5,6 +5,7 @@ Forster, Carlone, Dellaert, Scaramuzza, "On-Manifold Preintegration for Real-Tim
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -46,6 +47,18 @@ def sampling_noise(noise: ImuNoise, gap_s: float) -> tuple[float, float]:
     return float(np.hypot(noise.accel_m_s2_sqrt_hz, accel)), float(np.hypot(noise.gyro_rad_s_sqrt_hz, gyro))
 
 
+def with_scale_error(noise: ImuNoise, imu: ImuSamples, state: State) -> ImuNoise:
+    """Return the noise of the samples with that of the gyroscope's unknown scale in it.
+
+    After a turn θ a scale and misalignment of relative standard deviation s leave each axis s·θ off, as white noise of
+    density s·θ/√t does after the time t. The turn that counts is the largest on the way: a motion to and fro takes the
+    error back.
+    """
+    duration_s = float(imu.stamps_ns[-1] - imu.stamps_ns[0]) / NS_PER_S
+    by_scale = noise.gyro_scale_sigma * imu.largest_turn_rad(state.gyro_bias_rad_s) / np.sqrt(duration_s)
+    return replace(noise, gyro_rad_s_sqrt_hz=float(np.hypot(noise.gyro_rad_s_sqrt_hz, by_scale)))
+
+
 def preintegration_params(noise: ImuNoise, gap_s: float, gravity: Array) -> gtsam.PreintegrationCombinedParams:
     """Return GTSAM's parameters for samples at most ``gap_s`` seconds apart, with gravity ``(3,)`` in world."""
     accel, gyro = sampling_noise(noise, gap_s)
@@ -67,11 +80,16 @@ def preintegrate(imu: ImuSamples, state: State, noise: ImuNoise) -> gtsam.Preint
     """Preintegrate the samples from the state's stamp to the last one, with the state's biases and gravity.
 
     The trapezoidal rule: each step between two samples takes their mean. The noise grows with the longest step
-    (:func:`sampling_noise`).
+    (:func:`sampling_noise`) and with the turn (:func:`with_scale_error`).
 
     Raises:
         DataError: there are fewer than two samples.
     """
+    _check_count(imu, state)
+    return _preintegrated(imu, state, with_scale_error(noise, imu, state))
+
+
+def _preintegrated(imu: ImuSamples, state: State, noise: ImuNoise) -> gtsam.PreintegratedCombinedMeasurements:
     pim = gtsam.PreintegratedCombinedMeasurements(_params_for(imu, state, noise), gtsam_bias(state))
     _integrate(pim, imu, state)
     return pim
@@ -81,14 +99,19 @@ def preintegrate_constant_biases(
     imu: ImuSamples, state: State, noise: ImuNoise
 ) -> gtsam.PreintegratedImuMeasurements:  # fmt: skip
     """Preintegrate as :func:`preintegrate`, for biases that do not walk."""
-    pim = gtsam.PreintegratedImuMeasurements(_params_for(imu, state, noise), gtsam_bias(state))
+    _check_count(imu, state)
+    params = _params_for(imu, state, with_scale_error(noise, imu, state))
+    pim = gtsam.PreintegratedImuMeasurements(params, gtsam_bias(state))
     _integrate(pim, imu, state)
     return pim
 
 
-def _params_for(imu: ImuSamples, state: State, noise: ImuNoise) -> gtsam.PreintegrationCombinedParams:
+def _check_count(imu: ImuSamples, state: State) -> None:
     if len(imu) < 2:
         raise DataError(f"preintegration: {len(imu)} IMU samples after {state.stamp_ns} ns, at least 2 are needed")
+
+
+def _params_for(imu: ImuSamples, state: State, noise: ImuNoise) -> gtsam.PreintegrationCombinedParams:
     longest_s = float(np.diff(imu.stamps_ns).max()) / NS_PER_S
     return preintegration_params(noise, longest_s, state.gravity_m_s2)
 
@@ -151,8 +174,9 @@ def predict_step(pim: gtsam.PreintegratedCombinedMeasurements, state: State) -> 
 def predict_in_parts(imu: ImuSamples, state: State, noise: ImuNoise) -> tuple[Array, Array]:
     """Return what :func:`predict_step` does for samples of any turn: parts of a quarter turn, one after the other."""
     then, J, added = navigation_of(state), np.eye(15), np.zeros((15, 15))
+    noise = with_scale_error(noise, imu, state)  # of the whole turn: parts have the same error of scale
     for part in _parts(imu, state):
-        pim = preintegrate(part, state, noise)
+        pim = _preintegrated(part, state, noise)
         then, by_part = navigation_after(pim, then, gtsam_bias(state))
         J, added = by_part @ J, by_part @ added @ by_part.T + pim.preintMeasCov()
     return _step(state, then, J, added, float(imu.stamps_ns[-1] - imu.stamps_ns[0]) / NS_PER_S)

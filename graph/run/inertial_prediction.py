@@ -29,6 +29,7 @@ class InertialPrediction:
         self.stamp_ns = state.stamp_ns  # of the last sample that was integrated
         self._state, self._noise, self._bias = state, noise, gtsam_bias(state)
         self._params: dict[float, gtsam.PreintegrationCombinedParams] = {}
+        self._turn, self._largest_turn_rad = np.zeros(3), 0.0  # integral of the rates, and the most of its length
         self._nav = navigation_of(state)
         # GTSAM perturbs a NavState's velocity in the body frame; the state's covariance is of the velocity in world
         to_body = np.eye(15)
@@ -43,6 +44,7 @@ class InertialPrediction:
             values: six for each stamp, angular velocity (rad/s) and specific force (m/s²).
         """
         self._nav, self._covariance = self._after(stamps_ns, values)
+        self._turn, self._largest_turn_rad = self._turned(stamps_ns, values)
         self.stamp_ns = stamps_ns[-1]
 
     def pose_after(self, stamps_ns: Sequence[int], values: Sequence[Values]) -> tuple[Array, Array]:
@@ -74,7 +76,20 @@ class InertialPrediction:
             turned = gtsam.Rot3.Expmap((gyro - self._state.gyro_bias_rad_s) * step_s).rotate(after[3:])
             pim.integrateMeasurement((before[3:] + turned) / 2, gyro, step_s)
         nav, J = navigation_after(pim, self._nav, self._bias)
-        return nav, J @ self._covariance @ J.T + pim.preintMeasCov()
+        covariance = J @ self._covariance @ J.T + pim.preintMeasCov()
+        # of the gyroscope's unknown scale, see with_scale_error: what the largest turn has grown by since
+        grown = self._turned(stamps_ns, values)[1] ** 2 - self._largest_turn_rad**2
+        covariance[:3, :3] += np.eye(3) * self._noise.gyro_scale_sigma**2 * grown
+        return nav, covariance
+
+    def _turned(self, stamps_ns: Sequence[int], values: Sequence[Values]) -> tuple[Array, float]:
+        """Return the rates' integral after samples as for :meth:`advance`, and the most that its length has been."""
+        turn, largest = self._turn, self._largest_turn_rad
+        rates = [np.array(row[:3]) - self._state.gyro_bias_rad_s for row in values]
+        for (begin, end), before, after in zip(pairwise(stamps_ns), rates, rates[1:], strict=False):
+            turn = turn + (before + after) / 2 * ((end - begin) / NS_PER_S)
+            largest = max(largest, float(np.linalg.norm(turn)))
+        return turn, largest
 
     def _params_for(self, longest_s: float) -> gtsam.PreintegrationCombinedParams:
         """Return parameters for the longest step between samples, rounded up to a power of two, to reuse them."""

@@ -12,6 +12,10 @@ from hybridlio.core.sensors import ImuSamples
 
 LARGEST_SHARE = 0.2  # by which a matrix may differ from the identity: sensors keep 3 %; more is a unit or another frame
 
+# Standard deviation of what a known scale of a gyroscope leaves: sensitivity changes by 0.03 % per kelvin (BMI088, data
+# sheet), and an IMU warms up by 10 K.
+KNOWN_SCALE_SIGMA = 3e-3
+
 
 def _identity() -> Array:
     return np.eye(3)

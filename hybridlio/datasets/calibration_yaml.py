@@ -12,7 +12,7 @@ import numpy as np
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.files import read_yaml
-from hybridlio.core.imu_scale import ImuScale
+from hybridlio.core.imu_scale import KNOWN_SCALE_SIGMA, ImuScale
 from hybridlio.core.lidar_models import LIDAR_MODELS, LidarModel
 from hybridlio.core.sensors import MAX_RANGE_M, Calibration, ImuNoise
 from hybridlio.core.setting_checks import SettingError
@@ -80,7 +80,8 @@ def read_calibration_yaml(path: Path, needs_imu: bool = False) -> StatedCalibrat
       offset is found before a run;
     * ``imu_scale``: matrices ``gyro`` and ``accel`` that bring the samples to true scale and orthogonal axes, see
       :class:`hybridlio.core.imu_scale.ImuScale`;
-    * ``imu_noise``: noise densities by the names of :class:`hybridlio.core.sensors.ImuNoise`;
+    * ``imu_noise``: noise densities by the names of :class:`hybridlio.core.sensors.ImuNoise`; with ``imu_scale`` the
+      default of ``gyro_scale_sigma`` is 0.003;
     * ``frames``, ``imu_frame`` and ``lidar_frame``: in place of ``T_imu_lidar``, a list of transforms between frames as
       in a TF tree, each ``parent``, ``child`` and the child's pose in the parent, and the names of the sensors' frames;
     * ``lidars``: where several lidars are merged, the pose of each further one in the first one's frame, by its topic
@@ -132,7 +133,7 @@ def _stated(content: dict[str, Any]) -> StatedCalibration:
     return StatedCalibration(
         calibration=Calibration(T_imu_lidar, T_camera_lidar, read("antenna_imu_m", _three_numbers, None)),
         lidar=lidar,
-        imu_noise=read("imu_noise", _imu_noise, None),
+        imu_noise=_stated_noise(content),
         imu_time_offset_s=read("imu_time_offset_s", _time_offset_s, None),
         imu_scale=read("imu_scale", _imu_scale, ImuScale()),
         rate_hz=read("rate_hz", lambda key, value: _number(key, value, 0, MAX_RATE_HZ), None),
@@ -221,6 +222,15 @@ def _lidars(key: str, value: Any) -> dict[str, Array]:
     if not isinstance(value, dict):
         raise DataError(f"{key}: expected a mapping of topics or folders to transforms, got {value!r}")
     return {str(name): parse_transform(f"{key}: {name}", part) for name, part in value.items()}
+
+
+def _stated_noise(content: dict[str, Any]) -> ImuNoise | None:
+    """Return the stated noise; the gyroscope's scale is known better where ``imu_scale`` states it."""
+    values = content.get("imu_noise")
+    noise = None if values is None else _imu_noise("imu_noise", values)
+    if content.get("imu_scale") is None or "gyro_scale_sigma" in (values or {}):
+        return noise
+    return replace(noise or ImuNoise(), gyro_scale_sigma=KNOWN_SCALE_SIGMA)
 
 
 def _imu_noise(key: str, value: Any) -> ImuNoise:

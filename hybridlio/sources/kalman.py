@@ -69,7 +69,8 @@ class Kalman:
         H = np.zeros((3, 12))
         H[:, _W] = H[:, _B] = np.eye(3)
         rate = self._R_lidar_imu @ frame.imu.gyro_rad_s.mean(axis=0)
-        R = np.eye(3) * self._noise.gyro_rad_s_sqrt_hz**2 / dt_s
+        by_scale = self._noise.gyro_scale_sigma * float(np.linalg.norm(rate))
+        R = np.eye(3) * (self._noise.gyro_rad_s_sqrt_hz**2 / dt_s + by_scale**2)
         self._filter.update(rate[:, None], R=R, H=H)
 
     def _step(self, dt_s: float, from_imu: bool) -> RelativePose:

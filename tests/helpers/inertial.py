@@ -11,7 +11,7 @@ from hybridlio.core.sensors import NS_PER_S, ImuNoise, ImuSamples
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 CERTAIN = 1e-18 * np.eye(15)
-NOISE = ImuNoise()
+NOISE = ImuNoise(gyro_scale_sigma=0.0)  # of samples whose only errors are noise and biases
 
 
 def state_at(T: np.ndarray, velocity: np.ndarray, **changes: object) -> State:

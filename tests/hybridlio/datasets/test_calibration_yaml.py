@@ -141,6 +141,14 @@ class TestInAFolder:
         np.testing.assert_array_equal(sequence.imu.accel_m_s2, before.accel_m_s2)
         assert any("corrected by the scale" in note for note in sequence.notes)
 
+    @pytest.mark.parametrize(("stated", "sigma"), [("", 0.003), ("imu_noise: {gyro_scale_sigma: 0.001}\n", 0.001)])
+    def test_a_stated_scale_is_believed_unless_its_error_is_stated_too(
+        self, recordings: Any, tmp_path: Path, stated: str, sigma: float
+    ) -> None:
+        folder = recordings.write_folder(tmp_path, recordings.ride)
+        self.append(folder, "imu_scale: {gyro: [[1.01, 0, 0], [0, 1, 0], [0, 0, 1]]}\n" + stated)
+        assert open_sequence(folder).imu_noise == ImuNoise(gyro_scale_sigma=sigma)
+
     def test_noise_and_ranges_reach_the_frames(self, recordings: Any, tmp_path: Path) -> None:
         folder = recordings.write_folder(tmp_path, recordings.ride)
         self.append(folder, "imu_noise: {accel_m_s2_sqrt_hz: 0.05}\nlidar: {min_range_m: 8, max_range_m: 20}\n")
