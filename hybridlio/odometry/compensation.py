@@ -33,7 +33,15 @@ class MotionCompensation:
         return frame.scan.time_offsets_ns is not None
 
     def compensate(
-        self, frame: Frame, T_start_end: Array, start_ns: int, end_ns: int, state: State | None, imu: ImuSamples
+        self,
+        frame: Frame,
+        T_start_end: Array,
+        start_ns: int,
+        end_ns: int,
+        state: State | None,
+        imu: ImuSamples,
+        *,
+        turns_by_gyroscope: bool = True,
     ) -> Frame:
         """Return the frame with a compensated scan.
 
@@ -43,13 +51,14 @@ class MotionCompensation:
             start_ns, end_ns: stamps between which that motion takes place.
             state: at ``start_ns``; None if it is not known yet.
             imu: samples between both stamps.
+            turns_by_gyroscope: whether the gyroscope's rates hold, see :func:`inertial_motion`.
         """
         if not self.applies_to(frame):
             return frame
         motion = None
         if state is not None and len(imu):
             samples = ImuSamples.concatenate([imu, frame.sweep_imu])
-            motion = inertial_motion(samples, state, T_start_end, end_ns, self._calibration)
+            motion = inertial_motion(samples, state, T_start_end, end_ns, self._calibration, turns_by_gyroscope)
         if motion is None:
             step = constant_twist(T_start_end, start_ns, end_ns)
             bias = np.zeros(3) if state is None else state.gyro_bias_rad_s

@@ -12,7 +12,12 @@ from hybridlio.core.trajectory import Trajectory
 
 
 def inertial_motion(
-    imu: ImuSamples, state: State, T_start_end: Array, end_ns: int, calibration: Calibration
+    imu: ImuSamples,
+    state: State,
+    T_start_end: Array,
+    end_ns: int,
+    calibration: Calibration,
+    turns_by_gyroscope: bool = True,
 ) -> Trajectory | None:
     """Return lidar poses at the samples: rotation from the gyroscope, and the bend of the path from the accelerometer.
 
@@ -25,6 +30,7 @@ def inertial_motion(
         T_start_end: ``(4, 4)`` lidar motion from the state's stamp to ``end_ns``.
         end_ns: a stamp.
         calibration: the extrinsics.
+        turns_by_gyroscope: whether the rates hold; else they are changed to turn as ``T_start_end`` does.
 
     Returns:
         Poses ``T_world_lidar`` at the samples' stamps; None if there is no sample at both ends, or a gap.
@@ -36,15 +42,41 @@ def inertial_motion(
     if np.diff(stamps).max() > LONGEST_INTERPOLATION_NS:
         return None
     since_s = (stamps - state.stamp_ns) / NS_PER_S
-    R_world_imu = _rotations(imu.gyro_rad_s - state.gyro_bias_rad_s, since_s)
+    rates = imu.gyro_rad_s - state.gyro_bias_rad_s
+    R_world_imu = _rotations(rates, since_s)
+    if not turns_by_gyroscope:
+        turn = R_world_imu[i].T @ R_world_imu[j]
+        missing = se3.so3_log(turn.T @ _of_imu(T_start_end, calibration)[:3, :3])
+        R_world_imu = _rotations(_turned_further(rates, since_s, slice(int(i), int(j) + 1), missing), since_s)
     R_world_imu = state.T_world_imu[:3, :3] @ R_world_imu[i].T @ R_world_imu
     force = (imu.accel_m_s2 - state.accel_bias_m_s2)[..., None]
     bend = _bend((R_world_imu @ force)[..., 0] + state.gravity_m_s2, since_s, int(i))
-    T_imu_lidar = calibration.T_imu_lidar
-    step = T_imu_lidar @ T_start_end @ se3.inverse(T_imu_lidar)
+    step = _of_imu(T_start_end, calibration)
     velocity = (state.T_world_imu[:3, :3] @ step[:3, 3] - bend[j]) / since_s[j]
     poses = se3.make(R_world_imu, bend + since_s[:, None] * velocity)
-    return Trajectory(stamps, poses @ T_imu_lidar)
+    return Trajectory(stamps, poses @ calibration.T_imu_lidar)
+
+
+def lidar_turn(imu: ImuSamples, state: State, calibration: Calibration) -> Array:
+    """Return the lidar's rotation ``(3, 3)`` from the first sample to the last by the gyroscope."""
+    R = _rotations(imu.gyro_rad_s - state.gyro_bias_rad_s, (imu.stamps_ns - imu.stamps_ns[0]) / NS_PER_S)[-1]
+    R_imu_lidar = calibration.T_imu_lidar[:3, :3]
+    return np.asarray(R_imu_lidar.T @ R @ R_imu_lidar)
+
+
+def _of_imu(T_start_end: Array, calibration: Calibration) -> Array:
+    """Return the IMU's motion for the lidar's."""
+    return np.asarray(calibration.T_imu_lidar @ T_start_end @ se3.inverse(calibration.T_imu_lidar))
+
+
+def _turned_further(rates: Array, times_s: Array, step: slice, missing: Array) -> Array:
+    """Return rates ``(S, 3)`` that turn further by a rotation vector over a step, where they turn most.
+
+    An error of scale grows with the rate.
+    """
+    speeds = np.linalg.norm(rates, axis=1)
+    turned = float(np.trapezoid(speeds[step], times_s[step]))
+    return np.asarray(rates + missing * speeds[:, None] / turned) if turned > 0 else rates
 
 
 def _rotations(rates: Array, times_s: Array) -> Array:

@@ -26,6 +26,7 @@ from hybridlio.core.estimates import (
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise
 from hybridlio.odometry.compensation import MotionCompensation
 from hybridlio.odometry.estimate import InertialState
+from hybridlio.odometry.second_pass import SecondCompensation
 from hybridlio.odometry.start_search import StartSearch
 from hybridlio.sources.imu_trust import ImuTrust, without_imu
 from hybridlio.sources.innovation_gate import GateResult, InnovationGate
@@ -108,12 +109,7 @@ class Pipeline:
         return _checked(self.initial_pose.predict(frame, state), self.initial_pose.name)
 
     def refine(
-        self,
-        frame: Frame,
-        initial: RelativePose,
-        state: State,
-        seconds: dict[str, float],
-        again: RelativePose | None = None,
+        self, frame: Frame, initial: RelativePose, state: State, seconds: dict[str, float]
     ) -> tuple[Frame, RelativePose]:
         """Compensate the scan's motion by the initial pose, then refine that pose.
 
@@ -122,8 +118,6 @@ class Pipeline:
             initial: initial relative pose of the step to it.
             state: the backend's state at the scan before.
             seconds: gets the time spent in both stages.
-            again: None, or the initial relative pose from which the residual source refines its last scan again;
-                ``initial`` then only compensates.
 
         Returns:
             The compensated frame and the refined relative pose, with the noise of compensation in its covariance.
@@ -132,16 +126,31 @@ class Pipeline:
             ConfigError: the source returned something else than a RelativePose.
         """
         with timed(seconds, "motion compensation"):
-            compensated = self.compensation.compensate(
-                frame, initial.pose, state.stamp_ns, frame.scan.stamp_ns, state, frame.imu
-            )
-            noise = self.compensation.noise(frame)
+            compensated = self._compensated(frame, initial.pose, state)
         with timed(seconds, "residual"):
-            if again is not None and isinstance(self.residual, RefinesAgain):
-                relative = self.residual.refine_again(compensated, again)
-            else:
-                relative = _checked(self.residual.refine(compensated, initial), self.residual.name)
-        return compensated, relative if noise is None or not relative.ok else relative.wider(added=noise)
+            relative = _checked(self.residual.refine(compensated, initial), self.residual.name)
+        return compensated, self._with_compensation_noise(frame, relative)
+
+    def refine_again(
+        self, frame: Frame, initial: RelativePose, state: State, second: SecondCompensation
+    ) -> tuple[Frame, RelativePose]:
+        """Compensate the last scan once more, and refine the initial pose by it as :meth:`refine` did.
+
+        The residual source is one that :class:`~hybridlio.core.estimates.RefinesAgain`.
+        """
+        assert isinstance(self.residual, RefinesAgain)
+        compensated = self._compensated(frame, second.T_start_end, state, second.turns_by_gyroscope)
+        return compensated, self._with_compensation_noise(frame, self.residual.refine_again(compensated, initial))
+
+    def _compensated(self, frame: Frame, T_start_end: Array, state: State, turns_by_gyroscope: bool = True) -> Frame:
+        return self.compensation.compensate(
+            frame, T_start_end, state.stamp_ns, frame.scan.stamp_ns, state, frame.imu,
+            turns_by_gyroscope=turns_by_gyroscope,
+        )  # fmt: skip
+
+    def _with_compensation_noise(self, frame: Frame, relative: RelativePose) -> RelativePose:
+        noise = self.compensation.noise(frame)
+        return relative if noise is None or not relative.ok else relative.wider(added=noise)
 
     def apply_gate(
         self, frame: Frame, initial: RelativePose, measured: RelativePose, state: State

@@ -8,13 +8,15 @@ swing by centimetres around the path from scan to scan.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from hybridlio.core import se3
-from hybridlio.core.estimates import RelativePose
-from hybridlio.core.sensors import NS_PER_S, Frame
+from hybridlio.core.arrays import Array
+from hybridlio.core.estimates import RelativePose, State
+from hybridlio.core.sensors import NS_PER_S, Calibration, Frame
+from hybridlio.odometry.inertial_motion import lidar_turn
 
 _LEVER_M = 10.0  # half of a scan's points are nearer; turns a rotation into a displacement
 # Displacement of the sweep's last points, over the spread of the residuals, from which a scan is registered again. The
@@ -22,26 +24,48 @@ _LEVER_M = 10.0  # half of a scan's points are nearer; turns a rotation into a d
 _LEAST_RATIO = 1.0
 
 
-def motion_for_second_pass(
-    frame: Frame, initial: RelativePose, found: RelativePose, before_ns: int
-) -> RelativePose | None:
-    """Return the step by which to compensate a scan once more; None if its points would move by less than their noise.
+@dataclass(frozen=True, eq=False)
+class SecondCompensation:
+    """How to compensate a scan once more.
+
+    Attributes:
+        T_start_end: ``(4, 4)`` lidar motion of the step to the scan.
+        turns_by_gyroscope: whether the gyroscope's rates hold; else they are changed so that they turn as the motion.
+    """
+
+    T_start_end: Array
+    turns_by_gyroscope: bool
+
+
+def second_compensation(
+    frame: Frame, initial: RelativePose, found: RelativePose, before: State, calibration: Calibration
+) -> SecondCompensation | None:
+    """Return how to compensate a scan once more; None if its points would move by less than their noise.
 
     Registration found the step ``f`` with points compensated for the step ``p``. The error of ``p`` is ``(p − f)·T /
-    (T + τ)`` with the step's duration ``T``, since ``f`` errs by ``−τ/T`` of it.
+    (T + τ)`` with the step's duration ``T``, since ``f`` errs by ``−τ/T`` of it. The gyroscope is right within
+    hundredths of a degree, unless its scale is wrong and the step turns by tens of degrees.
 
     Args:
         frame: as recorded.
-        initial: initial relative pose of the step, by which the scan was compensated.
+        initial: initial relative pose of the step, by whose translation the scan was compensated.
         found: the step of the first pass, with the spread of its residuals in ``details``.
-        before_ns: stamp of the scan before.
+        before: the state at the scan before.
+        calibration: the extrinsics.
     """
     offsets_ns, noise_m = frame.scan.time_offsets_ns, found.details.get("sigma_m", np.inf)
     if not found.ok or offsets_ns is None or not len(offsets_ns):
         return None
-    step_s = (frame.scan.stamp_ns - before_ns) / NS_PER_S
+    step_s = (frame.scan.stamp_ns - before.stamp_ns) / NS_PER_S
     mean_s, sweep_s = offsets_ns.mean() / NS_PER_S, np.abs(offsets_ns).max() / NS_PER_S
-    error = se3.log(se3.between(initial.pose, found.pose)) * step_s / (step_s + mean_s)
-    turned_m = 0.0 if len(frame.imu) else _LEVER_M * float(np.linalg.norm(error[:3]))  # else by the gyroscope
-    moved_m = (float(np.linalg.norm(error[3:])) + turned_m) * sweep_s / step_s
-    return replace(initial, pose=initial.pose @ se3.exp(error)) if moved_m > _LEAST_RATIO * noise_m else None
+    by_imu = len(frame.imu) > 0
+    turn = lidar_turn(frame.imu, before, calibration) if by_imu else initial.pose[:3, :3]
+    compensated_by = se3.make(turn, initial.pose[:3, 3])
+    error = se3.log(se3.between(compensated_by, found.pose)) * step_s / (step_s + mean_s)
+    moved_m = np.linalg.norm(error.reshape(2, 3), axis=1) * (_LEVER_M, 1.0) * sweep_s / step_s
+    holds = by_imu and moved_m[0] <= _LEAST_RATIO * noise_m
+    if holds:
+        error[:3], moved_m[0] = 0.0, 0.0
+    if moved_m.sum() <= _LEAST_RATIO * noise_m:
+        return None
+    return SecondCompensation(compensated_by @ se3.exp(error), holds)

@@ -37,10 +37,11 @@ class Setup:
         unit.
 
         Raises:
-            SettingError: a noise density is 0. A simulator may have such an IMU, but the graph cannot weigh it.
+            SettingError: a noise density is 0. A simulator may have such an IMU, but the graph cannot weigh it. Only
+                an error of scale may be missing.
         """
         noise = config.imu_noise or frame.imu_noise or ImuNoise()
-        check_positive(noise, *(field.name for field in fields(noise)))
+        check_positive(noise, *(field.name for field in fields(noise) if field.name != "gyro_scale_sigma"))
         return cls(config, frame.calibration or Calibration(), noise)
 
     @cached_property

@@ -20,7 +20,7 @@ from hybridlio.core.motion_limits import BRIDGED_ACCELERATION_SIGMA_M_S2
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuSamples, Scan
 from hybridlio.core.start_state import start_state
 from hybridlio.odometry.pipeline import Pipeline, timed
-from hybridlio.odometry.second_pass import motion_for_second_pass
+from hybridlio.odometry.second_pass import second_compensation
 from hybridlio.odometry.start_search import StartEstimate, StartSearch
 from hybridlio.record import plain_values
 from hybridlio.record.record import Record
@@ -115,8 +115,8 @@ def _measured(
         if isinstance(residual, ScanMatching) and (is_lost or len(answer[1].degenerate)):
             pipeline.start_search = _search(pipeline, residual, leads=is_lost)
     elif isinstance(residual, RefinesAgain):
-        motion = motion_for_second_pass(frame, initial, answer[1], before.stamp_ns)
-        answer = answer if motion is None else pipeline.refine(frame, motion, before, {}, again=initial)
+        second = second_compensation(frame, initial, answer[1], before, pipeline.calibration)
+        answer = answer if second is None else pipeline.refine_again(frame, initial, before, second)
     if pipeline.start_search is not None:
         own = None if pipeline.start_search.leads else _pose_after(pipeline, before, answer[1])
         return _searched(pipeline, pipeline.start_search, frame, seconds, own) or answer

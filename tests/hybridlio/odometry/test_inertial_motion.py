@@ -12,7 +12,7 @@ from hybridlio.core import se3
 from hybridlio.core.estimates import State
 from hybridlio.core.sensors import Calibration, ImuNoise, ImuSamples
 from hybridlio.core.start_state import start_state
-from hybridlio.odometry.inertial_motion import inertial_motion
+from hybridlio.odometry.inertial_motion import inertial_motion, lidar_turn
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 MOUNT = se3.exp(np.array([0.4, -0.3, 2.0, 0.1, -0.2, 0.3]))
@@ -60,6 +60,30 @@ def test_the_path_is_followed_through_the_sweep_and_before_the_step(path: Path):
     errors = se3.log(se3.between(true, motion.poses))
     assert np.abs(errors[:, :3]).max() < 1e-4
     assert np.abs(errors[:, 3:]).max() < 1e-3  # 3 cm of braking and 5 cm of the bend, within 1 mm
+
+
+def test_rates_of_a_wrong_scale_are_changed_to_turn_as_the_motion_does():
+    """A drone turns by 34° in the step; sensitivities off by 1.5 % and mixed axes leave 0.44°."""
+    true = np.array([drone(t) for t in STAMPS / 1e9]) @ MOUNT
+    step = se3.between(drone(0.0) @ MOUNT, drone(0.1) @ MOUNT)
+    imu, scale = measured(drone), np.array([[1.015, 0.01, -0.005], [0.005, 0.985, 0.01], [-0.01, 0.005, 1.015]])
+    wrong = replace(imu, gyro_rad_s=imu.gyro_rad_s @ scale.T)
+    errors = []
+    for by_gyroscope in (True, False):
+        motion = inertial_motion(wrong, state(drone), step, END_NS, Calibration(MOUNT), by_gyroscope)
+        assert motion is not None
+        errors.append(np.abs(se3.log(se3.between(true, motion.poses))[:, :3]).max())
+    assert errors[0] > np.radians(0.4)
+    assert errors[1] < 0.3 * errors[0]
+
+
+def test_the_lidars_turn_is_that_of_its_path():
+    step = se3.between(drone(0.0) @ MOUNT, drone(0.1) @ MOUNT)
+    imu = measured(drone)
+    within = (imu.stamps_ns >= 0) & (imu.stamps_ns <= END_NS)
+    samples = ImuSamples(imu.stamps_ns[within], imu.gyro_rad_s[within], imu.accel_m_s2[within])
+    turn = lidar_turn(samples, state(drone), Calibration(MOUNT))
+    assert np.linalg.norm(se3.so3_log(step[:3, :3].T @ turn)) < 1e-4
 
 
 def test_without_samples_at_both_ends_or_with_a_gap_there_is_no_motion():
