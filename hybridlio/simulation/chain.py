@@ -24,7 +24,7 @@ from hybridlio.simulation.rig import GRAVITY_WORLD_M_S2, IMU_RATE_HZ, SCAN_RATE_
 from hybridlio.simulation.sensors.imu import ideal_imu
 
 START_NS = 1_700_000_000_000_000_000  # November 2023; as large as real stamps, which do not fit a float64
-NOISE = ImuNoise()
+NOISE = ImuNoise(gyro_scale_sigma=0.0)  # the samples have noise and biases alone
 STEP_SIGMAS = np.r_[np.full(3, 1e-3), np.full(3, 0.02)]  # rad, m: a relative pose of lidar odometry
 # a mount with rotation and lever arm on all axes, so that an error in the use of a transform shows
 T_IMU_LIDAR = se3.make(Rotation.from_euler("xyz", (1.0, -0.5, 3.0), degrees=True).as_matrix(), (0.8, -0.3, 0.9))
