@@ -157,9 +157,9 @@ _ASCII_PLY = (
 )
 
 
-def rows(columns: int) -> str:
+def rows(columns: int, before: str = "") -> str:
     numbers = np.random.default_rng(0).uniform(1, 20, (20, columns)).round(3)
-    return "".join(" ".join(map(str, row)) + "\n" for row in numbers.tolist())
+    return "".join(" ".join([before, *map(str, row)]).strip() + "\n" for row in numbers.tolist())
 
 
 def read_imu(path: Path) -> None:
@@ -179,6 +179,9 @@ FILES = {
     **{f"map-{name}": Input(lambda root, name=name: written_map(root, name), open_prior_map) for name in MAPS},
     "points-pcd": Input(lambda root: written_text(root, "scan.pcd", _ASCII_PCD + rows(4)), read_points),
     "points-ply": Input(lambda root: written_text(root, "scan.ply", _ASCII_PLY + rows(3)), read_points),
+    "points-obj": Input(lambda root: written_text(root, "scan.obj", rows(3, "v")), read_points),
+    "points-off": Input(lambda root: written_text(root, "scan.off", "OFF\n20 0 0\n" + rows(3)), read_points),
+    "points-stl": Input(lambda root: written_text(root, "scan.stl", "solid scan\n" + rows(3, "vertex")), read_points),
     "config": Input(lambda root: written_text(root, "config.yaml", config_to_yaml(Config())), load_config),
     "calibration": Input(
         lambda root: written_text(root, "calibration.yaml", rides.calibration_yaml(rides.Ride()) + _CALIBRATION),
