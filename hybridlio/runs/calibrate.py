@@ -9,9 +9,11 @@ same clock: between 0.15 and 0.6 of it in simulated scenes. So what a round find
 slope between rounds at different clocks (secant method). Its standard deviation is divided too, and else would claim
 two to seven times too much. Where the rounds' clocks are too close for a slope, one round is made beside them.
 
-Steps of scan matching state larger covariances than their errors. So all variances are multiplied by the χ² per degree
+Steps of scan matching state larger covariances than their errors, so all variances are multiplied by the χ² per degree
 of freedom that the last round left (the variance of unit weight of adjustment theory; Koch, "Parameter Estimation and
-Hypothesis Testing in Linear Models", 1999, section 3.2).
+Hypothesis Testing in Linear Models", 1999, section 3.2). As the scans follow the samples that compensate them,
+residuals show no more of the motion's errors than of the clock's, and χ² the square of that share: the clock's factor
+is divided by it, up to the stated covariances.
 """
 
 from __future__ import annotations
@@ -110,6 +112,7 @@ class _Search:
         self._rounds: list[tuple[float, float]] = []  # clock of a round, and the change that it found
         self._best_s = 0.0  # the clock that the rounds so far mean
         self._share = 1.0  # of a clock's error that a round shows
+        self._variance_factor = 1.0  # of the last round, by which all variances are multiplied
         self._found: Calibrated | None = None
         self._scale: ScaleSearch | None = None
         self._warnings: HeldBack | None = None  # of the last round; those before concern what was replaced
@@ -164,7 +167,7 @@ class _Search:
             smoothed = smooth(record, gps=uses_gps, calibrate=self._priors)
         found: Calibrated = smoothed.found["calibration"]
         sigmas = {one.name: one.sigmas for one in found.parameters}
-        factor = smoothed.verdict.variance_factor
+        factor = self._variance_factor = smoothed.verdict.variance_factor
         found = replace(found, parameters=tuple(one.scaled(factor) for one in found.parameters))
         self._now = replace(self._now, calibration=found.calibration)
         moves = {one.name: one.change for one in found.parameters if one.name != _CLOCK}
@@ -200,10 +203,14 @@ class _Search:
         return is_probed
 
     def _widened(self, found: Parameter) -> Parameter:
-        """Return the clock with the variance of what a round finds, divided by the share that it shows."""
+        """Return the clock with the variance of what a round finds, divided by the share that it shows.
+
+        The residuals that the variance was multiplied for show the same share.
+        """
         if found.name != "time_offset":
             return found
-        return replace(found, covariance=found.covariance / self._share**2)
+        hidden = min(1 / self._share**2, max(1 / self._variance_factor, 1.0))
+        return replace(found, covariance=hidden * found.covariance / self._share**2)
 
     def result(self) -> Calibrated:
         """Return what the last round found, after its warnings."""

@@ -111,6 +111,9 @@ def test_a_round_that_shows_a_share_of_the_clocks_error_is_divided_by_it(wrong: 
     assert search._share == pytest.approx(share, rel=0.01)
     assert search._offset_s == pytest.approx(true_s, abs=1e-8)
     assert search._widened(found).sigmas[0] == pytest.approx(sigma_s / share, rel=0.01)
+    search._variance_factor = 0.3**2  # of residuals that show the same share; at most as stated
+    stated = 1 / max(share, 0.3)
+    assert search._widened(found).sigmas[0] == pytest.approx(sigma_s / share * stated, rel=0.01)
 
 
 def test_the_scale_alone_is_found_without_a_graph():
