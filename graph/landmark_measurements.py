@@ -73,6 +73,39 @@ class LandmarkMeasurements(BodyMeasurements):
         measured = (bearing, range_m)
         return self._observe(observation_factor(self._data, "bearing-range", (pose, landmark), measured, noise, robust))
 
+    def add_range(self, pose: Key, landmark: Key, range_m: float, sigma_m: float, robust: RobustLike = None) -> int:
+        """Add a landmark's distance from a pose alone, as a radio beacon gives it, and return the factor's id.
+
+        A new landmark is added. It is placed by its other observations; where ranges alone allow several places, give
+        one near it to :meth:`add_landmark`. An online solver needs another observation that places it first.
+
+        Args:
+            pose: key of a pose that the graph has.
+            landmark: key of the landmark.
+            range_m: the distance, positive.
+            sigma_m: standard deviation.
+            robust: as in :meth:`~hybridlio.graph.PoseGraph.add_between`.
+        """
+        noise = NoiseInput(sigmas=sigma_m)
+        return self._observe(observation_factor(self._data, "range", (pose, landmark), (range_m,), noise, robust))
+
+    def add_bearing(
+        self, pose: Key, landmark: Key, bearing: ArrayLike, sigma_rad: float, robust: RobustLike = None
+    ) -> int:
+        """Add a landmark's direction from a pose alone, as a camera gives it, and return the factor's id.
+
+        A new landmark is added, and placed by its observations from other poses, as for :meth:`add_range`.
+
+        Args:
+            pose: key of a pose that the graph has.
+            landmark: key of the landmark.
+            bearing: as in :meth:`add_bearing_range`.
+            sigma_rad: standard deviation; in space of both components of the direction.
+            robust: as in :meth:`~hybridlio.graph.PoseGraph.add_between`.
+        """
+        noise = NoiseInput(sigmas=sigma_rad)
+        return self._observe(observation_factor(self._data, "bearing", (pose, landmark), (bearing,), noise, robust))
+
     def _observe(self, factor: Factor) -> int:
         assert factor.landmark is not None
         if factor.landmark not in self._data.landmarks:

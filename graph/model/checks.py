@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 
 from hybridlio.core import se3
@@ -12,7 +14,7 @@ from hybridlio.graph.model.calibrations import of_kind
 from hybridlio.graph.model.connectivity import components, groups
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, list_keys
-from hybridlio.graph.model.measurements import OBSERVATIONS, STEPS, VELOCITIES, Factor
+from hybridlio.graph.model.measurements import OF_LANDMARKS, STEPS, VELOCITIES, Factor
 from hybridlio.graph.model.user_residual import sample_poses
 
 _MOTIONS = ("rotation about x", "rotation about y", "rotation about z", "x", "y", "z")
@@ -49,15 +51,23 @@ def check_determined(data: GraphData) -> None:
 
 
 def check_observed(data: GraphData) -> None:
-    """Check that every landmark is observed, which determines it, as its observing pose is determined.
+    """Check that every landmark is observed by as many numbers as it has coordinates.
 
     Raises:
-        GraphError: no factor observes a landmark; names the keys.
+        GraphError: no factor observes a landmark, or only a range or a bearing; names the keys.
     """
-    observed = {factor.landmark for factor in data.other_factors.values() if factor.kind in OBSERVATIONS}
-    unseen = [key for key in data.landmarks.keys if key not in observed]
+    observed: Counter[Key] = Counter()
+    for factor in data.other_factors.values():
+        if factor.kind in OF_LANDMARKS and factor.landmark is not None and factor.noise is not None:
+            observed[factor.landmark] += len(factor.noise.values)
+    unseen = [key for key in data.landmarks.keys if not observed[key]]
     if unseen:
         raise GraphError(f"no factor observes landmark {list_keys(unseen)}; add one, or leave the landmark out")
+    hardly = [key for key in data.landmarks.keys if observed[key] < data.dimension]
+    if hardly:
+        raise GraphError(
+            f"too few ranges and bearings observe landmark {list_keys(hardly)} to place it; add others from other poses"
+        )
 
 
 def _check_concerned(data: GraphData) -> None:
@@ -83,7 +93,7 @@ def free_motions(data: GraphData, part: list[Key]) -> list[str]:
     if inside & data.fixed:
         return []
     names = _MOTIONS if data.dimension == 3 else _MOTIONS[2:5]
-    factors = [f for f in data.other_factors.values() if f.keys[0] in inside and f.kind not in ("bias", *OBSERVATIONS)]
+    factors = [f for f in data.other_factors.values() if f.keys[0] in inside and f.kind not in ("bias", *OF_LANDMARKS)]
     if any(factor.kind in ("prior", "marginal", "gtsam") for factor in factors):
         return []  # what a marginal or a factor of GTSAM's leaves free, the solver finds
     jacobian = np.vstack([np.zeros((1, 6)), *(_motion_jacobian(data, factor) for factor in _distinct(factors))])

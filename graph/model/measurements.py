@@ -13,11 +13,14 @@ from hybridlio.graph.model.keys import Key
 from hybridlio.graph.model.noise import Noise, Robust
 
 Kind: TypeAlias = Literal[
-    "between", "prior", "gps", "attitude", "velocity", "bias", "imu", "point", "bearing-range", "altitude", "heading",
+    "between", "prior", "gps", "attitude", "velocity", "bias", "imu", "point", "bearing-range", "range", "bearing",
+    "altitude", "heading",
     "body-velocity", "sensor-step", "marginal", "custom", "gtsam",
 ]  # fmt: skip
 CODE = ("custom", "gtsam")  # of users, which no file holds
-OBSERVATIONS = ("point", "bearing-range")  # of landmarks
+OBSERVATIONS = ("point", "bearing-range")  # of landmarks, which they place
+PARTIAL_OBSERVATIONS = ("range", "bearing")  # several of which place a landmark
+OF_LANDMARKS = (*OBSERVATIONS, *PARTIAL_OBSERVATIONS)
 # a direction has two degrees of freedom
 VECTOR_NOISE_SIZE = {
     "gps": 3, "attitude": 2, "velocity": 3, "bias": 6, "altitude": 1, "heading": 1, "body-velocity": 3,
@@ -41,7 +44,8 @@ class Factor:
             ``attitude``: direction in world, in body (6); ``velocity``: m/s (3); ``bias``: accelerometer, gyroscope
             (6); ``imu``: the fields of :class:`hybridlio.core.sensors.ImuNoise` in their order (6); ``point``: a
             landmark in the frame of the pose (d); ``bearing-range``: angle or unit direction, and range (2, in space
-            4); ``altitude``: m (1); ``heading``: rad (1); ``body-velocity``: m/s (3); ``marginal``: see
+            4); ``range`` (1) and ``bearing`` (1, in space 3) as there; ``altitude``: m (1); ``heading``: rad (1);
+            ``body-velocity``: m/s (3); ``marginal``: see
             :class:`hybridlio.graph.model.marginals.Marginal`; empty for ``custom`` and ``gtsam``.
         noise: of the measurement; None for ``imu``, whose noise follows from the samples, and for ``marginal``.
         robust: kernel, or None.

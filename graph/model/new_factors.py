@@ -18,6 +18,7 @@ from hybridlio.graph.model.graph_data import GraphData, PosesByKey
 from hybridlio.graph.model.keys import Key, check_key
 from hybridlio.graph.model.measurements import (
     CODE,
+    PARTIAL_OBSERVATIONS,
     SCALARS,
     STEPS,
     VECTOR_NOISE_SIZE,
@@ -157,9 +158,9 @@ def observation_factor(
 
     Args:
         data: the graph.
-        kind: ``point`` or ``bearing-range``.
+        kind: of an observation.
         ends: keys of pose and landmark.
-        measured: the point; or bearing and range.
+        measured: the point; or bearing, range or both.
         noise: of the measurement; two sigmas of a bearing and a range in space become three.
         robust: kernel.
 
@@ -168,6 +169,7 @@ def observation_factor(
         GraphError: unknown pose, malformed key, a pose as landmark, or none or several forms of noise.
     """
     name, d = factor_label(kind, ends), data.dimension
+    size: int = d
     (pose,) = data.known_keys(ends[0], what=name)
     landmark = check_key(ends[1])
     if landmark in data:
@@ -176,24 +178,34 @@ def observation_factor(
         z = check_vector(measured[0], d, name)
         if not z.any():
             raise DataError(f"{name}: the point lies at the pose itself, so that it has no bearing")
+    elif kind in PARTIAL_OBSERVATIONS:
+        z, size = _partial(kind, measured[0], d, name), 1 if kind == "range" else d - 1
     else:
         z = _bearing_range(measured, d, name)
         if noise.sigmas is not None and d == 3 and (sigmas := as_floats(noise.sigmas, name)).shape == (2,):
             bearing, distance = sigmas
             noise = NoiseInput(sigmas=[bearing, bearing, distance])
-    return Factor(kind, (pose,), z, make_noise(name, d, noise), make_robust(robust, d, name), landmark=landmark)
+    return Factor(kind, (pose,), z, make_noise(name, size, noise), make_robust(robust, size, name), landmark=landmark)
 
 
 def _bearing_range(measured: tuple[ArrayLike, ...], dimension: int, name: str) -> Array:
-    bearing = np.atleast_1d(as_floats(measured[0], name))
-    bearing = check_vector(bearing, 1 if dimension == 2 else 3, name)
-    distance = check_vector(np.atleast_1d(as_floats(measured[1], name)), 1, name)
-    if distance[0] <= 0:
-        raise DataError(f"{name}: the range must be positive, got {distance[0]}")
+    kinds = ("bearing", "range")
+    return np.concatenate([_partial(kind, one, dimension, name) for kind, one in zip(kinds, measured, strict=True)])
+
+
+def _partial(kind: str, measured: ArrayLike, dimension: int, name: str) -> Array:
+    """Return a range ``(1,)`` or a bearing, the angle ``(1,)`` in the plane and a unit direction ``(3,)`` in space."""
+    values = np.atleast_1d(as_floats(measured, name))
+    if kind == "range":
+        distance = check_vector(values, 1, name)
+        if distance[0] <= 0:
+            raise DataError(f"{name}: the range must be positive, got {distance[0]}")
+        return distance
+    bearing = check_vector(values, 1 if dimension == 2 else 3, name)
     if dimension == 3:
         check_direction(bearing, name)
         bearing = bearing / np.linalg.norm(bearing)
-    return np.concatenate([bearing, distance])
+    return bearing
 
 
 def new_measurement(factor: Factor, measured: ArrayLike, dimension: co.Dimension) -> Array:
@@ -219,6 +231,8 @@ def new_measurement(factor: Factor, measured: ArrayLike, dimension: co.Dimension
         if not isinstance(measured, tuple | list) or len(measured) != 2:
             raise DataError(f"{name}: expected bearing and range, got {measured!r}")
         return _bearing_range((measured[0], measured[1]), dimension, name)
+    if factor.kind in PARTIAL_OBSERVATIONS:
+        return _partial(factor.kind, measured, dimension, name)
     values = check_vector(np.atleast_1d(as_floats(measured, name)), len(old), name)
     if factor.kind == "point" and not values.any():
         raise DataError(f"{name}: the point lies at the pose itself, so that it has no bearing")

@@ -37,7 +37,7 @@ from hybridlio.graph.model.edge_table import FORMS
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key
 from hybridlio.graph.model.marginals import Marginal
-from hybridlio.graph.model.measurements import IN_OWN_ORDER, OBSERVATIONS, Factor
+from hybridlio.graph.model.measurements import IN_OWN_ORDER, OF_LANDMARKS, Factor
 from hybridlio.graph.model.noise import Robust
 from hybridlio.graph.model.user_residual import altitude, heading
 from hybridlio.graph.solve.custom_factors import body_velocity_factor, custom_factor, linear_factor
@@ -134,7 +134,7 @@ class Builder:
 
     def factor(self, factor: Factor, robust: bool = True) -> Any:
         """Return any factor but a between-factor."""
-        if factor.kind in OBSERVATIONS:
+        if factor.kind in OF_LANDMARKS:
             return observation(self.data, factor, robust)
         if factor.kind == "gtsam":
             return factor.code.rekey([X(self.data.index[key]) for key in factor.keys])

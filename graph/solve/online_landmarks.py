@@ -11,7 +11,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key
-from hybridlio.graph.model.measurements import OBSERVATIONS, Factor
+from hybridlio.graph.model.measurements import OBSERVATIONS, OF_LANDMARKS, PARTIAL_OBSERVATIONS, Factor
 from hybridlio.graph.solve.landmark_factors import landmark_point
 
 
@@ -34,7 +34,7 @@ class OnlineLandmarks:
         """Return the index of the newest pose that observes each landmark, by landmark index, over new factors too."""
         found: dict[int, int] = {}
         for factor in factors:
-            if factor.kind in OBSERVATIONS and factor.landmark is not None:
+            if factor.kind in OF_LANDMARKS and factor.landmark is not None:
                 landmark, pose = self._data.landmarks.index[factor.landmark], self._data.index[factor.keys[0]]
                 found[landmark] = max(pose, found.get(landmark, self._last_seen.get(landmark, 0)))
         return found
@@ -42,12 +42,25 @@ class OnlineLandmarks:
     def check(self, factors: Iterable[Factor], removed: bool) -> None:
         """Check that new factors observe no landmark that has left the lag, and that no landmark lost all of its own.
 
+        A range or a bearing alone is taken where something else places the landmark.
+
         Raises:
             GraphError: names the landmark.
         """
+        factors = list(factors)
+        index = self._data.landmarks.index
+        placed = {factor.landmark for factor in factors if factor.kind in OBSERVATIONS}
         for factor in factors:
-            if factor.landmark is not None and self._data.landmarks.index[factor.landmark] in self._departed:
+            if factor.landmark is None:
+                continue
+            if index[factor.landmark] in self._departed:
                 raise GraphError(f"{factor.label}: landmark {factor.landmark} has left the lag; use a new key for it")
+            is_placed = factor.landmark in placed or index[factor.landmark] in self.estimated
+            if factor.kind in PARTIAL_OBSERVATIONS and not is_placed:
+                raise GraphError(
+                    f"{factor.label}: an online solver first needs a point, or bearing and range together, of landmark "
+                    f"{factor.landmark}; optimize() by batch takes it as it is"
+                )
         if removed and not self._departed:
             self._check_observed()
 

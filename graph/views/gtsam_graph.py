@@ -14,14 +14,17 @@ from hybridlio.graph.calibration.variables import insert_calibrations
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, from_integer, to_integer
-from hybridlio.graph.model.measurements import Factor
+from hybridlio.graph.model.measurements import Factor, Kind
 from hybridlio.graph.model.noise import Noise
 from hybridlio.graph.solve.builder import Builder
 from hybridlio.graph.solve.landmark_factors import initial_landmarks, insert_landmarks
 
 _BETWEEN = {"BetweenFactorPose3", "BetweenFactorPose2"}
 _PRIOR = {"PriorFactorPose3", "PriorFactorPose2"}
-_OBSERVATION = {"BearingRangeFactor3D", "BearingRangeFactor2D"}
+_OBSERVATIONS: dict[str, Kind] = {
+    "BearingRangeFactor3D": "bearing-range", "BearingRangeFactor2D": "bearing-range", "RangeFactor3D": "range",
+    "RangeFactor2D": "range", "BearingFactor3D": "bearing", "BearingFactor2D": "bearing",
+}  # fmt: skip
 
 
 def to_gtsam(data: GraphData) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -60,7 +63,7 @@ def _landmark_points(data: GraphData, poses: Array) -> dict[int, Array]:
 def from_gtsam(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> GraphData:
     """Return a pose graph of factors over poses and landmarks; inverse of :func:`to_gtsam`.
 
-    Fixed poses come back as priors. Between-factors, priors and bearings with ranges of landmarks, if their noise is
+    Fixed poses come back as priors. Between-factors, priors, and bearings and ranges of landmarks, if their noise is
     Gaussian, become this package's own; all others over poses stay GTSAM's. Calibration variables do not come back:
     GTSAM's have neither kind nor name, and their factors are code.
 
@@ -117,12 +120,12 @@ def _factor(data: GraphData, factor: Any, row: int) -> Factor:
     keys: tuple[Key, ...] = tuple(from_integer(key) for key in list(factor.keys()))
     kind = type(factor).__name__
     model = factor.noiseModel() if hasattr(factor, "noiseModel") else None
-    if kind in _OBSERVATION and keys[1] in data.landmarks and not isinstance(model, gtsam.noiseModel.Robust):
+    if kind in _OBSERVATIONS and keys[1] in data.landmarks and not isinstance(model, gtsam.noiseModel.Robust):
         return _observation(data, factor, keys)
     unknown = [key for key in keys if key not in data]
     if unknown and unknown[0] in data.landmarks:
         raise DataError(
-            f"from_gtsam: factor {row}, a {kind}, cannot be taken: of landmarks only bearings with ranges can"
+            f"from_gtsam: factor {row}, a {kind}, cannot be taken: of landmarks only bearings and ranges can"
         )
     if unknown:
         raise DataError(f"from_gtsam: factor {row} concerns {unknown[0]}, which has no pose among the values")
@@ -134,7 +137,12 @@ def _factor(data: GraphData, factor: Any, row: int) -> Factor:
 
 
 def _observation(data: GraphData, factor: Any, keys: tuple[Key, ...]) -> Factor:
-    measured = factor.measured()
-    bearing = [measured.bearing().theta()] if data.dimension == 2 else measured.bearing().point3()
+    kind, measured = _OBSERVATIONS[type(factor).__name__], factor.measured()
+    bearing = measured.bearing() if kind == "bearing-range" else measured
+    distance = [measured.range()] if kind == "bearing-range" else []
+    if kind == "range":
+        values = np.array([measured])
+    else:
+        values = np.r_[[bearing.theta()] if data.dimension == 2 else bearing.point3(), distance]
     noise = Noise("information", factor.noiseModel().information())
-    return Factor("bearing-range", keys[:1], np.r_[bearing, measured.range()], noise, landmark=keys[1])
+    return Factor(kind, keys[:1], values, noise, landmark=keys[1])
