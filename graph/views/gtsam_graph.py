@@ -125,10 +125,14 @@ def _factor(data: GraphData, factor: Any, row: int) -> Factor:
     unknown = [key for key in keys if key not in data]
     if unknown and unknown[0] in data.landmarks:
         raise DataError(
-            f"from_gtsam: factor {row}, a {kind}, cannot be taken: of landmarks only bearings and ranges can"
+            f"from_gtsam: factor {row}, a {kind}, cannot be taken: of landmarks only bearings and ranges can, without "
+            "a robust kernel"
         )
     if unknown:
-        raise DataError(f"from_gtsam: factor {row} concerns {unknown[0]}, which has no pose among the values")
+        raise DataError(
+            f"from_gtsam: factor {row} concerns {unknown[0]}, which has no pose among the values; add "
+            "one (a graph of hybridlio's gets them by initialise(), before to_gtsam)"
+        )
     if kind not in _BETWEEN | _PRIOR or model is None or isinstance(model, gtsam.noiseModel.Robust):
         return Factor("gtsam", keys, np.zeros(0), code=factor)
     measured = pose_coordinates(factor.measured() if kind in _BETWEEN else factor.prior())

@@ -150,8 +150,8 @@ def test_what_gtsam_has_and_a_pose_graph_cannot_take_is_named():
     values.insert(0, gtsam.Pose3())
     values.insert(gtsam.symbol("l", 1), np.array([1.0, 2.0, 3.0]))
     model = gtsam.noiseModel.Isotropic.Sigma(1, 0.1)
-    factors.add(gtsam.RangeFactor3D(0, gtsam.symbol("l", 1), 2.0, model))
-    with pytest.raises(DataError, match="factor 0, a RangeFactor3D, cannot be taken"):
+    factors.add(gtsam.RangeFactorWithTransform3D(0, gtsam.symbol("l", 1), 2.0, model, gtsam.Pose3()))
+    with pytest.raises(DataError, match="factor 0, a RangeFactorWithTransform3D, cannot be taken"):
         PoseGraph.from_gtsam(factors, values)
     values.insert(gtsam.symbol("b", 0), gtsam.imuBias.ConstantBias())
     with pytest.raises(DataError, match="the value of b0 is neither a pose nor a landmark"):
