@@ -11,7 +11,7 @@ from typing import Any, get_args
 import numpy as np
 
 from hybridlio.core.errors import DataError, GraphError
-from hybridlio.core.files import UNREADABLE_NPZ, write_atomically
+from hybridlio.core.files import UNREADABLE_NPZ, opened_npz, write_atomically
 from hybridlio.core.geodesy import check_geodetic
 from hybridlio.core.sensors import ImuSamples
 from hybridlio.graph.formats.npz_calibration import add_calibrations, calibration_arrays
@@ -135,7 +135,7 @@ def read_npz(path: str | os.PathLike[str]) -> GraphData:
     """
     path = Path(path)
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with opened_npz(path) as archive:
             arrays = {name: archive[name] for name in archive.files}
         if str(arrays["format"]) not in _FORMATS:
             raise DataError(f"{path}: has format {arrays['format']!s}; this release reads {_FORMATS[-1]}")

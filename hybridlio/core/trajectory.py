@@ -27,6 +27,7 @@ PathLike = str | os.PathLike[str]
 KITTI_PERIOD_NS = NS_PER_S // 10  # nominal: the HDL-64E turns at 10 Hz
 # formats by the number of columns in a row
 _COLUMNS = {8: "TUM (stamp x y z qx qy qz qw)", 12: "KITTI (three rows of a pose)"}
+_LARGEST = 1e100  # of any number, so that squares stay finite
 _ROTATION_TOLERANCE = 1e-2  # passes files with two or more decimals, rejects anything that is no rotation
 
 
@@ -238,8 +239,8 @@ def _parse_numbers(path: Path, rows: list[tuple[int, list[str]]], columns: int) 
             values[:] = [float(field) for field in fields]
         except ValueError as error:
             raise DataError(f"{path}: row {n}: {error}") from None
-        if not np.isfinite(values).all():
-            raise DataError(f"{path}: row {n} contains a value that is not finite; remove or repair the row")
+        if not (np.abs(values) < _LARGEST).all():
+            raise DataError(f"{path}: row {n} contains a value that is not finite, or too large; repair the row")
     return out
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
-from hybridlio.core.files import UNREADABLE_NPZ, user_path
+from hybridlio.core.files import UNREADABLE_NPZ, opened_npz, user_path
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.points.point_files import SUFFIXES, read_columns
 from hybridlio.localization.prior_map import PriorMap
@@ -73,7 +73,7 @@ def _points(path: Path) -> Array:
         raise DataError(f"{path}: no such map; give a run folder or a file of points")
     if path.suffix.lower() == ".npz":
         try:
-            with np.errstate(all="ignore"), np.load(path, allow_pickle=False) as file:
+            with np.errstate(all="ignore"), opened_npz(path) as file:
                 points = np.asarray(file["points"], np.float64).reshape(-1, 3)
         except UNREADABLE_NPZ as error:
             raise DataError(f"{path}: not a map ({error}); `hybridlio map` writes one") from error

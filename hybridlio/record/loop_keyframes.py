@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from hybridlio.cloud.voxel import voxel_average
 from hybridlio.core.arrays import Array, Floats, Index, Stamps
 from hybridlio.core.errors import DataError
-from hybridlio.core.files import UNREADABLE_NPZ, atomic_path
+from hybridlio.core.files import UNREADABLE_NPZ, atomic_path, opened_npz
 from hybridlio.core.sensors import Scan
 from hybridlio.core.setting_checks import check_positive, check_setting
 from hybridlio.record.packed_arrays import PackedCloud
@@ -126,7 +126,7 @@ class LoopKeyframes:
         if not path.is_file():
             raise DataError(f"{path}: the run has no keyframes for loop closure; run `hybridlio odometry` again")
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with opened_npz(path) as file:
                 version, resolution_m = int(file["version"]), float(file["resolution_m"])
                 if version != FORMAT_VERSION or resolution_m != RESOLUTION_M:
                     raise ValueError(f"format version {version}, this release reads {FORMAT_VERSION}")

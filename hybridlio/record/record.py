@@ -18,7 +18,7 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.estimates import RelativePose, State
-from hybridlio.core.files import UNREADABLE_NPZ, atomic_path
+from hybridlio.core.files import UNREADABLE_NPZ, atomic_path, opened_npz
 from hybridlio.core.geodesy import GeodeticPoint
 from hybridlio.core.sensors import NS_PER_S, Calibration, GpsFix, ImuNoise, ImuSamples
 from hybridlio.core.start_state import start_state
@@ -159,7 +159,7 @@ class Record:
             DataError: the file is missing, is not a record, or has a newer format version.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with opened_npz(path) as file:
                 return _from_arrays({name: file[name] for name in file.files})
         except UNREADABLE_NPZ as error:
             raise DataError(f"{path}: not the record of a run ({error}); run `hybridlio odometry` again") from error

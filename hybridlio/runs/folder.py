@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybridlio.core.errors import DataError
 from hybridlio.core.estimates import RelativePose
-from hybridlio.core.files import UNREADABLE_NPZ, atomic_path, write_atomically
+from hybridlio.core.files import UNREADABLE_NPZ, atomic_path, opened_npz, write_atomically
 from hybridlio.core.motion_limits import unknown_motion_covariance
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.trajectory import Trajectory, read_tum, write_kitti, write_tum
@@ -150,7 +150,7 @@ def read_run(path: Path) -> StoredRun:
     reference = read_tum(path / REFERENCE) if (path / REFERENCE).is_file() else None
     try:
         metrics = _metrics(path / METRICS)
-        with np.load(path / COVARIANCES, allow_pickle=False) as file:
+        with opened_npz(path / COVARIANCES) as file:
             arrays = {name: file[name] for name in file.files}
         estimated = arrays["estimated"]
         covered = Trajectory(whole.stamps_ns, whole.poses, arrays["absolute"])

@@ -11,7 +11,7 @@ import numpy as np
 
 from hybridlio.core.arrays import Array, Stamps
 from hybridlio.core.errors import DataError
-from hybridlio.core.files import UNREADABLE_NPZ, atomic_path
+from hybridlio.core.files import UNREADABLE_NPZ, atomic_path, opened_npz
 from hybridlio.odometry.estimate import Estimate
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ class States:
             DataError: the file is missing or holds something else.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with opened_npz(path) as file:
                 return cls(*(file[field.name] for field in fields(cls)))
         except UNREADABLE_NPZ as error:
             raise DataError(f"{path}: not the states of a run ({error}); run `hybridlio odometry` again") from error

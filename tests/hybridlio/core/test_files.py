@@ -3,12 +3,13 @@ import os
 import socket
 import stat
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import pytest
 
 from hybridlio.core.errors import ConfigError, DataError
-from hybridlio.core.files import atomic_path, locked, read_yaml, write_atomically
+from hybridlio.core.files import atomic_path, locked, opened_npz, read_yaml, write_atomically
 
 
 def test_text_and_bytes_are_written_unchanged_and_folders_made(tmp_path: Path) -> None:
@@ -115,3 +116,24 @@ def test_a_lock_on_a_full_disk_is_an_error_that_names_its_place(
     with pytest.raises(DataError, match=f"cannot write to {tmp_path}: No space left"), locked(tmp_path / "lock"):
         pass
     assert not (tmp_path / "lock").exists()
+
+
+def test_an_archive_that_unpacks_to_far_more_than_its_file_is_refused_before_memory_is_taken(tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "bomb.npz", points=np.broadcast_to(np.float64(0), (40_000_000,)))
+    with pytest.raises(ValueError, match=r"0\.3 MB unpack to 320 MB"), opened_npz(tmp_path / "bomb.npz"):
+        pass
+
+
+def test_an_array_that_announces_more_than_it_holds_is_refused_before_memory_is_taken(tmp_path: Path) -> None:
+    np.savez(tmp_path / "lies.npz", points=np.zeros((9, 3)))
+    data = (tmp_path / "lies.npz").read_bytes()
+    (tmp_path / "lies.npz").write_bytes(data.replace(b"(9, 3), }       ", b"(9999999, 3), } "))
+    with pytest.raises((ValueError, BadZipFile), match=r"announces more|CRC"), opened_npz(tmp_path / "lies.npz"):
+        pass
+
+
+def test_an_archive_of_arrays_comes_back(tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "good.npz", points=np.eye(3), count=5)
+    with opened_npz(tmp_path / "good.npz") as file:
+        assert int(file["count"]) == 5
+        np.testing.assert_array_equal(file["points"], np.eye(3))

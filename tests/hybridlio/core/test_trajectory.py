@@ -121,6 +121,7 @@ GOOD_KITTI = "1 0 0 0 0 1 0 0 0 0 1 0\n"
         (GOOD_KITTI + GOOD_KITTI.strip() + " 1\n", "row 2 has 13 columns"),
         (GOOD_KITTI + "1 0 0 0 0 1 0 0 0 0 -1 0\n", "row 2: .*not a rotation"),
         (GOOD_KITTI + "2 0 0 0 0 2 0 0 0 0 2 0\n", "row 2: .*not a rotation"),
+        (GOOD_TUM + "0.2 1e308 0 0 0 0 0 1\n", "row 2 contains a value that is not finite, or too large"),
         (GOOD_KITTI + "1 0 0 inf 0 1 0 0 0 0 1 0\n", "row 2 contains a value that is not finite"),
         ("1 2 3\n", "row 1 has 3 columns; expected one of TUM .* KITTI"),
         ("# only a comment\n", "contains no poses"),
