@@ -33,7 +33,9 @@ def exchanged(solver: WeightedSolver, cluster: Index, best: Found, margin: float
     """
     found: list[Found] = []
     for _ in range(_ROUNDS):
-        found += [solver.found(best.values, best.correct ^ some) for some in _promising(solver, cluster, best, margin)]
+        tried = [solver.found(best.values, best.correct ^ some) for some in _promising(solver, cluster, best, margin)]
+        # the same loops again are no confirmation: the search started from there
+        found += [one for one in tried if not np.array_equal(one.correct, best.correct)]
         better = least([best, *found])
         if not better.cost < best.cost - _GAIN * solver.price:
             break
