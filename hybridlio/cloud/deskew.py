@@ -68,21 +68,38 @@ def sweep_motion(sweep: Frame, step: Trajectory, gyro_bias_rad_s: Array, calibra
     return Trajectory(imu.stamps_ns, np.array(poses))
 
 
-def compensation_noise(sweep: Frame, noise: ImuNoise) -> Array:
+def compensation_noise(sweep: Frame, noise: ImuNoise, change_sigmas: Array | None = None) -> Array:
     """Return the covariance ``(6, 6)``, rad² and m², that compensation adds to a step between two scans.
 
     With a gyroscope the orientation of a point measured ``τ`` from the stamp has the noise density integrated over
     ``τ``, variance ``σ_g²·|τ|``. Averaged over a sweep of length ``T`` around the stamp, the scan as a whole is rotated
-    by a variance of about ``σ_g²·T/12``. Without samples the orientation is wrong by ``τ`` times the difference between
-    the actual rate and the mean rate of the step, and the scan by a variance of ``σ_r²·T²/12``. Both scans contribute.
+    by a variance of about ``σ_g²·T/12``. Without samples points are wrong by ``τ`` times the difference between
+    the actual twist and the mean one of the step, and the scan by a variance of ``σ²`` times the mean of ``τ²``. Both
+    scans contribute.
+
+    Args:
+        sweep: the frame.
+        noise: the gyroscope's.
+        change_sigmas: ``(6,)`` standard deviations of that difference without samples, rad/s and m/s; by default those
+            of a car whose sweeps follow each other at once.
     """
     offsets_ns = sweep.scan.time_offsets_ns
     assert offsets_ns is not None
-    sweep_s = float(np.ptp(offsets_ns)) / NS_PER_S if len(offsets_ns) else 0.0
-    by_gyro = len(sweep.sweep_imu) >= _MIN_IMU_SAMPLES
-    spread = noise.gyro_rad_s_sqrt_hz**2 * sweep_s if by_gyro else (SWEEP_RATE_SIGMA_RAD_S * sweep_s) ** 2
-    both_scans = 2 * spread / 12
-    return np.diag(np.r_[np.full(3, both_scans), np.zeros(3)])
+    sweep_s = sweep_duration_s(sweep)
+    if len(sweep.sweep_imu) >= _MIN_IMU_SAMPLES:
+        both_scans = 2 * noise.gyro_rad_s_sqrt_hz**2 * sweep_s / 12
+        return np.diag(np.r_[np.full(3, both_scans), np.zeros(3)])
+    offsets_s = offsets_ns / NS_PER_S if len(offsets_ns) else np.zeros(1)
+    sigmas = np.r_[np.full(3, SWEEP_RATE_SIGMA_RAD_S), np.zeros(3)]
+    if change_sigmas is not None:
+        sigmas = np.maximum(sigmas, change_sigmas)
+    return np.diag(2 * sigmas**2 * np.mean(offsets_s**2))
+
+
+def sweep_duration_s(frame: Frame) -> float:
+    """Return the time from the first to the last point of a frame's scan; 0 where points carry no times."""
+    offsets_ns = frame.scan.time_offsets_ns
+    return float(np.ptp(offsets_ns)) / NS_PER_S if offsets_ns is not None and len(offsets_ns) else 0.0
 
 
 def deskew(scan: Scan, motion: Trajectory) -> Scan:

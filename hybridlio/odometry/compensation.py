@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from hybridlio.cloud.deskew import compensation_noise, constant_twist, deskew, sweep_motion
+from hybridlio.cloud.deskew import compensation_noise, constant_twist, deskew, sweep_duration_s, sweep_motion
+from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.estimates import State
-from hybridlio.core.sensors import Calibration, Frame, ImuNoise, ImuSamples
+from hybridlio.core.estimates import RelativePose, State
+from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples
 from hybridlio.odometry.inertial_motion import inertial_motion
+from hybridlio.sources.constant_velocity import UsualChange
 
 
 class MotionCompensation:
@@ -22,10 +24,12 @@ class MotionCompensation:
     Args:
         calibration: the extrinsics.
         imu_noise: the gyroscope's noise, for :meth:`noise`.
+        first_ns: stamp of the first scan.
     """
 
-    def __init__(self, calibration: Calibration, imu_noise: ImuNoise) -> None:
+    def __init__(self, calibration: Calibration, imu_noise: ImuNoise, first_ns: int = 0) -> None:
         self._calibration, self._imu_noise = calibration, imu_noise
+        self._change, self._stamp_ns = UsualChange(), first_ns
 
     @staticmethod
     def applies_to(frame: Frame) -> bool:
@@ -65,9 +69,26 @@ class MotionCompensation:
             motion = sweep_motion(frame, step, bias, self._calibration)
         return replace(frame, scan=deskew(frame.scan, motion))
 
-    def noise(self, frame: Frame) -> Array | None:
+    def learn(self, step: RelativePose | None, stamp_ns: int) -> None:
+        """Take the step to a scan, by which sweeps are compensated without an IMU; None if it was not found."""
+        step_s = (stamp_ns - self._stamp_ns) / NS_PER_S
+        self._change.learn(None if step is None else se3.log(step.pose) / step_s)
+        self._stamp_ns = stamp_ns
+
+    def noise(self, frame: Frame, before_ns: int) -> Array | None:
         """Return the covariance ``(6, 6)`` that compensation adds to the step to this frame; None without point times.
+
+        Without an IMU sweeps are compensated with the mean motion of the step. While sweeps follow each other at once,
+        scan matching has seen it; between sweeps nothing has.
+
+        Args:
+            frame: the frame.
+            before_ns: stamp of the scan before.
 
         See :func:`hybridlio.cloud.deskew.compensation_noise`.
         """
-        return compensation_noise(frame, self._imu_noise) if self.applies_to(frame) else None
+        if not self.applies_to(frame):
+            return None
+        step_s = (frame.scan.stamp_ns - before_ns) / NS_PER_S
+        unseen = max(1.0 - sweep_duration_s(frame) / step_s, 0.0)
+        return compensation_noise(frame, self._imu_noise, unseen * self._change.sigmas(step_s))

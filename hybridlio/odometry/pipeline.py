@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -82,7 +82,7 @@ class Pipeline:
     _has_warned: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
-        self.compensation = MotionCompensation(self.calibration, self.imu_noise)
+        self.compensation = MotionCompensation(self.calibration, self.imu_noise, self.first.scan.stamp_ns)
         self.gate = InnovationGate(isinstance(self.residual, TakesBack))
         self.trust = ImuTrust(self.imu_noise)
 
@@ -129,7 +129,7 @@ class Pipeline:
             compensated = self._compensated(frame, initial.pose, state)
         with timed(seconds, "residual"):
             relative = _checked(self.residual.refine(compensated, initial), self.residual.name)
-        return compensated, self._with_compensation_noise(frame, relative)
+        return compensated, self._with_compensation_noise(frame, relative, state)
 
     def refine_again(
         self, frame: Frame, initial: RelativePose, state: State, second: SecondCompensation
@@ -140,7 +140,8 @@ class Pipeline:
         """
         assert isinstance(self.residual, RefinesAgain)
         compensated = self._compensated(frame, second.T_start_end, state, second.turns_by_gyroscope)
-        return compensated, self._with_compensation_noise(frame, self.residual.refine_again(compensated, initial))
+        again = self.residual.refine_again(compensated, initial)
+        return compensated, self._with_compensation_noise(frame, again, state)
 
     def _compensated(self, frame: Frame, T_start_end: Array, state: State, turns_by_gyroscope: bool = True) -> Frame:
         return self.compensation.compensate(
@@ -148,9 +149,9 @@ class Pipeline:
             turns_by_gyroscope=turns_by_gyroscope,
         )  # fmt: skip
 
-    def _with_compensation_noise(self, frame: Frame, relative: RelativePose) -> RelativePose:
-        noise = self.compensation.noise(frame)
-        return relative if noise is None or not relative.ok else relative.wider(added=noise)
+    def _with_compensation_noise(self, frame: Frame, relative: RelativePose, state: State) -> RelativePose:
+        noise = self.compensation.noise(frame, state.stamp_ns)
+        return relative if noise is None or not relative.ok else _widened(relative, noise, frame)
 
     def apply_gate(
         self, frame: Frame, initial: RelativePose, measured: RelativePose, state: State
@@ -195,7 +196,9 @@ class Pipeline:
 
     def correct(self, frame: Frame, initial: RelativePose, relative: RelativePose, step: RelativePose) -> None:
         """Let the initial-pose source learn from the backend's step, unless the step is only its own prediction."""
-        if relative.ok and relative.source != initial.source:
+        is_found = relative.ok and relative.source != initial.source
+        self.compensation.learn(step if is_found else None, frame.scan.stamp_ns)
+        if is_found:
             self.initial_pose.correct(frame, step)
 
     def lidar_pose(self, state: State) -> tuple[Array, Array]:
@@ -226,6 +229,19 @@ def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     start = time.perf_counter()
     yield
     seconds[stage] = time.perf_counter() - start
+
+
+def _widened(relative: RelativePose, noise: Array, frame: Frame) -> RelativePose:
+    """Return a step with the noise of compensation in its covariance.
+
+    Without an IMU the scans that make the map have such errors, too, and the share of them that adds up is that of the
+    step's other errors.
+    """
+    wide = relative.wider(added=noise)
+    if relative.drift is None or len(frame.imu):
+        return wide
+    share = np.trace(relative.drift[3:, 3:]) / np.trace(relative.covariance[3:, 3:])
+    return replace(wide, drift=relative.drift + share * noise)
 
 
 def _checked(answer: RelativePose, source: str) -> RelativePose:

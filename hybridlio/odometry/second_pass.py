@@ -8,13 +8,14 @@ swing by centimetres around the path from scan to scan.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.estimates import RelativePose, State
+from hybridlio.core.estimates import RefinesAgain, RelativePose, State, TakesBack
+from hybridlio.core.motion_limits import UNKNOWN_TRANSLATION_SIGMA_M
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame
 from hybridlio.odometry.inertial_motion import lidar_turn
 
@@ -69,3 +70,14 @@ def second_compensation(
     if moved_m.sum() <= _LEAST_RATIO * noise_m:
         return None
     return SecondCompensation(compensated_by @ se3.exp(error), holds)
+
+
+def without_misfit(
+    residual: RefinesAgain, initial: RelativePose, found: RelativePose, lost_cost: float
+) -> RelativePose:
+    """Return the initial pose as a failed step, if it was so vague that a scan which fits nowhere was put anywhere."""
+    is_vague = initial.translation_sigma_m > UNKNOWN_TRANSLATION_SIGMA_M
+    if is_vague and found.ok and found.details.get("cost", 0.0) > lost_cost and isinstance(residual, TakesBack):
+        residual.take_back(initial)
+        return replace(initial, ok=False, drift=found.drift, details=found.details)
+    return found

@@ -20,7 +20,7 @@ from hybridlio.core.motion_limits import BRIDGED_ACCELERATION_SIGMA_M_S2
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuSamples, Scan
 from hybridlio.core.start_state import start_state
 from hybridlio.odometry.pipeline import Pipeline, timed
-from hybridlio.odometry.second_pass import second_compensation
+from hybridlio.odometry.second_pass import second_compensation, without_misfit
 from hybridlio.odometry.start_search import StartEstimate, StartSearch
 from hybridlio.record import plain_values
 from hybridlio.record.record import Record
@@ -116,7 +116,10 @@ def _measured(
             pipeline.start_search = _search(pipeline, residual, leads=is_lost)
     elif isinstance(residual, RefinesAgain):
         second = second_compensation(frame, initial, answer[1], before, pipeline.calibration)
-        answer = answer if second is None else pipeline.refine_again(frame, initial, before, second)
+        if second is not None:
+            again = initial if len(frame.imu) else replace(initial, proposed=answer[1].pose)
+            answer = pipeline.refine_again(frame, again, before, second)
+        answer = answer[0], without_misfit(residual, initial, answer[1], LOST_COST)
     if pipeline.start_search is not None:
         own = None if pipeline.start_search.leads else _pose_after(pipeline, before, answer[1])
         return _searched(pipeline, pipeline.start_search, frame, seconds, own) or answer
@@ -140,11 +143,13 @@ def held_at_rest(calibration: Calibration, frame: Frame, step: RelativePose, bef
         return step
     up = (before.T_world_imu[:3, :3] @ calibration.T_imu_lidar[:3, :3]).T @ before.gravity_m_s2
     level = np.eye(3) - np.outer(up, up) / (up @ up)
-    step_s = (frame.scan.stamp_ns - before.stamp_ns) / NS_PER_S
-    is_still = np.linalg.norm(level @ step.pose[:3, 3]) < _REST_M_S * step_s
-    if not is_still or np.linalg.norm(step.degenerate[:, 3:] @ level, axis=1).max() > _MOST_LEVEL:
+    rest_m = _REST_M_S * (frame.scan.stamp_ns - before.stamp_ns) / NS_PER_S
+    if (
+        np.linalg.norm(level @ step.pose[:3, 3]) > rest_m
+        or np.linalg.norm(step.degenerate[:, 3:] @ level, axis=1).max() > _MOST_LEVEL
+    ):
         return step
-    moved, rest = se3.log(step.pose), np.diag(np.r_[np.full(3, _ANY_TURN_RAD), np.full(3, _REST_M_S * step_s)] ** 2)
+    moved, rest = se3.log(step.pose), np.diag(np.r_[np.full(3, _ANY_TURN_RAD), np.full(3, rest_m)] ** 2)
     kept = rest @ np.linalg.inv(step.covariance + rest)  # the rest has no motion
     covariance = kept @ step.covariance
     drift = None if step.drift is None else kept @ step.drift @ kept.T

@@ -25,6 +25,10 @@ _COARSE_KERNEL = 0.5
 _JUDGED_STRIDE = 8  # every eighth point, some hundreds, are enough to compare candidates one kernel width apart
 _COARSE_ITERATIONS = 6  # three while the kernel is halved from 0.5 to 0.1 m, and three under the narrow one
 _REFINED_CANDIDATES = 12  # of 18 speeds and 5 rates of turn by default: the best one and those beside it in both
+# Between rotations that are tried, and the farthest: half a step displaces points 7 m away by a coarse kernel.
+_LARGEST_RATE_RAD_S = 2.6  # of hands and heads: 150 °/s, over half a second
+_LEAST_TURN_STEPS = 2
+_TURN_STEP_RAD, _LARGEST_TURN_RAD = np.radians(8.0), np.radians(80.0)
 _MIN_MATCHED_RATIO = 0.8  # to the most matches of any candidate; with few matches a low cost is easy to have
 
 
@@ -52,6 +56,22 @@ def motions(speeds_m_s: Iterable[float], rates_deg_s: Iterable[float], dt_s: flo
     """Return poses ``(4, 4)`` after ``dt_s`` seconds, for every forward speed with every rate of turn."""
     pairs = product(speeds_m_s, np.deg2rad(list(rates_deg_s)))
     return [se3.exp(np.array([0, 0, rate, speed, 0, 0]) * dt_s) for speed, rate in pairs]
+
+
+def rotated(T_map_before: Array, T_map_start: Array, dt_s: float) -> list[Array]:
+    """Return poses ``(4, 4)`` at the place of a start, rotated against the scan before as bodies turn in ``dt_s``.
+
+    Bodies turn about the vertical most, and few lidars are mounted on their side: the largest angle is the one about z,
+    and half of it about x and y. Within a tenth of a second the rates of :func:`motions` and the kernel reach as far,
+    and there are none.
+    """
+    reach = np.array([0.5, 0.5, 1.0]) * min(_LARGEST_RATE_RAD_S * dt_s, _LARGEST_TURN_RAD)
+    if reach[2] < _LEAST_TURN_STEPS * _TURN_STEP_RAD:
+        return []
+    grid = product(*(_TURN_STEP_RAD * np.arange(-n, n + 1) for n in np.floor(reach / _TURN_STEP_RAD).astype(int)))
+    turns = [np.array(turn) for turn in grid if ((np.array(turn) / reach) ** 2).sum() <= 1.0]
+    beside = se3.make(T_map_before[:3, :3], T_map_start[:3, 3])
+    return [beside @ se3.exp(np.r_[turn, np.zeros(3)]) for turn in sorted(turns, key=np.linalg.norm)]
 
 
 def by_cost(fits: Sequence[Fit]) -> list[int]:

@@ -7,8 +7,36 @@ import numpy as np
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose, State
-from hybridlio.core.motion_limits import changed_motion_covariance, unknown_motion_covariance
+from hybridlio.core.motion_limits import (
+    ACCELERATION_SIGMA_M_S2,
+    ANGULAR_ACCELERATION_SIGMA_RAD_S2,
+    PREDICTION_FLOOR_SIGMAS,
+    unknown_motion_covariance,
+)
 from hybridlio.core.sensors import NS_PER_S, Frame
+
+_MEMORY_STEPS = 20  # as in hybridlio/sources/motion_change.py
+_PRIOR = np.array([ANGULAR_ACCELERATION_SIGMA_RAD_S2, ACCELERATION_SIGMA_M_S2])
+
+
+class UsualChange:
+    """How much the twist usually changes between two steps, at least by the accelerations of a calm platform."""
+
+    def __init__(self) -> None:
+        self._twist: Array | None = None
+        self._squared, self._changes = np.zeros(2), 0  # mean over the axes of (rad/s)² and (m/s)²
+
+    def learn(self, twist: Array | None) -> None:
+        """Take the twist ``(6,)`` of the next step; None for a step of which it is not known."""
+        if twist is not None and self._twist is not None:
+            self._changes = min(self._changes + 1, _MEMORY_STEPS)
+            change = ((twist - self._twist) ** 2).reshape(2, 3).mean(axis=1)
+            self._squared = self._squared + (change - self._squared) / self._changes
+        self._twist = twist
+
+    def sigmas(self, time_s: float) -> Array:
+        """Return standard deviations ``(6,)`` of a change, rad/s and m/s per axis, over a time."""
+        return np.repeat(np.sqrt(np.maximum(self._squared, (_PRIOR * time_s) ** 2)), 3)
 
 
 class Identity:
@@ -32,16 +60,27 @@ class ConstantVelocity:
 
     def __init__(self) -> None:
         self._twist: Array | None = None
-        self._stamp_ns = 0
+        self._stamp_ns = self._found_ns = 0  # of the scan before, and of the last one whose step was found
+        self._change = UsualChange()
 
     def predict(self, frame: Frame, state: State) -> RelativePose:
-        """Return the last twist times the time since ``state``; the identity before the first step."""
+        """Return the last twist times the time since ``state``; the identity before the first step.
+
+        The twist is the less certain the older it is, and the more it has changed from step to step so far.
+        """
         dt_s = (frame.scan.stamp_ns - state.stamp_ns) / NS_PER_S
         self._stamp_ns = state.stamp_ns
         if self._twist is None:
             return RelativePose(np.eye(4), unknown_motion_covariance(dt_s), source=self.name)
-        return RelativePose(se3.exp(self._twist * dt_s), changed_motion_covariance(dt_s), source=self.name)
+        sigmas = self._change.sigmas((frame.scan.stamp_ns - self._found_ns) / NS_PER_S) * dt_s
+        covariance = np.diag(sigmas**2 + PREDICTION_FLOOR_SIGMAS**2)
+        return RelativePose(se3.exp(self._twist * dt_s), covariance, source=self.name)
 
     def correct(self, frame: Frame, estimate: RelativePose) -> None:
         """Take the twist from the step to ``frame``."""
+        follows = self._found_ns == self._stamp_ns
         self._twist = se3.log(estimate.pose) * NS_PER_S / (frame.scan.stamp_ns - self._stamp_ns)
+        self._found_ns = frame.scan.stamp_ns
+        if not follows:  # after scans that were not found
+            self._change.learn(None)
+        self._change.learn(self._twist)

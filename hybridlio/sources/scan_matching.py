@@ -15,7 +15,7 @@ from hybridlio.core.motion_limits import MEASUREMENT_FLOOR_SIGMAS, UNKNOWN_TRANS
 from hybridlio.core.sensors import NS_PER_S, Frame, Scan
 from hybridlio.registration.degeneracy import ObservedRegistration, RegistrationProblem, register_with_degeneracy
 from hybridlio.registration.local_map import LocalMap
-from hybridlio.registration.motion_search import best_start, coarse_kernel_m, fits_better, motions
+from hybridlio.registration.motion_search import best_start, coarse_kernel_m, fits_better, motions, rotated
 from hybridlio.sources import map_errors
 from hybridlio.sources.matching_state import MatchingState, PathPoint
 from hybridlio.sources.position_doubt import NEW_MAP
@@ -236,7 +236,8 @@ class ScanMatching:
         if is_lost and not is_unknown:
             return self._continue_motion(self._state.last_found, scan, dt_s) or self._refind(scan, place)
         if is_unknown:  # the initial-pose source knows no motion, but this source may know the last one
-            if (continued := self._continue_motion(self._state.current, scan, dt_s)) is not None:
+            continued = self._continue_motion(self._state.current, scan, dt_s)
+            if continued is not None and continued.registration.cost < REFOUND_COST:
                 return continued
             start = self._search_motion(scan, start, initial, dt_s)
         observed = self._register_from(start, scan, initial)
@@ -271,6 +272,7 @@ class ScanMatching:
         turns = initial.covariance[:3, :3].trace() > _UNKNOWN_ROTATION_SIGMA_RAD**2
         rates_deg_s = settings.start_rates_deg_s if turns else (0.0,)
         starts = [start @ step for step in motions(settings.start_speeds_m_s, rates_deg_s, dt_s)]
+        starts += rotated(self._state.current.T_map_lidar, start, dt_s) if turns else []
         return best_start(surface, scan.source, scan.points, starts, settings.registration)
 
     def _register_from(self, start: Array, scan: ThinnedScan, initial: RelativePose) -> ObservedRegistration:

@@ -96,9 +96,9 @@ def test_a_frame_without_point_times_passes_unchanged_and_without_noise(rng):
     compensation = MotionCompensation(Calibration(), ImuNoise())
     compensated = compensation.compensate(frame, np.eye(4), 0, SWEEP_NS, None, ImuSamples.empty())
     np.testing.assert_allclose(compensated.scan.points, points, atol=1e-4)
-    assert compensation.noise(frame) is not None
+    assert compensation.noise(frame, 0) is not None
     assert compensation.compensate(compensated, np.eye(4), 0, SWEEP_NS, None, ImuSamples.empty()) is compensated
-    assert compensation.noise(compensated) is None
+    assert compensation.noise(compensated, 0) is None
 
 
 def test_the_first_scan_is_compensated_for_rotation(rng):
