@@ -42,7 +42,7 @@ class Factor:
         measured: ``between``, ``sensor-step`` and ``prior``: coordinates of a pose
             (:mod:`hybridlio.graph.model.coordinates`); ``gps``: position, lever arm (6; in the plane z is 0);
             ``attitude``: direction in world, in body (6); ``velocity``: m/s (3); ``bias``: accelerometer, gyroscope
-            (6); ``imu``: the fields of :class:`hybridlio.core.sensors.ImuNoise` in their order (6); ``point``: a
+            (6); ``imu``: the fields of :class:`hybridlio.core.sensors.ImuNoise` in their order (7); ``point``: a
             landmark in the frame of the pose (d); ``bearing-range``: angle or unit direction, and range (2, in space
             4); ``range`` (1) and ``bearing`` (1, in space 3) as there; ``altitude``: m (1); ``heading``: rad (1);
             ``body-velocity``: m/s (3); ``marginal``: see

@@ -144,7 +144,8 @@ def imu_factor(
             "between"
         )
     densities = np.array(astuple(noise))
-    if not (np.isfinite(densities).all() and densities.min() > 0):
+    positive = [value for field, value in vars(noise).items() if field != "gyro_scale_sigma"]  # known exactly where 0
+    if not (np.isfinite(densities).all() and min(positive) > 0):
         raise DataError(f"{name}: noise densities must be finite and positive, got {densities.tolist()}")
     names = chosen(data.calibrations, calibration, ("bias", "gravity"), name)
     return Factor("imu", (i, j), densities, samples=samples, calibration=names)
