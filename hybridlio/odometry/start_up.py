@@ -82,8 +82,8 @@ def measure_step(
     """Return the compensated frame and the step to it: of the search of the start, if there is one, else refined.
 
     Lidars that do not repeat their pattern start by the search. Those that do, start by two scans; if these do not fit
-    each other the search leads, and if they leave a direction open, such as the vertical between walls, it goes along
-    and mends it.
+    each other, and their match has not converged, the search leads; if it has, or if they leave a direction open, such
+    as the vertical between walls, it goes along and mends it.
 
     Args:
         pipeline: its residual source refines.
@@ -111,8 +111,10 @@ def _measured(
     answer = pipeline.refine(frame, initial, before, seconds)
     if is_first_step:
         answer = repeat_first_step(pipeline, frame, answer, before)
-        is_lost = not answer[1].ok or answer[1].details.get("cost", 0.0) > LOST_COST
-        if isinstance(residual, ScanMatching) and (is_lost or len(answer[1].degenerate)):
+        fits_poorly = answer[1].details.get("cost", 0.0) > LOST_COST
+        # Ghosts and few rings make a right match poor, too, but it converges; false ones in rooms do not.
+        is_lost = not answer[1].ok or (fits_poorly and not answer[1].details.get("converged", 1.0))
+        if isinstance(residual, ScanMatching) and (is_lost or fits_poorly or len(answer[1].degenerate)):
             pipeline.start_search = _search(pipeline, residual, leads=is_lost)
     elif isinstance(residual, RefinesAgain):
         second = second_compensation(frame, initial, answer[1], before, pipeline.calibration)
