@@ -16,13 +16,15 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RefinesAgain, RelativePose, State, TakesBack
 from hybridlio.core.motion_limits import UNKNOWN_TRANSLATION_SIGMA_M
-from hybridlio.core.sensors import NS_PER_S, Calibration, Frame
+from hybridlio.core.sensors import NS_PER_S, Frame
 from hybridlio.odometry.inertial_motion import lidar_turn
+from hybridlio.odometry.setup import Setup
 
 _LEVER_M = 10.0  # half of a scan's points are nearer; turns a rotation into a displacement
 # Displacement of the sweep's last points, over the spread of the residuals, from which a scan is registered again. The
 # mean displacement, which moves the scan, is half of it.
 _LEAST_RATIO = 1.0
+_SIGMAS = 3.0  # of the gyroscope's scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,20 +41,21 @@ class SecondCompensation:
 
 
 def second_compensation(
-    frame: Frame, initial: RelativePose, found: RelativePose, before: State, calibration: Calibration
+    frame: Frame, initial: RelativePose, found: RelativePose, before: State, setup: Setup
 ) -> SecondCompensation | None:
     """Return how to compensate a scan once more; None if its points would move by less than their noise.
 
     Registration found the step ``f`` with points compensated for the step ``p``. The error of ``p`` is ``(p − f)·T /
     (T + τ)`` with the step's duration ``T``, since ``f`` errs by ``−τ/T`` of it. The gyroscope is right within
-    hundredths of a degree, unless its scale is wrong and the step turns by tens of degrees.
+    hundredths of a degree, unless its scale is wrong and the step turns by tens of degrees. A turn that no error of
+    scale explains is a wrong match rather.
 
     Args:
         frame: as recorded.
         initial: initial relative pose of the step, by whose translation the scan was compensated.
         found: the step of the first pass, with the spread of its residuals in ``details``.
         before: the state at the scan before.
-        calibration: the extrinsics.
+        setup: the extrinsics and the IMU's noise.
     """
     offsets_ns, noise_m = frame.scan.time_offsets_ns, found.details.get("sigma_m", np.inf)
     if not found.ok or offsets_ns is None or not len(offsets_ns):
@@ -60,11 +63,12 @@ def second_compensation(
     step_s = (frame.scan.stamp_ns - before.stamp_ns) / NS_PER_S
     mean_s, sweep_s = offsets_ns.mean() / NS_PER_S, np.abs(offsets_ns).max() / NS_PER_S
     by_imu = len(frame.imu) > 0
-    turn = lidar_turn(frame.imu, before, calibration) if by_imu else initial.pose[:3, :3]
+    turn = lidar_turn(frame.imu, before, setup.calibration) if by_imu else initial.pose[:3, :3]
     compensated_by = se3.make(turn, initial.pose[:3, 3])
     error = se3.log(se3.between(compensated_by, found.pose)) * step_s / (step_s + mean_s)
     moved_m = np.linalg.norm(error.reshape(2, 3), axis=1) * (_LEVER_M, 1.0) * sweep_s / step_s
-    holds = by_imu and moved_m[0] <= _LEAST_RATIO * noise_m
+    by_scale_rad = _SIGMAS * setup.imu_noise.gyro_scale_sigma * float(np.linalg.norm(se3.so3_log(turn)))
+    holds = by_imu and bool(moved_m[0] <= _LEAST_RATIO * noise_m or np.linalg.norm(error[:3]) > by_scale_rad)
     if holds:
         error[:3], moved_m[0] = 0.0, 0.0
     if moved_m.sum() <= _LEAST_RATIO * noise_m:
