@@ -31,7 +31,7 @@ Scene = Annotated[
         metavar="NAME",
         autocompletion=completion.scene,
         help="A road: town, corridor or field; or a scene for other platforms: office, "
-        "stairs, house, warehouse, garage, forest, tunnel, mine or campus.",
+        "room, stairs, house, warehouse, garage, forest, tunnel, mine or campus.",
     ),
 ]
 Platform = Annotated[

@@ -16,9 +16,8 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RefinesAgain, RelativePose, State, TakesBack
 from hybridlio.core.motion_limits import UNKNOWN_TRANSLATION_SIGMA_M
-from hybridlio.core.sensors import NS_PER_S, Frame
+from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise
 from hybridlio.odometry.inertial_motion import lidar_turn
-from hybridlio.odometry.setup import Setup
 
 _LEVER_M = 10.0  # half of a scan's points are nearer; turns a rotation into a displacement
 # Displacement of the sweep's last points, over the spread of the residuals, from which a scan is registered again. The
@@ -41,7 +40,12 @@ class SecondCompensation:
 
 
 def second_compensation(
-    frame: Frame, initial: RelativePose, found: RelativePose, before: State, setup: Setup
+    frame: Frame,
+    initial: RelativePose,
+    found: RelativePose,
+    before: State,
+    calibration: Calibration,
+    imu_noise: ImuNoise,
 ) -> SecondCompensation | None:
     """Return how to compensate a scan once more; None if its points would move by less than their noise.
 
@@ -55,7 +59,8 @@ def second_compensation(
         initial: initial relative pose of the step, by whose translation the scan was compensated.
         found: the step of the first pass, with the spread of its residuals in ``details``.
         before: the state at the scan before.
-        setup: the extrinsics and the IMU's noise.
+        calibration: the extrinsics.
+        imu_noise: with the standard deviation of the gyroscope's scale.
     """
     offsets_ns, noise_m = frame.scan.time_offsets_ns, found.details.get("sigma_m", np.inf)
     if not found.ok or offsets_ns is None or not len(offsets_ns):
@@ -63,11 +68,11 @@ def second_compensation(
     step_s = (frame.scan.stamp_ns - before.stamp_ns) / NS_PER_S
     mean_s, sweep_s = offsets_ns.mean() / NS_PER_S, np.abs(offsets_ns).max() / NS_PER_S
     by_imu = len(frame.imu) > 0
-    turn = lidar_turn(frame.imu, before, setup.calibration) if by_imu else initial.pose[:3, :3]
+    turn = lidar_turn(frame.imu, before, calibration) if by_imu else initial.pose[:3, :3]
     compensated_by = se3.make(turn, initial.pose[:3, 3])
     error = se3.log(se3.between(compensated_by, found.pose)) * step_s / (step_s + mean_s)
     moved_m = np.linalg.norm(error.reshape(2, 3), axis=1) * (_LEVER_M, 1.0) * sweep_s / step_s
-    by_scale_rad = _SIGMAS * setup.imu_noise.gyro_scale_sigma * float(np.linalg.norm(se3.so3_log(turn)))
+    by_scale_rad = _SIGMAS * imu_noise.gyro_scale_sigma * float(np.linalg.norm(se3.so3_log(turn)))
     holds = by_imu and bool(moved_m[0] <= _LEAST_RATIO * noise_m or np.linalg.norm(error[:3]) > by_scale_rad)
     if holds:
         error[:3], moved_m[0] = 0.0, 0.0

@@ -117,7 +117,7 @@ def _measured(
         if isinstance(residual, ScanMatching) and (is_lost or fits_poorly or len(answer[1].degenerate)):
             pipeline.start_search = _search(pipeline, residual, leads=is_lost)
     elif isinstance(residual, RefinesAgain):
-        second = second_compensation(frame, initial, answer[1], before, pipeline.setup)
+        second = second_compensation(frame, initial, answer[1], before, pipeline.calibration, pipeline.imu_noise)
         if second is not None:
             again = initial if len(frame.imu) else replace(initial, proposed=answer[1].pose)
             answer = pipeline.refine_again(frame, again, before, second)

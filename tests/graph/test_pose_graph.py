@@ -318,7 +318,7 @@ def test_the_public_names_are_exactly_these():
         *("add_pose", "initial", "set_initial", "start_from", "fix", "unfix", "set_origin", "remove"),
         *("add_prior", "add_between", "add_imu", "add_velocity", "add_zero_velocity", "add_bias"),
         *("add_gps", "add_gps_geodetic", "add_attitude", "add_gravity"),
-        *("landmarks", "add_landmark", "add_point_observation", "add_bearing_range"),
+        *("landmarks", "add_landmark", "add_point_observation", "add_bearing_range", "add_range", "add_bearing"),
         *("add_factor", "add_gtsam_factor", "add_altitude", "add_heading", "add_body_velocity", "add_wheel_speed"),
         *("calibrations", "add_calibration", "add_sensor_step"),
         *("copy", "subgraph", "remove_pose", "marginalise", "merge", "set_measurement", "set_noise"),

@@ -14,7 +14,7 @@ from hybridlio.graph import PoseGraph
 STEP_S, SAMPLES = 0.2, 20  # time of a step between poses, and its samples of the IMU
 NOISE = ImuNoise(
     accel_m_s2_sqrt_hz=5e-3, gyro_rad_s_sqrt_hz=5e-4, accel_walk_m_s3_sqrt_hz=1e-9, gyro_walk_rad_s2_sqrt_hz=1e-9,
-    accel_bias_sigma_m_s2=0.05, gyro_bias_sigma_rad_s=0.005,
+    accel_bias_sigma_m_s2=0.05, gyro_bias_sigma_rad_s=0.005, gyro_scale_sigma=0.0,
 )  # fmt: skip
 STEP_SIGMAS = np.r_[np.full(3, 1e-3), np.full(3, 0.01)]
 FIX_SIGMA = 0.03
