@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError, GraphError
 from hybridlio.core.se3 import as_floats
-from hybridlio.core.sensors import ImuNoise, ImuSamples
+from hybridlio.core.sensors import NOISE_DENSITIES, ImuNoise, ImuSamples
 from hybridlio.graph.base.preintegration import MOST_TURN_RAD
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.calibrations import CalibrationNames, chosen, of_kind
@@ -144,8 +144,7 @@ def imu_factor(
             "between"
         )
     densities = np.array(astuple(noise))
-    positive = [value for field, value in vars(noise).items() if field != "gyro_scale_sigma"]  # known exactly where 0
-    if not (np.isfinite(densities).all() and min(positive) > 0):
+    if not (np.isfinite(densities).all() and min(getattr(noise, field) for field in NOISE_DENSITIES) > 0):
         raise DataError(f"{name}: noise densities must be finite and positive, got {densities.tolist()}")
     names = chosen(data.calibrations, calibration, ("bias", "gravity"), name)
     return Factor("imu", (i, j), densities, samples=samples, calibration=names)

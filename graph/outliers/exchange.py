@@ -43,11 +43,18 @@ def exchanged(solver: WeightedSolver, cluster: Index, best: Found, margin: float
     return found
 
 
+def _changes_at(solver: WeightedSolver, best: Found) -> LinearChanges | None:
+    """Return what exchanges change at a result; None where loops with a trace of weight alone determine some pose."""
+    try:
+        return LinearChanges(solver.linear(best.values), best.correct, solver.price)
+    except RuntimeError:  # singular
+        return None
+
+
 def _promising(solver: WeightedSolver, cluster: Index, best: Found, margin: float) -> list[Mask]:
     """Return sets of loops ``(M,)`` to exchange, those that lower the cost most first."""
-    try:
-        changes = LinearChanges(solver.linear(best.values), best.correct, solver.price)
-    except RuntimeError:  # singular: loops with a trace of weight alone determine some pose
+    changes = _changes_at(solver, best)
+    if changes is None:
         return []
     single = changes.single
     wrong, missed = best.correct & (single > solver.price), ~best.correct & (single < solver.price)
@@ -91,9 +98,8 @@ def contradicted(solver: WeightedSolver, cluster: Index, best: Found, groups: li
         best: the result.
         groups: masks ``(M,)``.
     """
-    try:
-        changes = LinearChanges(solver.linear(best.values), best.correct, solver.price)
-    except RuntimeError:
+    changes = _changes_at(solver, best)
+    if changes is None:
         return False
     return all(_contradicts(changes, solver, cluster, best.correct, group) for group in groups)
 

@@ -5,7 +5,7 @@ Time is in int64 nanoseconds. Arrays are checked here, when the objects are made
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
@@ -199,6 +199,10 @@ class ImuNoise:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             check_setting(self, name, 0 <= value < np.inf, "finite and not negative")
+
+
+NOISE_DENSITIES = tuple(field.name for field in fields(ImuNoise) if field.name != "gyro_scale_sigma")
+"""Values of :class:`ImuNoise` that a graph needs above 0; a scale may be known exactly."""
 
 
 @dataclass(frozen=True, eq=False)

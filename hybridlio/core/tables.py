@@ -21,9 +21,9 @@ def number(value: float | None, decimals: int) -> str:
     return NOTHING if value is None else f"{value:.{decimals}f}"
 
 
-def counted(count: int, what: str) -> str:
-    """Return a count with its noun in singular or plural: ``1 scan``, ``2 scans``."""
-    return f"{count} {what}{'s' * (count != 1)}"
+def counted(count: int, what: str, several: str | None = None) -> str:
+    """Return a count with its noun in singular or plural, which is ``several`` or with s: ``1 scan``, ``2 scans``."""
+    return f"{count} {what if count == 1 else several or what + 's'}"
 
 
 def headings(rows: Items[Row]) -> list[str]:

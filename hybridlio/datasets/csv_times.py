@@ -14,10 +14,10 @@ from hybridlio.core.arrays import NS_PER_S, Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.datasets.notes import Notes
 
-_TIME_UNIT = re.compile(r"(.*?)\s*(?:[\[(]([^\])]*)[\])]|_(s|sec|ms|us|ns|nsec))")
+_UNITS = "s|sec|ms|us|ns|nsec"  # at the end of a name
 _TIMES = ("stamp", "headerstamp", "t", "time", "timestamp", "stamps", "timestamps")
 _STATED = {"s": NS_PER_S, "sec": NS_PER_S, "ms": 10**6, "us": 1000, "µs": 1000, "ns": 1, "nsec": 1}
-_TOLD = {"ns": 1, "us": 1000, "ms": 10**6, "s": NS_PER_S}  # units that are told from the values
+_TOLD = {unit: _STATED[unit] for unit in ("ns", "us", "ms", "s")}  # units that are told from the values
 _PAIRS = (("secs", "nsecs"), ("sec", "nsec"), ("sec", "nanosec"), ("seconds", "nanoseconds"))
 
 
@@ -102,6 +102,20 @@ def plain_name(name: str) -> str:
     return re.sub(r"[\s._%\-]", "", name.lower().removeprefix("field."))
 
 
+def name_and_unit(name: str, units: str) -> tuple[str, str | None]:
+    """Split a column's name as ``t_s``, ``t [s]`` or ``t(s)``.
+
+    Args:
+        name: as the header has it.
+        units: that may stand behind ``_``, separated by ``|``; in brackets any may.
+
+    Returns:
+        The plain name, and the unit, None if the header has none.
+    """
+    parts = re.fullmatch(rf"(.*?)\s*(?:[\[(]([^\])]*)[\])]|_({units}))", name.lower())
+    return (plain_name(parts[1]), parts[2] or parts[3]) if parts else (plain_name(name), None)
+
+
 def time_column(header: Sequence[str]) -> TimeColumn:
     """Find the time among the columns of a CSV file.
 
@@ -116,9 +130,8 @@ def time_column(header: Sequence[str]) -> TimeColumn:
                 return TimeColumn(header[column], column, NS_PER_S, plain.index(partner))
     for wanted in _TIMES:
         for column, name in enumerate(header):
-            parts = _TIME_UNIT.fullmatch(name.lower())
-            base, unit = (parts[1], parts[2] or parts[3]) if parts else (name, None)
-            if plain_name(base) == wanted:
+            base, unit = name_and_unit(name, _UNITS)
+            if base == wanted:
                 if unit is not None and unit.strip() not in _STATED:
                     raise ColumnError(f"has the unknown unit '{unit}' in '{name}'; known: {', '.join(_STATED)}")
                 return TimeColumn(name, column, None if unit is None else _STATED[unit.strip()])

@@ -20,7 +20,7 @@ from hybridlio.core.geodesy import GeodeticPoint, check_geodetic, enu_from_geode
 from hybridlio.core.sensors import NS_PER_S, GpsFix
 from hybridlio.core.tables import counted
 from hybridlio.datasets.csv_rows import read_csv
-from hybridlio.datasets.csv_times import ColumnError, TimeColumn, plain_name, time_column
+from hybridlio.datasets.csv_times import ColumnError, TimeColumn, name_and_unit, time_column
 from hybridlio.datasets.notes import Notes
 
 DEFAULT_SIGMA_M = 5.0  # of a fix without one: what single receivers reach under open sky
@@ -34,7 +34,7 @@ _GEODETIC = (
     ("height", "ellipsoidalheight", "hgt", "altitude", "alt", "elevation", "ele"),
 )
 _RECEIVER = re.compile(r"(?:gps|gnss|navsatfix|fix)(?=.)")  # before a name
-_UNIT = re.compile(r"(.*?)\s*(?:[\[(]([^\])]*)[\])]|_(deg|degrees|rad|m|cm|mm|ft))")
+_UNITS = "deg|degrees|rad|m|cm|mm|ft"  # at the end of a name
 _DEGREES = {"deg": 1.0, "degrees": 1.0, "°": 1.0, "rad": 180 / np.pi}
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 1e-3, "ft": 0.3048}
 
@@ -159,9 +159,8 @@ def _gps_columns(header: Sequence[str]) -> _GpsColumns:
 
 def _named(name: str) -> tuple[str, str | None]:
     """Return the plain name of a column, and its unit if the header has one."""
-    parts = _UNIT.fullmatch(name.lower())
-    base, unit = (parts[1], parts[2] or parts[3]) if parts else (name, None)
-    return _RECEIVER.sub("", plain_name(base), count=1), unit
+    base, unit = name_and_unit(name, _UNITS)
+    return _RECEIVER.sub("", base, count=1), unit
 
 
 def _factor(name: str, unit: str | None, units: dict[str, float]) -> float:
@@ -250,8 +249,7 @@ def assumed_where_unknown(covariances: list[Array | None], source: str, notes: N
         notes: receives the note.
     """
     if unknown := sum(one is None for one in covariances):
-        fixes = counted(unknown, "fix").replace("fixs", "fixes")
-        notes.add(f"{source}: {fixes} without covariance; {DEFAULT_SIGMA_M:g} m are assumed")
+        notes.add(f"{source}: {counted(unknown, 'fix', 'fixes')} without covariance; {DEFAULT_SIGMA_M:g} m are assumed")
     return [DEFAULT_SIGMA_M**2 * np.eye(3) if one is None else one for one in covariances]
 
 

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridlio.datasets.csv_times import ColumnError, TimeColumn, plain_name, time_column
+from hybridlio.datasets.csv_times import ColumnError, TimeColumn, name_and_unit, plain_name, time_column
 
 STANDARD_GRAVITY_M_S2 = 9.80665  # the unit g, by definition; not the gravity of a place
 
 _GYRO = "gyroscope|gyro|gyr|angularvelocity|angvel|angularrate|rotationrate|omega|wrss|w|g"
 _ACCEL = "linearacceleration|linacc|acceleration|accelerometer|accel|acc|specificforce|arss|a"
 _AXIS = re.compile(rf"(?P<gyro>{_GYRO})(?P<axis>[xyz])|(?P<accel>{_ACCEL})(?P<axis2>[xyz])")
-_UNIT = re.compile(r"(.*?)\s*(?:[\[(]([^\])]*)[\])]|_(rad_s|deg_s|dps|mdps|mrad_s|m_s2|g|mg))")
+_UNITS = "rad_s|deg_s|dps|mdps|mrad_s|m_s2|g|mg"  # at the end of a name
 _RATES = {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": np.pi / 180, "mdeg/s": np.pi / 180_000}
 _FORCES = {"m/s2": 1.0, "g": STANDARD_GRAVITY_M_S2, "mg": STANDARD_GRAVITY_M_S2 * 1e-3}
 _SAME = {
@@ -70,9 +70,8 @@ def _is_linear(name: str) -> bool:
 
 def _axis(name: str) -> tuple[str, float | None] | None:
     """Return which of gx gy gz ax ay az a column is, and its factor; None for another column."""
-    parts = _UNIT.fullmatch(name.lower())
-    base, unit = (parts[1], parts[2] or parts[3]) if parts else (name, None)
-    match = _AXIS.fullmatch(plain_name(base))
+    base, unit = name_and_unit(name, _UNITS)
+    match = _AXIS.fullmatch(base)
     if match is None:
         return None
     kind, units = ("g", _RATES) if match["gyro"] else ("a", _FORCES)

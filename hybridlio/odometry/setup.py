@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from hybridlio.core.sensors import Calibration, Frame, ImuNoise
+from hybridlio.core.sensors import NOISE_DENSITIES, Calibration, Frame, ImuNoise
 from hybridlio.core.setting_checks import check_positive
 
 if TYPE_CHECKING:  # the command line imports this module and must start quickly
@@ -41,7 +41,7 @@ class Setup:
                 an error of scale may be missing.
         """
         noise = config.imu_noise or frame.imu_noise or ImuNoise()
-        check_positive(noise, *(field.name for field in fields(noise) if field.name != "gyro_scale_sigma"))
+        check_positive(noise, *NOISE_DENSITIES)
         return cls(config, frame.calibration or Calibration(), noise)
 
     @cached_property

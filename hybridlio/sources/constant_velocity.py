@@ -7,36 +7,9 @@ import numpy as np
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose, State
-from hybridlio.core.motion_limits import (
-    ACCELERATION_SIGMA_M_S2,
-    ANGULAR_ACCELERATION_SIGMA_RAD_S2,
-    PREDICTION_FLOOR_SIGMAS,
-    unknown_motion_covariance,
-)
+from hybridlio.core.motion_limits import PREDICTION_FLOOR_SIGMAS, unknown_motion_covariance
 from hybridlio.core.sensors import NS_PER_S, Frame
-
-_MEMORY_STEPS = 20  # as in hybridlio/sources/motion_change.py
-_PRIOR = np.array([ANGULAR_ACCELERATION_SIGMA_RAD_S2, ACCELERATION_SIGMA_M_S2])
-
-
-class UsualChange:
-    """How much the twist usually changes between two steps, at least by the accelerations of a calm platform."""
-
-    def __init__(self) -> None:
-        self._twist: Array | None = None
-        self._squared, self._changes = np.zeros(2), 0  # mean over the axes of (rad/s)² and (m/s)²
-
-    def learn(self, twist: Array | None) -> None:
-        """Take the twist ``(6,)`` of the next step; None for a step of which it is not known."""
-        if twist is not None and self._twist is not None:
-            self._changes = min(self._changes + 1, _MEMORY_STEPS)
-            change = ((twist - self._twist) ** 2).reshape(2, 3).mean(axis=1)
-            self._squared = self._squared + (change - self._squared) / self._changes
-        self._twist = twist
-
-    def sigmas(self, time_s: float) -> Array:
-        """Return standard deviations ``(6,)`` of a change, rad/s and m/s per axis, over a time."""
-        return np.repeat(np.sqrt(np.maximum(self._squared, (_PRIOR * time_s) ** 2)), 3)
+from hybridlio.sources.motion_change import UsualChange
 
 
 class Identity:

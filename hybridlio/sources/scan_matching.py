@@ -199,8 +199,10 @@ class ScanMatching:
             drift = None if drift is None else self._state.current.bridge_covariance
             self._state = self._state.restarted(scan.points)
             details[NEW_MAP] = 1.0
-        bridge = RelativePose(initial.pose, initial.covariance, initial.source, ok=False, drift=drift, details=details)
-        return replace(bridge, from_imu=initial.from_imu)
+        return RelativePose(
+            initial.pose, initial.covariance, initial.source,
+            ok=False, from_imu=initial.from_imu, drift=drift, details=details,
+        )  # fmt: skip
 
     @property
     def _keyframes(self) -> int:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from inertial import GRAVITY, NOISE, at_rest, samples, state_at
+from inertial import GRAVITY, NOISE, at_rest, samples, state_at, tumbling
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
@@ -22,7 +22,6 @@ from hybridlio.graph.base.preintegration import (
     predict_step,
     preintegrate,
     sampling_noise,
-    with_scale_error,
 )
 from hybridlio.simulation.config import SimulationConfig
 from hybridlio.simulation.plan import plan
@@ -147,37 +146,6 @@ def test_the_covariance_from_sample_noise_alone_is_its_scatter(rng: np.random.Ge
     np.testing.assert_allclose(ratio, 1.0, atol=0.12)  # four standard deviations of a sigma from 600 repetitions
 
 
-# ---------------------------------------------------------------------------------------------- unknown scale
-
-CONSUMER_GYRO = ImuNoise(gyro_scale_sigma=ImuNoise().gyro_scale_sigma)
-
-
-@pytest.mark.parametrize("turns", [0.2, 0.45, 2.0])
-def test_the_covariance_covers_a_gyroscope_of_a_consumer_imu(turns: float, rng: np.random.Generator):
-    """Sensitivities off by their tolerance of 1.5 %, axes mixed by up to 1 %, and no other error (ICM-20948)."""
-    imu, R_end = tumbling(turns)
-    state, nees = state_at(np.eye(4), np.zeros(3)), []
-    for _ in range(60):
-        off = np.diag(0.015 * rng.choice([-1.0, 1.0], 3)) + rng.uniform(-0.01, 0.01, (3, 3)) * (1 - np.eye(3))
-        wrong = replace(imu, gyro_rad_s=imu.gyro_rad_s @ (np.eye(3) + off).T)
-        step, covariance = predict_in_parts(wrong, state, CONSUMER_GYRO)
-        error = se3.log(se3.between(step, se3.make(R_end.as_matrix(), np.zeros(3))))[:3]
-        nees.append(error @ np.linalg.solve(covariance[:3, :3], error) / 3)
-    assert 0.3 < np.mean(nees) < 3.0
-
-
-def test_a_motion_to_and_fro_takes_the_error_of_scale_back():
-    times = np.arange(2001) / 200
-    swinging = samples(times, np.outer(np.cos(2 * np.pi * times), [0.0, 0.0, 0.5]), np.zeros((2001, 3)))
-    turning = samples(times, np.tile([0.0, 0.0, 0.5], (2001, 1)), np.zeros((2001, 3)))
-    state = state_at(np.eye(4), np.zeros(3))
-    added = [
-        np.sqrt(10.0 * (with_scale_error(CONSUMER_GYRO, imu, state).gyro_rad_s_sqrt_hz ** 2 - 1e-3**2))
-        for imu in (swinging, turning)
-    ]
-    np.testing.assert_allclose(added, CONSUMER_GYRO.gyro_scale_sigma * np.array([0.5 / (2 * np.pi), 5.0]), rtol=0.01)
-
-
 # ---------------------------------------------------------------------------------------------- sampling
 
 
@@ -212,19 +180,6 @@ def test_motion_between_samples_at_10_hz_stays_within_the_sampling_noise():
         error = se3.log(se3.between(step, se3.between(*motion.poses)))
         nees.append(error @ np.linalg.solve(covariance, error) / 6)
     assert np.mean(nees) < 1.0
-
-
-def tumbling(turns: float) -> tuple[ImuSamples, Rotation]:
-    """Return 4 s of an IMU that turns on the spot, mostly about z, and its orientation at the end."""
-    times = np.arange(1601) / 400
-    about_z = np.full(len(times), 2 * np.pi * turns / 4)
-    rates = np.column_stack([0.3 * np.sin(3 * times), 0.3 * np.cos(2 * times), about_z])
-    steps = Rotation.from_rotvec((rates[1:] + rates[:-1]) / 2 / 400)
-    orientations = [Rotation.identity()]
-    for step in steps:
-        orientations.append(orientations[-1] * step)
-    R = Rotation.concatenate(orientations)
-    return samples(times, rates, R.inv().apply(-GRAVITY)), R[-1]
 
 
 @pytest.mark.parametrize("turns", [0.2, 0.6, 1.0, 2.0])
