@@ -101,8 +101,13 @@ Frames = Annotated[str | None, typer.Option("--frames", metavar="A:B", help="Use
 Start = Annotated[
     int | None, typer.Option("--start", "--jump", "-j", metavar="N", min=0, help="Leave out the first N scans.")
 ]
-ScanCount = Annotated[int | None, typer.Option("--n-scans", "-n", metavar="N", min=1, help="Use N scans at most.")]
-Every = Annotated[int, typer.Option("--every", metavar="N", min=1, help="Use one scan in N.")]
+ScanCount = Annotated[
+    int | None,
+    typer.Option("--n-scans", "-n", metavar="N", min=1, help="Use N scans at most, after --start and --every."),
+]
+Every = Annotated[
+    int, typer.Option("--every", metavar="N", min=1, help="Use one scan in N, from the first one that is not left out.")
+]
 InitialPoseName = Annotated[
     str | None,
     typer.Option(
@@ -258,8 +263,10 @@ def check_data(recording: Sequence, check: bool) -> Sequence:
         return check_recording(recording, report)
 
 
-def range_of(frames: str | None, start: int | None, count: int | None) -> str | None:
+def range_of(frames: str | None, start: int | None, count: int | None, every: int = 1) -> str | None:
     """Return the range of scans in which ``--frames``, or ``--start`` and ``--n-scans``, leave the recording.
+
+    As for KISS-ICP, ``--n-scans`` counts the scans that are used: with ``--every`` they lie in a longer range.
 
     Raises:
         ConfigError: both are given.
@@ -269,7 +276,7 @@ def range_of(frames: str | None, start: int | None, count: int | None) -> str | 
     if frames is not None:
         raise ConfigError("--frames and --start or --n-scans choose the scans both; give one of them")
     first = start or 0
-    return f"{first}:{'' if count is None else first + count}"
+    return f"{first}:{'' if count is None else first + count * every}"
 
 
 def load_settings(config: Path | None, **names: str | None) -> Config:

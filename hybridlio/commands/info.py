@@ -44,7 +44,6 @@ def info(
     with notes_held_back():
         recording = common.open_data(data, sequence, reader, raw_root, None, None, topics, rate)
         summary = {"path": str(path), "reader": name, "topics": found, **summarise(recording)}
-        summary["is_checked"] = check and recording.imu_time_offset_s is None
         if check:
             _add_check(summary, recording)
     if as_json:
@@ -58,14 +57,12 @@ def info(
 
 def _add_check(summary: dict[str, Any], recording: Sequence) -> None:
     """Add the comparison of IMU and scans: the offset of the clocks, and notes."""
-    from hybridlio.runs.recording_check import compare_imu, is_comparable
+    from hybridlio.runs.recording_check import examine, is_checked
 
-    found = None
-    if is_comparable(recording):
-        with progress("checking the IMU") as report:
-            found = compare_imu(recording, report)
-    if found is None:
+    if not is_checked(recording):
         return
+    with progress("checking the IMU") as report:
+        found = examine(recording, report)
     if (offset := found.offset) is not None:
         figures = {"offset_s": round(offset.offset_s, 6), "sigma_s": round(offset.sigma_s, 6)}
         summary["imu_clock"] = figures | {"is_significant": offset.is_significant}
@@ -102,8 +99,6 @@ def _lines(summary: dict[str, Any]) -> list[tuple[str, str]]:
     if imu is not None:
         force, rate = imu["median_force_m_s2"], imu["largest_rate_rad_s"]
         lines += [("", f"median specific force {force:.2f} m/s², up to {rate:.2f} rad/s")]
-    if imu is not None and summary.get("is_checked") and "imu_clock" not in summary:
-        lines += [("", "clock offset not found: too few scans or turns to compare with; stamps are taken as they are")]
     if (clock := summary.get("imu_clock")) is not None:
         applied = "runs move the stamps by it" if clock["is_significant"] else "runs take the stamps as they are"
         lines += [("", f"clock offset {1e3 * clock['offset_s']:+.1f} ± {1e3 * clock['sigma_s']:.1f} ms, {applied}")]

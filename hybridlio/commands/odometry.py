@@ -79,7 +79,7 @@ def odometry(
         raise ConfigError("--resume needs -o, the folder of the run that is to go on, and no --overwrite")
     chosen = common.load_settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
     estimator = Odometry(config=chosen)  # report unknown names before the recording is opened
-    frames = common.range_of(frames, start, n_scans)
+    frames = common.range_of(frames, start, n_scans, every)
     recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle, topics, rate).every(every)
     adapted = adapt_config(recording, chosen, is_explicit=initial_pose is not None or config is not None)
     if adapted != chosen:

@@ -150,7 +150,8 @@ def reopen(source: Source, path: str | os.PathLike[str] | None = None) -> Sequen
         topics=source.topics,
         rate_hz=source.rate_hz,
     )
-    return whole if not source.start and source.stop is None else whole.part(source.start, source.stop)
+    used = whole if not source.start and source.stop is None else whole.part(source.start, source.stop)
+    return used.every(source.step)
 
 
 def without_false_samples(sequence: Sequence) -> Sequence:

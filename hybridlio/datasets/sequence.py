@@ -144,7 +144,7 @@ class Sequence:
             load_scan=lambda k: self.load_scan(k * step),
             reference=None if reference is None else Trajectory(reference.stamps_ns[rows], reference.poses[rows]),
             forward_speed_m_s=None if self.forward_speed_m_s is None else self.forward_speed_m_s[rows],
-            source=None,  # its rows are no range
+            source=None if self.source is None else self.source.every(step),
             notes=(*self.notes, f"one scan in {step} is used"),
         )
 

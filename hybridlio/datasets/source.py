@@ -18,6 +18,7 @@ class Source:
         sequence, reader: names, as found.
         raw_root, vertical_angle_deg, topics, rate_hz: as given.
         start, stop: first frame used, and the one after the last; None for all.
+        step: of these, one in so many is used.
     """
 
     path: str
@@ -29,10 +30,15 @@ class Source:
     rate_hz: float | None = None
     start: int = 0
     stop: int | None = None
+    step: int = 1
 
     def part(self, start: int, stop: int) -> Source:
         """Return the source of frames ``start`` to ``stop`` (exclusive) of the part that this one names."""
-        return replace(self, start=self.start + start, stop=self.start + stop)
+        return replace(self, start=self.start + start * self.step, stop=self.start + stop * self.step)
+
+    def every(self, step: int) -> Source:
+        """Return the source of one in ``step`` of the frames that this one names."""
+        return replace(self, step=self.step * step)
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return all attributes as plain values."""
@@ -50,7 +56,7 @@ class Source:
             source = cls(**{**values, "topics": topics})
         except (TypeError, KeyError, ConfigError) as error:
             raise DataError(f"not the description of a recording ({error})") from None
-        kinds = {"path": str, "sequence": str, "reader": str, "start": int, "stop": int, "raw_root": str}
+        kinds = {"path": str, "sequence": str, "reader": str, "start": int, "stop": int, "step": int, "raw_root": str}
         for name, kind in kinds.items():
             value = getattr(source, name)
             if not isinstance(value, kind) and not (value is None and name in ("stop", "raw_root")):

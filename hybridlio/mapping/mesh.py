@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import math
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -68,7 +71,28 @@ def write_mesh(path: Path, points: PointMap, voxel_m: float, colour: str = "heig
     mesh.remove_vertices_by_mask((density < np.quantile(density, _UNSUPPORTED)).tolist())
     mesh.compute_vertex_normals()
     mesh.vertex_colors = o3d.utility.Vector3dVector(np.clip(np.asarray(mesh.vertex_colors), 0.0, 1.0))  # extrapolated
+    if path.suffix.lower() != ".stl":  # Open3D warns on stdout where a format has no room for them
+        mesh.triangle_normals = o3d.utility.Vector3dVector()
     with atomic_path(path) as part:
         if not o3d.io.write_triangle_mesh(part, mesh):
             raise DataError(f"{path}: the mesh cannot be written; choose a place with free space")
+        if path.suffix.lower() == ".glb":
+            _move_to_binary_chunk(part)
     return len(mesh.triangles)
+
+
+def _move_to_binary_chunk(path: Path) -> None:
+    """Move the buffer of a binary glTF file from its JSON, where Open3D writes it and few programs look, to a chunk.
+
+    Khronos, glTF 2.0 Specification, section 4.4: a header, a JSON chunk padded with spaces, a chunk padded with zeros.
+    """
+    written = path.read_bytes()
+    (size,) = struct.unpack_from("<I", written, 12)
+    scene = json.loads(written[20 : 20 + size])
+    (buffer,) = scene["buffers"]
+    content = base64.b64decode(buffer.pop("uri").partition(",")[2])
+    text = json.dumps(scene, separators=(",", ":")).encode()
+    text, content = text + b" " * (-len(text) % 4), content + bytes(-len(content) % 4)
+    header = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(content))
+    chunks = (struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(content), b"BIN\0"), content)
+    path.write_bytes(b"".join((header, *chunks)))

@@ -47,10 +47,9 @@ def check_recording(sequence: Sequence, progress: Progress | None = None) -> Seq
     Raises:
         DataError: the IMU or its mounting is wrong; the message says what and what to do.
     """
-    if sequence.imu_time_offset_s is not None or len(sequence.imu) < 2:
+    if not is_checked(sequence):
         return sequence
-    check = compare_imu(sequence, progress) if is_comparable(sequence) else None
-    check = check or ImuCheck(sequence.imu)
+    check = examine(sequence, progress)
     if check.wrong:
         raise DataError(f"{sequence.name}: {check.wrong[0]}. To run all the same: --no-check")
     notes = Notes(sequence.name, list(sequence.notes))
@@ -58,14 +57,26 @@ def check_recording(sequence: Sequence, progress: Progress | None = None) -> Seq
         notes.corrected(text)
     for text in check.doubtful:
         notes.add(text)
-    if (reason := _why_not_found(check)) is not None:
-        notes.add(
-            f"the offset of the IMU's clock was not found: {reason}. Stamps are taken as they are; if the clocks may "
-            "differ, state imu_time_offset_s in calibration.yaml"
-        )
     is_moved = check.offset is not None and check.offset.is_significant
     applied_s = check.offset.offset_s if check.offset is not None and is_moved else None
     return replace(sequence, imu=check.imu, notes=tuple(notes.texts), imu_time_offset_s=applied_s)
+
+
+def is_checked(sequence: Sequence) -> bool:
+    """Whether a recording has samples to check, and does not state the offset of its clocks."""
+    return sequence.imu_time_offset_s is None and len(sequence.imu) > 1
+
+
+def examine(sequence: Sequence, progress: Progress | None = None) -> ImuCheck:
+    """Return what the comparison of a recording's IMU and scans shows; where it shows no offset, the doubts say why."""
+    found = compare_imu(sequence, progress) if is_comparable(sequence) else None
+    found = found or ImuCheck(sequence.imu)
+    if not found.wrong and (reason := _why_not_found(found)) is not None:
+        found.doubtful.append(
+            f"the offset of the IMU's clock was not found: {reason}. Stamps are taken as they are; if the clocks may "
+            "differ, state imu_time_offset_s in calibration.yaml"
+        )
+    return found
 
 
 def _why_not_found(check: ImuCheck) -> str | None:
@@ -81,8 +92,8 @@ def _why_not_found(check: ImuCheck) -> str | None:
 
 
 def is_comparable(sequence: Sequence) -> bool:
-    """Whether a recording has samples and scans enough to compare, and does not state the offset of its clocks."""
-    return sequence.imu_time_offset_s is None and len(sequence.imu) > 1 and len(sequence) >= _LEAST_SCANS
+    """Whether a recording is checked, and has scans enough to compare its samples with."""
+    return is_checked(sequence) and len(sequence) >= _LEAST_SCANS
 
 
 def compare_imu(sequence: Sequence, progress: Progress | None = None) -> ImuCheck | None:

@@ -74,7 +74,7 @@ def localize(
 
     place = None if start is None else _start(start)
     chosen = common.load_settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
-    frames = common.range_of(frames, None, n_scans)
+    frames = common.range_of(frames, None, n_scans, every)
     recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle, topics, rate).every(every)
     prior, crs = open_prior_map(map_), crs_of_file(map_)
     recording = common.check_data(recording, check)

@@ -162,7 +162,11 @@ class _Output:
             project = None if place is None else partial(projected, origin=place)
             count = write_tiles(self.path, tiles, self.tile_suffix, self.colour, project, crs, report)
             return f"{counted(count, 'point')} in {counted(len(tiles.names), 'tile')}"
-        points = PointMap.joined([tiles.points(tile) for tile in tiles.names])
+        parts = []
+        for tile in tiles.names:
+            parts.append(tiles.points(tile))
+            report("tiles", len(parts), len(tiles.names))
+        points = PointMap.joined(parts)
         if self.mesh:
             return counted(write_mesh(self.path, points, voxel_m, self.colour), "triangle")
         write_map(self.path, points if place is None else projected(points, place), self.colour, crs)

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from command_line import ok, refused
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.trajectory import read_tum
 from hybridlio.datasets.sequence import Sequence
+from hybridlio.runs.results.map_source import open_map_source
 
 pytestmark = pytest.mark.usefixtures("plain_logging", "without_pages")
 QUICK = ("--residual", "none")
@@ -28,6 +30,7 @@ QUICK = ("--residual", "none")
         (("--start", 20), slice(20, None)),
         (("--every", 4), slice(None, None, 4)),
         (("--every", 2, "--frames", "1:9"), slice(1, 9, 2)),
+        (("--every", 3, "-n", 5, "--start", 2), slice(2, 17, 3)),  # N scans are used, as with KISS-ICP
         (("--jump", 20), slice(20, None)),  # as in KISS-ICP
     ],
 )
@@ -36,6 +39,16 @@ def test_the_scans_to_use_can_be_chosen(
 ) -> None:
     ok("odometry", tiny_drive, *QUICK, *words, "-o", tmp_path / "run")
     assert read_tum(tmp_path / "run/poses_tum.txt").stamps_ns.tolist() == sequence.stamps_ns[rows].tolist()
+
+
+def test_a_run_of_every_third_scan_opens_its_recording_again(
+    tiny_drive: Path, sequence: Sequence, tmp_path: Path
+) -> None:
+    ok("odometry", tiny_drive, *QUICK, "--start", 2, "--every", 3, "-o", tmp_path / "run")
+    source = open_map_source(tmp_path / "run")
+    assert source.sequence.stamps_ns.tolist() == sequence.stamps_ns[2::3].tolist()
+    assert source.sequence.part(1, 3).every(2).source == replace(source.sequence.source, start=5, stop=11, step=6)
+    assert "8 scans" in ok("map", tmp_path / "run", "-o", tmp_path / "map.ply", "--voxel", 0.5)
 
 
 def test_two_ways_to_choose_them_are_one_too_many(tiny_drive: Path) -> None:

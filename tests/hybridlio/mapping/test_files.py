@@ -1,6 +1,7 @@
 """Files of maps, read back by other programs' readers: the same points, times, normals and colours."""
 
 import json
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from hybridlio.datasets.points.ply import read_ply
 from hybridlio.mapping.colours import COLOURS, colours_by
 from hybridlio.mapping.files import FORMATS, check_map_path, write_map
 from hybridlio.mapping.map_projection import projected, utm_crs
+from hybridlio.mapping.mesh import FORMATS as MESH_FORMATS
 from hybridlio.mapping.mesh import write_mesh
 from hybridlio.mapping.point_map import PointMap
 from hybridlio.mapping.settings import MapSettings
@@ -124,13 +126,30 @@ def test_colours_follow_the_value_and_ignore_stray_points() -> None:
     assert set(COLOURS) == {"height", "intensity", "time", "none"}
 
 
-def test_a_mesh_of_a_sphere_is_the_sphere(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("suffix", MESH_FORMATS)
+def test_a_mesh_of_a_sphere_is_the_sphere(suffix: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     o3d = pytest.importorskip("open3d")
     half = replace(cloud(), intensity=(cloud().points[:, 2] > 0).astype(np.float32))
-    assert write_mesh(tmp_path / "mesh.ply", half, 0.2, "intensity") > 500
-    assert capfd.readouterr().out == "", "Open3D warns on stdout of colours that it extrapolates"
-    vertices = np.asarray(o3d.io.read_triangle_mesh(str(tmp_path / "mesh.ply")).vertices)
-    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 5.0, atol=0.1)
+    triangles = write_mesh(tmp_path / f"mesh{suffix}", half, 0.2, "intensity")
+    assert triangles > 500
+    assert capfd.readouterr().out == "", "Open3D warns on stdout of colours that it extrapolates, and of normals"
+    mesh = o3d.io.read_triangle_mesh(str(tmp_path / f"mesh{suffix}"))
+    assert len(mesh.triangles) == triangles
+    assert mesh.has_vertex_colors() == (suffix != ".stl")
+    np.testing.assert_allclose(np.linalg.norm(np.asarray(mesh.vertices), axis=1), 5.0, atol=0.1)
+
+
+def test_a_binary_mesh_has_its_numbers_in_a_binary_chunk(tmp_path: Path) -> None:
+    pytest.importorskip("open3d")
+    write_mesh(tmp_path / "mesh.glb", cloud(), 0.5)
+    content = (tmp_path / "mesh.glb").read_bytes()
+    magic, version, length, size, kind = struct.unpack_from("<4sIII4s", content)
+    assert (magic, version, length, kind) == (b"glTF", 2, len(content), b"JSON")
+    scene = json.loads(content[20 : 20 + size])
+    size_binary, kind = struct.unpack_from("<I4s", content, 20 + size)
+    assert (kind, 28 + size + size_binary) == (b"BIN\0", len(content))
+    assert "uri" not in scene["buffers"][0]
+    assert 0 <= size_binary - scene["buffers"][0]["byteLength"] < 4
 
 
 def test_what_cannot_work_is_refused_before_anything_is_written(tmp_path: Path) -> None:

@@ -47,6 +47,28 @@ def test_a_moving_scene_without_the_vehicle_gets_no_note() -> None:
     assert notes.texts == []
 
 
+def ring_ground(tilt: float) -> np.ndarray:
+    """The rings of a spinning lidar on a plane of ground, the same in each scan while it moves."""
+    azimuth, radius = np.meshgrid(np.linspace(-np.pi, np.pi, 900), [2.2, 2.7, 3.4, 4.4, 6.0, 9.1])
+    x, y = (radius * np.cos(azimuth)).ravel(), (radius * np.sin(azimuth)).ravel()
+    return np.column_stack([x, y, tilt * x - 1.7])
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.2])
+def test_rings_on_flat_ground_are_not_the_vehicle(tilt: float) -> None:
+    rng, notes, with_bonnet = np.random.default_rng(2), Notes("test"), Notes("test")
+    clouds = [
+        np.vstack([scene(k)[: -len(BONNET)], ring_ground(tilt) + rng.normal(0, 0.01, (5400, 3))]) for k in range(5)
+    ]
+    clouds = [cloud[cloud[:, 2] > tilt * cloud[:, 0] - 1.8] for cloud in clouds]  # nothing is below the ground
+    note_vehicle(clouds, notes)
+    assert notes.texts == []
+    note_vehicle([np.vstack([cloud, scene(k)[-len(BONNET) :]]) for k, cloud in enumerate(clouds)], with_bonnet)
+    (text,) = with_bonnet.texts
+    box = yaml.safe_load(text.split("'")[1])["vehicle"]
+    assert np.ptp([box["min"], box["max"]], axis=0).max() < 2.0, "of the bonnet, without the ground"
+
+
 def test_a_room_without_farther_points_does_not_say_whether_the_vehicle_moves() -> None:
     notes = Notes("test")
     walls = scene(0)
