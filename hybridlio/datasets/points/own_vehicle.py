@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlio.core.arrays import Array, Floats, Mask
+from hybridlio.core.arrays import Floats
 from hybridlio.datasets.notes import Notes
 
 _VOXEL_M = 0.1  # twice the noise of a lidar at such ranges: a point of the vehicle stays in one or two voxels
@@ -19,7 +19,7 @@ _MIN_FAR = 100  # farther voxels of a scan: with fewer, as in a small room, nobo
 _MAX_STILL = 0.2  # share of the farther voxels that are occupied in all scans: more, and the vehicle stands
 _CELL_M = 1.0  # the lowest farther point of each such cell is on the ground, or on something that hides it
 _GROUND_M = 0.3  # above and below the plane of the ground: two voxels, and its unevenness
-_FITS = 10  # of the plane; what is off by more than _GROUND_M in one counts no more in the next
+_FITS = 10  # of the plane; what lies farther than _GROUND_M above one does not count in the next
 
 
 def note_vehicle(clouds: list[Floats], notes: Notes) -> None:
@@ -32,19 +32,15 @@ def note_vehicle(clouds: list[Floats], notes: Notes) -> None:
     if len(clouds) < _MIN_SCANS:
         return
     near, far = [], []
-    for cloud in clouds:
-        x, y, z = np.abs(cloud).T
-        across = np.maximum(np.maximum(x, y), z)
+    for cloud in _without_ground(clouds):
+        across = np.abs(cloud).max(axis=1)
         near.append(_voxels(cloud[across < _NEAR_M]))
         far.append(_voxels(cloud[(across >= _NEAR_M) & (across < _FAR_M)]))
     still, elsewhere = _in_all(near), _in_all(far)
     usual = float(np.median([len(voxels) for voxels in far]))
-    if usual < _MIN_FAR or len(elsewhere) > _MAX_STILL * usual:
+    if not len(still) or usual < _MIN_FAR or len(elsewhere) > _MAX_STILL * usual:
         return
-    corners_at = _corners(still)
-    corners_at = corners_at[~_on_ground(corners_at * _VOXEL_M, _corners(np.concatenate(far)) * _VOXEL_M)]
-    if not len(corners_at):
-        return
+    corners_at = np.column_stack(np.unravel_index(still, _SHAPE)) - _HALF
     low, high = corners_at.min(axis=0) * _VOXEL_M, (corners_at.max(axis=0) + 1) * _VOXEL_M
     share = float(np.mean([((c >= low) & (c <= high)).all(axis=1).mean() for c in clouds if len(c)]))
     if share >= _MIN_SHARE:
@@ -62,29 +58,23 @@ def _voxels(points: Floats) -> NDArray[np.int32]:
     return numbers[np.diff(numbers, prepend=-1) > 0]
 
 
-def _corners(voxels: NDArray[np.integer]) -> NDArray[np.int64]:
-    """Return the lower corners ``(N, 3)`` of voxels, in voxels from the lidar."""
-    return np.column_stack(np.unravel_index(voxels, _SHAPE)) - _HALF
+def _without_ground(clouds: list[Floats]) -> list[Floats]:
+    """Return the clouds without points on the ground: on a plane, each ring of the lidar stays at its place, too.
 
-
-def _on_ground(points: Array, farther: Array) -> Mask:
-    """Return which points lie on the ground: on a plane, each ring of the lidar stays at its place, too.
-
-    Args:
-        points: ``(N, 3)`` near the lidar.
-        farther: ``(M, 3)`` points around them, to whose lowest ones the plane is fitted.
+    The plane is fitted to the lowest of the farther points in each cell, and again without those high above it.
     """
+    pooled = np.concatenate(clouds)
+    across = np.abs(pooled).max(axis=1)
+    farther = pooled[(across >= _NEAR_M) & (across < _FAR_M)]
     cells = (np.floor(farther[:, :2] / _CELL_M) + round(_FAR_M / _CELL_M)).astype(int) @ [1000, 1]
     order = np.lexsort((farther[:, 2], cells))
-    lowest = farther[order[np.diff(cells[order], prepend=-1) > 0]]
+    lowest = farther[order[np.diff(cells[order], prepend=-1) > 0]].astype(np.float64)
     columns, height = np.column_stack([lowest[:, :2], np.ones(len(lowest))]), lowest[:, 2]
-    kept = height <= np.median(height)
+    kept, plane = np.ones(len(lowest), bool), np.zeros(3)
     for _ in range(_FITS):
         plane = np.linalg.lstsq(columns[kept], height[kept], rcond=None)[0]
-        kept = np.abs(height - columns @ plane) < _GROUND_M
-        if not kept.any():
-            return np.zeros(len(points), bool)
-    return np.abs(points[:, 2] - points[:, :2] @ plane[:2] - plane[2]) < _GROUND_M
+        kept = height - columns @ plane < _GROUND_M
+    return [c[np.abs(c[:, 2] - c[:, :2] @ plane[:2] - plane[2]) >= _GROUND_M] for c in clouds]
 
 
 def _in_all(scans: list[NDArray[np.int32]]) -> NDArray[np.int32]:
