@@ -70,7 +70,7 @@ def odometry(
     estimates are kept on the disk as the run goes: --resume goes on after a kill.
     """
     from hybridlio.odometry.odometry import Odometry
-    from hybridlio.runs.new_folder import new_run_folder
+    from hybridlio.runs.new_folder import check_run_folder, new_run_folder
     from hybridlio.runs.run import adapt_config
     from hybridlio.runs.whole_folder import partial_folder
 
@@ -80,6 +80,7 @@ def odometry(
     chosen = common.load_settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
     estimator = Odometry(config=chosen)  # report unknown names before the recording is opened
     frames = common.range_of(frames, start, n_scans, every)
+    check_run_folder(out, overwrite, data, resume=resume)
     recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle, topics, rate).every(every)
     adapted = adapt_config(recording, chosen, is_explicit=initial_pose is not None or config is not None)
     if adapted != chosen:

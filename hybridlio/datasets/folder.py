@@ -35,6 +35,7 @@ from hybridlio.datasets.points.scan_folders import (
     ScanFiles,
     files_in,
     has_scans,
+    named_file,
     note_other_folders,
     scan_files,
     stamp_files,
@@ -82,9 +83,9 @@ def open_folder(
     del raw_root
     folder = folder.resolve()
     notes = Notes(folder.name)
-    imu_file = next((folder / name for name in _IMU_FILES if (folder / name).is_file()), None)
+    imu_file = next((path for name in _IMU_FILES if (path := named_file(folder, name)).is_file()), None)
     imu = read_imu_csv(imu_file, notes) if imu_file else ImuSamples.empty()
-    stated = read_calibration_yaml(folder / "calibration.yaml", needs_imu=len(imu) > 0)
+    stated = read_calibration_yaml(named_file(folder, "calibration.yaml"), needs_imu=len(imu) > 0)
     scans = stamped(folder, scan_files(folder), stated.rate_hz if rate_hz is None else rate_hz, notes)
     stamps = scans.stamps_ns
     if len(imu):
@@ -93,11 +94,12 @@ def open_folder(
     else:
         notes.add(f"no inertial data: {folder / 'imu.csv'} does not exist")
     note_coverage(imu.stamps_ns, stamps, "inertial data", notes)
-    gps = read_gps_csv(folder / "gps.csv", notes)
+    gps = read_gps_csv(named_file(folder, "gps.csv"), notes)
     note_fixes(gps, stamps, notes)
     files = open_point_files(scans.paths, stamps, notes, stated.layout, stated.format)
     load = _with_others(raised(files, vertical_angle_deg), folder, scans, stated, vertical_angle_deg, notes)
-    poses = read_tum(folder / "poses_tum.txt") if (folder / "poses_tum.txt").is_file() else None
+    true = named_file(folder, "poses_tum.txt")
+    poses = read_tum(true) if true.is_file() else None
     return Sequence(
         name=folder.name,
         stamps_ns=stamps,

@@ -19,6 +19,7 @@ from hybridlio.datasets.kitti import odometry, raw
 from hybridlio.datasets.kitti.vertical_angle import check_angle
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.packets import ouster, velodyne
+from hybridlio.datasets.points.scan_folders import without_stamps
 from hybridlio.datasets.published.recording import Layout
 from hybridlio.datasets.published.table import PUBLISHED
 from hybridlio.datasets.rosbag import reader as rosbag
@@ -237,6 +238,8 @@ def _find(root: Path, reader: str | None) -> tuple[str, dict[str, Path]]:
             return name, found
     if not root.exists():  # a scene of nuScenes is found at a path that does not exist
         raise DataError(f"{root}: no such folder or bag; give a recording's folder, or a bag")
+    if "folder" in tried and (lacking := without_stamps(root)):
+        raise DataError(f"{root}: {lacking}")
     wanted = "\n".join(f"  {name}: {READERS[name].layout}" for name in tried)
     raise DataError(f"{root}: no recording found. Layouts tried:\n{wanted}")
 

@@ -92,7 +92,7 @@ def charts(data: ReportData, findings: Findings) -> dict[str, Figure]:
 
 def _page(data: ReportData, findings: Findings) -> dict[str, Any]:
     found = statements(data, findings)
-    level, summary = headline(found)
+    level, summary = headline(found, data.estimate_name if data.others else "")
     figures = charts(data, findings)
     return {
         "name": data.name,

@@ -113,6 +113,11 @@ class ReportData:
         }
         return {**rows, **self.conflicts}
 
+    def times_s(self, trajectory: Trajectory) -> Array:
+        """Return the times ``(N,)`` of another trajectory, in seconds since the first pose of the estimate."""
+        since_ns: Array = trajectory.stamps_ns - self.estimate.stamps_ns[0]
+        return since_ns / NS_PER_S
+
     @property
     def period_s(self) -> float | None:
         """Median time between poses; None for a single pose."""

@@ -36,13 +36,16 @@ def statements(data: ReportData, findings: Findings) -> list[Statement]:
     return sorted(found, key=lambda statement: order[statement.level])
 
 
-def headline(found: list[Statement]) -> tuple[Level, str]:
-    """Return the gravest level, and a sentence that sums up."""
+def headline(found: list[Statement], name: str = "") -> tuple[Level, str]:
+    """Return the gravest level, and a sentence that sums up; it names the trajectory where there are others."""
     worse = [statement for statement in found if statement.level != "good"]
     if not worse:
-        return "good", "Nothing here contradicts this trajectory."
+        return "good", f"Nothing here contradicts {name or 'this trajectory'}."
     level: Level = "bad" if any(statement.level == "bad" for statement in worse) else "doubtful"
-    return level, f"Check {'this point' if len(worse) == 1 else f'these {len(worse)} points'} before you use it."
+    return (
+        level,
+        f"Check {'this point' if len(worse) == 1 else f'these {len(worse)} points'} before you use {name or 'it'}.",
+    )
 
 
 def _flags(data: ReportData) -> list[Statement]:

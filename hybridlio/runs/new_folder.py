@@ -52,11 +52,28 @@ def new_run_folder(
             else:
                 check_free(folder, overwrite)
                 _check_no_journal(folder, overwrite)
+                discard_journal(partial_folder(folder))
             yield folder
     finally:
         if out is None:
             with suppress(OSError):  # it holds the run
                 folder.rmdir()
+
+
+def check_run_folder(
+    out: Path | None, overwrite: bool, *recordings: str | os.PathLike[str], resume: bool = False
+) -> None:
+    """Check that :func:`new_run_folder` will take a folder, before a recording is opened; nothing is changed.
+
+    Raises:
+        ConfigError: it will not, as far as can be told now.
+    """
+    if out is None:
+        return
+    check_output(out, *recordings)
+    if not resume:
+        check_free(out, overwrite)
+        _check_no_journal(out, overwrite)
 
 
 @contextmanager
@@ -95,14 +112,12 @@ def _take_up(folder: Path) -> None:
 
 
 def _check_no_journal(folder: Path, overwrite: bool) -> None:
-    """Check that no unfinished run is lost; remove its journal if that is wanted."""
-    part = partial_folder(folder)
-    if not overwrite and (part / STATE).is_file():
+    """Check that no unfinished run is lost, unless that is wanted."""
+    if not overwrite and (partial_folder(folder) / STATE).is_file():
         raise ConfigError(
             f"{folder} holds a run that was killed; give --resume to go on from its estimates, or --overwrite to start "
             "again"
         )
-    discard_journal(part)
 
 
 def _create_unique(wanted: Path) -> Path:

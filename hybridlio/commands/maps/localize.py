@@ -70,11 +70,12 @@ def localize(
     from hybridlio.localization.open_map import open_prior_map
     from hybridlio.localization.write import write_localization
     from hybridlio.mapping.map_projection import crs_of_file
-    from hybridlio.runs.new_folder import new_run_folder
+    from hybridlio.runs.new_folder import check_run_folder, new_run_folder
 
     place = None if start is None else _start(start)
     chosen = common.load_settings(config, initial_pose=initial_pose, residual=residual, backend=backend)
     frames = common.range_of(frames, None, n_scans, every)
+    check_run_folder(out, overwrite, data)
     recording = common.open_data(data, sequence, reader, raw_root, frames, vertical_angle, topics, rate).every(every)
     prior, crs = open_prior_map(map_), crs_of_file(map_)
     recording = common.check_data(recording, check)

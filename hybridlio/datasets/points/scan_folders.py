@@ -66,7 +66,7 @@ def has_scans(folder: Path) -> bool:
 
 def files_in(folder: Path) -> tuple[Path, ...]:
     """Return the scan files directly in a folder, in natural order; text and meshes only in a folder of scans."""
-    files = [p for p in folder.glob("*") if not p.name.startswith(".") and p.name not in STAMP_FILES]
+    files = [p for p in folder.glob("*") if not p.name.startswith(".") and p.name.lower() not in STAMP_FILES]
     found = [p for p in files if p.suffix.lower() in SUFFIXES]
     if not found and folder.name in _OWN_FOLDERS:
         found = [p for p in files if p.suffix.lower() in _COMMON_SUFFIXES]
@@ -75,7 +75,27 @@ def files_in(folder: Path) -> tuple[Path, ...]:
 
 def stamp_files(folder: Path) -> list[Path]:
     """Return the files of stamps directly in a folder."""
-    return [folder / name for name in STAMP_FILES if (folder / name).is_file()]
+    return [path for name in STAMP_FILES if (path := named_file(folder, name)).is_file()]
+
+
+def named_file(folder: Path, name: str) -> Path:
+    """Return the path of a file of a plain folder; one whose name has other capitals is taken where that is missing."""
+    path = folder / name
+    if path.is_file():
+        return path
+    alike = sorted(p for p in path.parent.glob("*") if p.name.lower() == name.rpartition("/")[2] and p.is_file())
+    return alike[0] if alike else path
+
+
+def without_stamps(folder: Path) -> str:
+    """Return what a folder lacks whose only subfolder with scans is not found, as there are no stamps; else nothing."""
+    others = [] if has_scans(folder) else _other_folders(folder)
+    if len(others) != 1:
+        return ""
+    return (
+        f"{others[0].name!r} holds scans, but no {' or '.join(STAMP_FILES)} is beside it or in it; write one, or name "
+        "the folder 'scans' and give --rate 10, the scans a second"
+    )
 
 
 def stamped(folder: Path, paths: tuple[Path, ...], rate_hz: float | None, notes: Notes) -> ScanFiles:

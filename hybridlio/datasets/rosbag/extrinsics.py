@@ -92,8 +92,8 @@ class Mounting:
         found = self.find(body_frame, self.lidar_frame) if body_frame else None
         if found is not None:
             self.notes.add(
-                f"reference poses: {topic.name} ({topic.type}), of the frame {body_frame!r}; if they are the robot's own "
-                "estimate and no truth, leave them out with --reference-topic none"
+                f"reference poses: {topic.name} ({topic.type}), of the frame {body_frame!r}; if they are the robot's "
+                "own estimate and no truth, leave them out with --reference-topic none"
             )
             return found
         why = f"no transform from {body_frame!r} to the lidar is known" if body_frame else "it names no body frame"

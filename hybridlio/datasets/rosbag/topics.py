@@ -86,9 +86,14 @@ def _most(topics: Iterable[Topic]) -> Topic:
     return max(topics, key=lambda topic: topic.count)
 
 
+def _rate(topic: Topic) -> str:
+    return f"{topic.rate_hz:.1f} Hz" if topic.count > 1 else ""
+
+
 def table(topics: Iterable[Topic], marks: Mapping[str, str] | None = None) -> str:
     """Return lines that list topics with types, counts and rates; ``marks`` are words put behind some of them."""
-    rows = [(t.name, t.type, str(t.count), f"{t.rate_hz:.1f} Hz", (marks or {}).get(t.name, "")) for t in topics]
+    marks = marks or {}
+    rows = [(t.name, t.type, str(t.count), _rate(t), marks.get(t.name, "")) for t in topics]
     if not rows:
         return "  (none)"
     width = [max(len(row[column]) for row in rows) for column in range(4)]

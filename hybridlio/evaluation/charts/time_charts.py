@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -31,29 +32,47 @@ _MAX_BARS = 300  # of the processing time
 _PERCENTILE = 0.99
 
 
+@dataclass(frozen=True, eq=False)
+class _Curve:
+    """A curve of a panel: ``(N,)`` values at times and at distances travelled."""
+
+    label: str
+    values: Array
+    times_s: Array
+    distance_m: Array
+    colour: str
+    dash: str = "solid"
+
+
 def timeline_figure(data: ReportData, findings: Findings) -> Figure:
     """Plot errors, uncertainty, speed and height over time, or over distance, which a button chooses.
 
-    Bridged and degenerate stretches are marked in all panels.
+    Errors of other trajectories are dashed, in their colours on the map. Bridged and degenerate stretches are marked in
+    all panels.
     """
     own = findings.paths[data.estimate_name]
     values = path_values(data, own)
-    panels: list[tuple[str, list[tuple[str, Array, str]]]] = []
+    at = values.times_s, values.distance_m
+    sigma = [] if values.sigma_m is None else [_Curve("σ of the position", values.sigma_m, *at, COLOURS[0], "dot")]
+    panels: list[tuple[str, list[_Curve]]] = []
     if values.error_m is not None:
-        errors = [("error, aligned at the start", values.error_m, COLOURS[0])]
-        errors += [] if values.sigma_m is None else [("σ of the position", values.sigma_m, COLOURS[1])]
-        panels.append(("error [m]", errors))
-        panels.append(("shape error [m]", [("error, aligned as a whole", own.aligned_error_m, COLOURS[2])]))
-    elif values.sigma_m is not None:
-        panels.append(("σ [m]", [("σ of the position", values.sigma_m, COLOURS[1])]))
-    panels.append(("speed [m/s]", [("speed", values.speed_m_s, COLOURS[4])]))
-    panels.append(("height [m]", [("height", own.positions_m[:, 2], COLOURS[3])]))
-    return _panels(panels, values.times_s, values.distance_m, _marked(data))
+        errors = [_Curve("error, aligned at the start", values.error_m, *at, COLOURS[0]), *sigma]
+        shape = [_Curve("error, aligned as a whole", own.aligned_error_m, *at, COLOURS[2])]
+        for colour, name in zip(COLOURS[1:], data.others, strict=False):
+            path = findings.paths[name]
+            if len(path.error_m):
+                other = (data.times_s(data.others[name])[path.rows], path.travelled_m, colour, "dash")
+                errors.append(_Curve(f"{name}, at the start", path.error_m, *other))
+                shape.append(_Curve(f"{name}, as a whole", path.aligned_error_m, *other))
+        panels += [("error [m]", errors), ("shape error [m]", shape)]
+    elif sigma:
+        panels.append(("σ [m]", sigma))
+    panels.append(("speed [m/s]", [_Curve("speed", values.speed_m_s, *at, COLOURS[4])]))
+    panels.append(("height [m]", [_Curve("height", own.positions_m[:, 2], *at, COLOURS[3])]))
+    return _panels(panels, _marked(data))
 
 
-def _panels(
-    panels: list[tuple[str, list[tuple[str, Array, str]]]], times_s: Array, distance_m: Array, shapes: list[Any]
-) -> Figure:
+def _panels(panels: list[tuple[str, list[_Curve]]], shapes: list[Any]) -> Figure:
     traces: list[Trace] = []
     over: dict[str, list[Any]] = {"time": [], "distance": []}
     layout: dict[str, Any] = {"shapes": shapes, "hovermode": "x unified", "showlegend": True}
@@ -65,11 +84,13 @@ def _panels(
         layout[f"yaxis{'' if not k else k + 1}"] = axis(
             title, domain=[max(top - height, 0), top], automargin=True, **low
         )
-        for label, y, colour in curves:
-            kept = thinned_peaks(y)
-            traces.append(line(label, times_s[kept], y[kept], colour, yaxis=name, hovertemplate="%{y:.3f}"))
-            over["time"].append(numbers(times_s[kept]))
-            over["distance"].append(numbers(distance_m[kept]))
+        for curve in curves:
+            kept = thinned_peaks(curve.values)
+            times_s, y = curve.times_s[kept], curve.values[kept]
+            more = {"line": {"dash": curve.dash}, "yaxis": name, "hovertemplate": "%{y:.3f}"}
+            traces.append(line(curve.label, times_s, y, curve.colour, **more))
+            over["time"].append(numbers(times_s))
+            over["distance"].append(numbers(curve.distance_m[kept]))
     last = "y" if len(panels) == 1 else f"y{len(panels)}"
     layout["xaxis"] = axis("time [s]", anchor=last)
     buttons = [

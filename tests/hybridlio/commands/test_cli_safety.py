@@ -43,6 +43,12 @@ def recording(tiny_drive: Path, tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.parametrize("words", [("odometry",), ("localize", "--map", "nowhere")])
+def test_a_folder_that_is_not_free_is_refused_before_anything_is_read(words, finished_run, tmp_path):
+    text = refused(2, words[0], tmp_path / "no-such-recording", *words[1:], "-o", finished_run)
+    assert "already holds a run" in text
+
+
 def test_no_command_writes_to_a_folder_that_is_holds_or_lies_inside_a_recording(recording, finished_run, tmp_path):
     before, other = snapshot(tmp_path / "D"), shutil.copytree(finished_run, tmp_path / "other")
     for out in (recording, recording / "run", recording.parent):

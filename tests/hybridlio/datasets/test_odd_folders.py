@@ -57,6 +57,31 @@ def noted(sequence: Sequence, text: str) -> bool:
     return any(text in note for note in sequence.notes)
 
 
+def test_names_of_files_may_have_other_capitals(tmp_path: Path) -> None:
+    usual = open_sequence(folder(tmp_path, imu=imu_csv("stamp_ns,gx,gy,gz,ax,ay,az", GYRO, FORCE)))
+    for name, other in (
+        ("timestamps.txt", "Timestamps.TXT"),
+        ("imu.csv", "IMU.csv"),
+        ("calibration.yaml", "Calibration.yaml"),
+    ):
+        (tmp_path / name).rename(tmp_path / other)
+    (tmp_path / "scans").rename(tmp_path / "Velodyne Points #1")
+    found = open_sequence(tmp_path)
+    assert found.stamps_ns.tolist() == usual.stamps_ns.tolist()
+    assert found.imu.stamps_ns.tolist() == usual.imu.stamps_ns.tolist()
+    assert np.array_equal(found.calibration.T_imu_lidar, usual.calibration.T_imu_lidar)
+
+
+def test_scans_without_stamps_in_a_folder_of_another_name_are_named(tmp_path: Path) -> None:
+    folder(tmp_path)
+    (tmp_path / "timestamps.txt").unlink()
+    (tmp_path / "scans").rename(tmp_path / "clouds")
+    with pytest.raises(DataError, match=r"'clouds' holds scans, but no timestamps\.txt.* give --rate 10"):
+        open_sequence(tmp_path)
+    (tmp_path / "clouds").rename(tmp_path / "scans")
+    assert len(open_sequence(tmp_path, rate_hz=10)) == SCANS
+
+
 def test_a_smooth_wall_is_not_taken_for_a_code_of_no_return(tmp_path: Path) -> None:
     sequence = open_sequence(folder(tmp_path))
     assert len(sequence[2].scan) == POINTS

@@ -17,7 +17,7 @@ from hybridlio.evaluation.charts.plotly import Figure, thinned, thinned_peaks
 from hybridlio.evaluation.evaluate import Steps, evaluate
 from hybridlio.evaluation.metrics_table import format_metrics
 from hybridlio.evaluation.report import ReportData, analyse, charts, write_report
-from hybridlio.evaluation.trust import statements
+from hybridlio.evaluation.trust import headline, statements
 
 SIGMAS = [*np.radians([0.03, 0.03, 0.05]).tolist(), 0.02, 0.01, 0.02]
 
@@ -267,6 +267,26 @@ def test_the_timeline_shows_both_alignments(data: ReportData) -> None:
     assert start[0] == pytest.approx(0, abs=1e-6)
     assert start[-1] == pytest.approx(evaluation.end_error_m, abs=1e-4)
     assert np.sqrt((whole**2).mean()) == pytest.approx(evaluation.ate_m, rel=0.1)  # ATE aligns positions alone
+
+
+def test_errors_of_other_trajectories_are_on_the_same_axes(data: ReportData) -> None:
+    assert data.reference is not None
+    late = Trajectory(data.estimate.stamps_ns[5:], data.estimate.poses[5:])
+    both = dataclasses.replace(data, others={"late": late})
+    figure = charts(both, analyse(both))["timeline"]
+    start, whole = (trace(figure, f"late, {how}") for how in ("at the start", "as a whole"))
+    np.testing.assert_allclose(values_of(start["x"]), data.estimate.times_s[5:], atol=1e-3)
+    evaluation = evaluate(late, data.reference)
+    assert values_of(start["y"])[-1] == pytest.approx(evaluation.end_error_m, abs=1e-4)
+    assert np.sqrt((values_of(whole["y"]) ** 2).mean()) == pytest.approx(evaluation.ate_m, rel=0.1)
+    assert start["line"]["dash"] == "dash"
+
+
+def test_the_headline_names_the_trajectory_where_there_are_several(data: ReportData) -> None:
+    several = dataclasses.replace(data, others={"late": data.estimate})
+    found = statements(several, analyse(several))
+    assert "this trajectory" not in headline(found, "mine")[1]
+    assert "mine" in headline(found, "mine")[1]
 
 
 def test_long_runs_stay_small_and_keep_their_peaks() -> None:
