@@ -57,7 +57,7 @@ def timeline_figure(data: ReportData, findings: Findings) -> Figure:
     panels: list[tuple[str, list[_Curve]]] = []
     if values.error_m is not None:
         errors = [_Curve("error, aligned at the start", values.error_m, *at, COLOURS[0]), *sigma]
-        shape = [_Curve("error, aligned as a whole", own.aligned_error_m, *at, COLOURS[2])]
+        shape = [_Curve("error, aligned as a whole", own.aligned_error_m, *at, COLOURS[0])]
         for colour, name in zip(COLOURS[1:], data.others, strict=False):
             path = findings.paths[name]
             if len(path.error_m):
