@@ -8,6 +8,8 @@ _SEQUENCE = re.compile(
 )  # colours, titles, cursor (ECMA-48)
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")  # all but tab and newline
 
+_LONGEST = 2000  # characters of a message: half a screen; a name in a damaged file may be as long as the file
+
 
 def strip_control(text: str) -> str:
     """Return the text without control characters, which a file's name or content could send to the terminal."""
@@ -20,10 +22,18 @@ def shown(value: object) -> str:
 
 
 class HybridLioError(Exception):
-    """Base class of all errors that the library raises on purpose; messages have no control characters of a file's."""
+    """Base class of all errors that the library raises on purpose.
+
+    Messages have no control characters of a file's, and of one that a file makes long the middle is left out.
+    """
 
     def __init__(self, *arguments: object) -> None:
-        super().__init__(*(strip_control(one) if isinstance(one, str) else one for one in arguments))
+        super().__init__(*(_clear(one) if isinstance(one, str) else one for one in arguments))
+
+
+def _clear(message: str) -> str:
+    text, half = strip_control(message), _LONGEST // 2
+    return text if len(text) <= _LONGEST else f"{text[:half]} … {text[-half:]}"
 
 
 class DataError(HybridLioError):

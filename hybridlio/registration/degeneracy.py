@@ -106,6 +106,10 @@ class ObservedRegistration:
         unobserved = self.weak_tangents[~self.is_observed]
         return np.asarray(unobserved / np.linalg.norm(unobserved, axis=1, keepdims=True))
 
+    def within_coverage(self, coverage: float) -> ObservedRegistration:
+        """As :meth:`hybridlio.registration.icp.Registration.within_coverage`."""
+        return replace(self, registration=self.registration.within_coverage(coverage))
+
     def covariance(self, scale: float) -> Array:
         """Return ``(6, 6)`` rad² and m², rotation first: from the Hessian in strong directions, from costs in weak
         ones.

@@ -12,7 +12,7 @@ minimum is found under the narrow kernel, which wrong matches hardly influence.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 _MAX_MATCHINGS = 8  # points midway between two neighbours can make the pose alternate without end; 3 to 5 are usual
 _MATCH_KERNELS = 3  # kernel widths within which neighbours count; the weight of a residual beyond is below 1 %
+
+_LEAST_COVERAGE = 0.3  # a surface that covers less of a scan says little about it
 
 
 class Fit(NamedTuple):
@@ -88,6 +90,17 @@ class Registration:
     def fit(self) -> Fit:
         """How well the points lie on the surface at the result."""
         return Fit(self.cost, self.matched)
+
+    def within_coverage(self, coverage: float) -> Registration:
+        """Return the registration with its share of matches and its cost relative to the points that could match.
+
+        Args:
+            coverage: share of the scan's points that the surface covers, see
+                :meth:`hybridlio.registration.local_map.LocalMap.covered`; values beyond the limits are taken for those.
+        """
+        coverage = min(max(coverage, _LEAST_COVERAGE), 1.0)
+        matched = min(self.matched / coverage, 1.0)
+        return replace(self, matched=matched, cost=max(1 - (1 - self.cost) / coverage, 0.0))
 
 
 def register(

@@ -21,6 +21,9 @@ from hybridlio.registration.voxel_map import VoxelMap
 _REBUILD_APPENDED_RATIO = 0.12
 _REBUILD_DISTANCE_RATIO = 0.12
 _OVERDUE = 2.0  # times that: rebuilt at a keyframe, if every scan has been one
+# Keyframes from which on the map is taken to have no gaps. Of 16 beams in an open field, a map of one keyframe has
+# planes near 0.47 of that keyframe's own points, of two 0.73, of five 0.81; in a town of one 0.91.
+_FILLED_KEYFRAMES = 5
 
 
 class LocalMap:
@@ -66,6 +69,21 @@ class LocalMap:
             self.surface = self.surface.extended(new.points, new.normals, self._settings.threads, new.weights)
         if self._rebuild_ratio() > _OVERDUE:
             self._rebuild()
+
+    def covered(self, points: Array, T_map_lidar: Array, distance_m: float) -> float:
+        """Return how many of a scan's points at a pose have a plane nearby: no scan of this place can match more.
+
+        The ground between the rings of the only scan has none. What a map of several keyframes covers has no limit.
+
+        Args:
+            points: ``(N, 3)`` lidar frame.
+            T_map_lidar: ``(4, 4)``.
+            distance_m: to the nearest plane.
+        """
+        if self.surface is None or self.keyframes >= _FILLED_KEYFRAMES:
+            return np.inf
+        distance2 = self.surface.nearest(se3.transform(T_map_lidar, points), self._settings.threads)[1]
+        return float(np.count_nonzero(distance2 < distance_m**2))
 
     def rebuild_if_due(self) -> None:
         """Rebuild the surface where that is due; to be called at scans that bring no keyframe."""

@@ -15,9 +15,10 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Floats, Index
 from hybridlio.core.sensors import Scan
 
-# A lidar repeats its pattern if more than this share of a scan's directions, in cells of this size, occur in the scan
-# before. On simulated recordings spinning lidars have 0.91 or more, those that do not repeat 0.40 or less.
-_REPEATED_SHARE, _CELL_DEG = 0.65, 1.0
+# A lidar repeats its pattern if more than this share of a scan's points lie in directions, in cells of this size, that
+# occur in the scan before. On simulated recordings spinning lidars have 0.95 or more, and 0.55 where half of the points
+# are anywhere; those that do not repeat have 0.33 or less.
+_REPEATED_SHARE, _CELL_DEG = 0.45, 1.0
 # Rows of a spinning lidar are fixed, so scans that were thinned at random share elevations where they share no
 # directions. Cells much finer than the rows' spacing, 0.35° with 128 rows over 45°, leave most elevations empty, while
 # a lidar without rows fills them as evenly as chance does.
@@ -48,7 +49,7 @@ class RecentPoints:
         if self._repeats is not None:
             return
         directions, before = _directions(scan.points), self._directions
-        self._directions = directions
+        self._directions = np.unique(directions)
         if before is not None:
             self._repeats = _repeats(before, directions)
             self._directions = None
@@ -73,30 +74,33 @@ class RecentPoints:
 
 def repeats_pattern(earlier: Scan, later: Scan) -> bool:
     """Return whether a lidar measures in about the same directions, or rows, in two consecutive scans."""
-    if _repeats(_directions(earlier.points), _directions(later.points)):
+    if _repeats(np.unique(_directions(earlier.points)), _directions(later.points)):
         return True
-    rows = _rows(earlier.points)
+    rows = np.unique(_rows(earlier.points))
     by_chance = len(rows) / (np.ptp(rows) + 1) if len(rows) else 1.0
     return by_chance < _MOST_FILLED and _repeats(rows, _rows(later.points), by_chance)
 
 
 def _repeats(before: Index, cells: Index, by_chance: float = 0.0) -> bool:
-    """Return whether most cells occur before, of those that would not do so by chance."""
-    shared = len(np.intersect1d(cells, before, assume_unique=True))
+    """Return whether the cells of most points occur before, of those that would not do so by chance.
+
+    Points are counted, not cells: noise puts each of its points into a cell of its own.
+    """
+    shared = int(np.isin(cells, before).sum())
     return shared - by_chance * len(cells) > _REPEATED_SHARE * (1 - by_chance) * len(cells)
 
 
 def _rows(points: Floats) -> Index:
-    """Return the cells of the elevations of points ``(N, 3)``, in ascending order."""
+    """Return the cell ``(N,)`` of each point's elevation."""
     x, y, z = points.T.astype(np.float64)
-    return np.asarray(np.unique(np.rint(np.degrees(np.arctan2(z, np.hypot(x, y))) / _ROW_CELL_DEG).astype(np.int64)))
+    return np.asarray(np.rint(np.degrees(np.arctan2(z, np.hypot(x, y))) / _ROW_CELL_DEG).astype(np.int64))
 
 
 def _directions(points: Array | Floats) -> Index:
-    """Return the cells of the directions in which points ``(N, 3)`` lie, in ascending order.
+    """Return the cell ``(N,)`` of each point's direction.
 
     Beams at whole degrees lie in the middle of their cells.
     """
     x, y, z = points.T.astype(np.float64)
     cells = np.rint(np.degrees([np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)]) / _CELL_DEG).astype(np.int64)
-    return np.asarray(np.unique(cells[0] * 1000 + cells[1]))
+    return np.asarray(cells[0] * 1000 + cells[1])

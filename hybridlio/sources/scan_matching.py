@@ -29,7 +29,7 @@ from hybridlio.sources.thinned_scan import ThinnedScan, thin
 # 10 m away by 0.2 m, two of the default kernels.
 _UNKNOWN_ROTATION_SIGMA_RAD = 0.02
 _LEVER_M = 10.0  # half of a scan's points are nearer; turns a rotation's uncertainty into a displacement
-LOST_COST = 0.6  # mean cost of the points, 0 to 1; well above that of any scan that is placed correctly
+LOST_COST = 0.6  # mean cost of the points that the map covers; well above that of any scan that is placed correctly
 # A new map starts after this number of scans in a row that have enough points and do not fit. A passing occlusion lasts
 # less than half a second at 10 Hz; bridging longer adds more error than a new map, which starts at the bridges' error.
 _LOST_SCANS = 5
@@ -51,7 +51,7 @@ class ScanMatching:
 
     def __init__(self, settings: ScanMatchingSettings | None = None) -> None:
         self._scale = SceneScale(settings or ScanMatchingSettings())
-        self._map = LocalMap(self.settings.local_map)
+        self._map, self._covered = LocalMap(self.settings.local_map), np.inf
         self._state = MatchingState(PathPoint(np.eye(4)), PathPoint(np.eye(4)))
         self._stamp_ns = 0
         self._before = self._state, self._stamp_ns  # when the last scan came
@@ -102,10 +102,10 @@ class ScanMatching:
         self._recent.observe(frame.scan)
         self._before = self._state, self._stamp_ns
         self.current_scan = scan = self._thin(frame.scan)
-        dt_s = (frame.scan.stamp_ns - self._stamp_ns) / NS_PER_S
-        self._stamp_ns = frame.scan.stamp_ns
+        dt_s, self._stamp_ns = (frame.scan.stamp_ns - self._stamp_ns) / NS_PER_S, frame.scan.stamp_ns
         usable = len(scan.points) >= self.settings.min_points and self._map.surface is not None
-        observed = self._register(scan, initial, dt_s) if usable else None
+        coverage = self._covered / max(len(scan.points), 1)
+        observed = self._register(scan, initial, dt_s).within_coverage(coverage) if usable else None
         if observed is None or observed.registration.matched < self.settings.min_matched:
             return self._bridge(scan, initial, observed)
         return self._accept(scan, initial, observed, dt_s)
@@ -154,8 +154,8 @@ class ScanMatching:
         observed = register_with_degeneracy(problem, initial.pose, kernel_start_m)
         if observed.registration.matched < self.settings.min_matched:
             return replace(initial, ok=False)
-        covariance = self._covariance(observed, keyframes=1)
-        return RelativePose(observed.registration.pose, covariance, self.name, degenerate=observed.degenerate)
+        pose, covariance = observed.registration.pose, self._covariance(observed, keyframes=1)
+        return RelativePose(pose, covariance, self.name, degenerate=observed.degenerate)
 
     def _accept(
         self, scan: ThinnedScan, initial: RelativePose, observed: ObservedRegistration, dt_s: float
@@ -227,7 +227,9 @@ class ScanMatching:
             return
         if self.settings.target == "last-scan" or self._state.adrift:
             self._map = LocalMap(self.settings.local_map)
-        self._map.insert(self._state.keyframe, self._state.current.T_map_lidar)
+        keyframe, pose = self._state.keyframe, self._state.current.T_map_lidar
+        self._map.insert(keyframe, pose)
+        self._covered = self._map.covered(keyframe, pose, self.settings.registration.max_distance_m)
         self._state = self._state.keyframe_inserted()
 
     def _register(self, scan: ThinnedScan, initial: RelativePose, dt_s: float) -> ObservedRegistration:
@@ -261,9 +263,8 @@ class ScanMatching:
         if last.twist is None or self._map.surface is None:
             return None
         settings, start = self.settings, last.T_map_lidar @ se3.exp(last.twist * dt_s)
-        observed = register_with_degeneracy(
-            self._problem(scan), start, coarse_kernel_m(settings.registration), is_start_vague=True
-        )
+        kernel_m = coarse_kernel_m(settings.registration)
+        observed = register_with_degeneracy(self._problem(scan), start, kernel_m, is_start_vague=True)
         found = observed.registration
         return observed if found.matched >= settings.min_matched and found.cost < LOST_COST else None
 

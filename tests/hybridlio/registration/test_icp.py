@@ -3,7 +3,7 @@ import pytest
 from rooms import ROOM, scene, seen_from
 
 from hybridlio.core import se3
-from hybridlio.registration.icp import register
+from hybridlio.registration.icp import Registration, register
 from hybridlio.registration.information import covariance_of
 from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Surface
@@ -102,3 +102,15 @@ def test_the_same_input_gives_the_same_bytes(rng: np.random.Generator):
     first, again = (register(Surface(points, normals, 2), source, np.eye(4), settings) for _ in range(2))
     assert first.pose.tobytes() == again.pose.tobytes()
     assert first.hessian.tobytes() == again.hessian.tobytes()
+
+
+def test_a_fit_within_coverage_counts_the_points_that_could_match() -> None:
+    found = Registration(np.eye(4), np.eye(6), np.ones(3), 0.02, matched=0.4, cost=0.7, iterations=3, converged=True)
+    covered = found.within_coverage(0.5)
+    assert covered.matched == pytest.approx(0.8)
+    assert covered.cost == pytest.approx(0.4)
+    assert found.within_coverage(1.0).fit == pytest.approx(found.fit)
+    assert found.within_coverage(np.inf).fit == pytest.approx(found.fit)
+    nothing = found.within_coverage(0.0)  # of a map that covers next to nothing, a poor fit stays one
+    assert nothing.matched <= 1
+    assert 0 <= nothing.cost < found.cost

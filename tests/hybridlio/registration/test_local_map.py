@@ -37,6 +37,19 @@ def test_a_scan_becomes_a_keyframe_once_it_is_far_enough_or_turned_enough(rng: n
     assert local_map.needs_keyframe(at(0.0))
 
 
+def test_a_map_of_one_scan_covers_no_ground_between_its_rings(rng: np.random.Generator):
+    angles = rng.uniform(0, 2 * np.pi, (2, 2000))
+    rings, between = (
+        np.column_stack([range_m * np.cos(a), range_m * np.sin(a), np.full(2000, -1.7)])
+        for range_m, a in zip((rng.uniform(5, 6, 2000), rng.uniform(9, 10, 2000)), angles, strict=True)
+    )
+    local_map, both = LocalMap(SETTINGS), np.vstack([rings, between])
+    assert local_map.covered(both, at(0.0), 1.0) == np.inf  # of no map nothing is known
+    for keyframes in range(1, 6):
+        local_map.insert(rings, at(0.0))
+        assert local_map.covered(both, at(0.0), 1.0) == (len(rings) if keyframes < 5 else np.inf)
+
+
 def test_the_surface_lies_where_the_scans_were_taken(rng: np.random.Generator):
     local_map = LocalMap(SETTINGS)
     tilt = se3.make(se3.so3_exp([0.0, 0.1, 0.5]), [30.0, -20.0, 4.0])

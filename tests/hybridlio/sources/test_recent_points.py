@@ -68,3 +68,11 @@ def test_a_spinning_lidar_repeats_its_rows_however_few_of_its_points_are_left(rn
 def test_scattered_scans_repeat_nothing_however_many_points_they_have(rng: np.random.Generator, count: int):
     first, second = (Scan(k, scattered(rng, count).astype(np.float32)) for k in range(2))
     assert not repeats_pattern(first, second)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5])
+def test_a_spinning_lidar_repeats_its_pattern_among_points_that_are_anywhere(rng: np.random.Generator, share: float):
+    first, second = rings(rng), rings(rng)
+    wrong = rng.random(len(second)) < share
+    second[wrong] = scattered(rng, int(wrong.sum()))
+    assert repeats_pattern(Scan(0, first.astype(np.float32)), Scan(1, second.astype(np.float32)))
