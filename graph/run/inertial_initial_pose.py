@@ -48,7 +48,9 @@ class Preintegration:
             return self._without_imu.predict(frame, state)
         self._without_imu = None
         predicted = self._steps.predicted(frame, state)
-        return self._coast(frame, state) if predicted is None else predicted
+        if predicted is not None:
+            return predicted
+        return self._steps.predicted_from_late(frame, state) or self._coast(frame, state)
 
     def _coast(self, frame: Frame, state: State) -> RelativePose:
         """Continue at the state's velocity and the last step's rate; both may change by the vehicle's limits."""

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import gtsam
+import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose, State
-from hybridlio.core.sensors import Calibration, Frame, ImuNoise
+from hybridlio.core.motion_limits import LARGEST_ACCELERATION_M_S2
+from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples
+from hybridlio.core.start_state import rate_change
 from hybridlio.graph.base.preintegration import (
     covers,
     makes_one_factor,
@@ -52,6 +55,23 @@ class InertialSteps:
             step = predict_in_parts(frame.imu, state, self.noise) if pim is None else predict_step(pim, state)
             self._predicted = self.as_lidar_step(*step, from_imu=True)
         return self._predicted
+
+    def predicted_from_late(self, frame: Frame, state: State) -> RelativePose | None:
+        """Return the step by samples that start after the state, the first held back to it; None if there are none.
+
+        It is no measurement, so ``ok`` is False. The rate while there were no samples may have changed as it does after
+        them.
+        """
+        samples = ImuSamples.concatenate([frame.imu, frame.sweep_imu])
+        late_s = float(samples.stamps_ns[0] - state.stamp_ns) / NS_PER_S if len(samples) else 0.0
+        held = samples.held_from(state.stamp_ns)
+        if not state.has_imu or held is samples:
+            return None
+        step, covariance = predict_in_parts(held.between(state.stamp_ns, frame.scan.stamp_ns), state, self.noise)
+        sigmas = np.r_[
+            np.full(3, rate_change(samples, late_s) * late_s), np.full(3, LARGEST_ACCELERATION_M_S2 * late_s**2)
+        ]
+        return self.as_lidar_step(step, covariance + np.diag((sigmas / 2) ** 2), ok=False)
 
     def _look(self, frame: Frame, state: State) -> None:
         """Preintegrate, unless the last call had the same inputs."""

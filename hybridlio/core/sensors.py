@@ -142,10 +142,24 @@ class ImuSamples:
         values = np.column_stack([np.interp(at, known, columns[:, i]) for i in range(6)])
         return ImuSamples(stamps, values[:, :3], values[:, 3:])
 
+    def held_from(self, start_ns: int) -> ImuSamples:
+        """Return the samples with the first one held back to a stamp up to :data:`LONGEST_INTERPOLATION_NS` before."""
+        if not len(self) or not 0 < self.stamps_ns[0] - start_ns <= LONGEST_INTERPOLATION_NS:
+            return self
+        first = ImuSamples(np.array([start_ns]), self.gyro_rad_s[:1], self.accel_m_s2[:1])
+        return ImuSamples.concatenate([first, self])
+
     def turns(self, bias_rad_s: Array) -> Array:
         """Return rotation vectors ``(S - 1, 3)`` between samples, rad, by rates without a bias ``(3,)``."""
         rates = (self.gyro_rad_s[1:] + self.gyro_rad_s[:-1]) / 2 - bias_rad_s
         return np.asarray(rates * (np.diff(self.stamps_ns) / NS_PER_S)[:, None])
+
+    def orientations(self, bias_rad_s: Array) -> Array:
+        """Return rotations ``(S, 3, 3)`` from each sample's frame to the first's, by rates without a bias ``(3,)``."""
+        out = [np.eye(3)]
+        for turn in se3.so3_exp(self.turns(bias_rad_s)):
+            out.append(out[-1] @ turn)
+        return np.array(out)
 
     def largest_turn_rad(self, bias_rad_s: Array) -> float:
         """Return the largest turn from the first sample to any other: the length of the rates' integral."""

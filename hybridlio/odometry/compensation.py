@@ -60,8 +60,8 @@ class MotionCompensation:
         if not self.applies_to(frame):
             return frame
         motion = None
-        if state is not None and len(imu):
-            samples = ImuSamples.concatenate([imu, frame.sweep_imu])
+        samples = ImuSamples.concatenate([imu, frame.sweep_imu])
+        if state is not None and state.has_imu and len(samples):
             motion = inertial_motion(samples, state, T_start_end, end_ns, self._calibration, turns_by_gyroscope)
         if motion is None:
             step = constant_twist(T_start_end, start_ns, end_ns)

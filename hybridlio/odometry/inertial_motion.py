@@ -10,6 +10,8 @@ from hybridlio.core.estimates import State
 from hybridlio.core.sensors import LONGEST_INTERPOLATION_NS, NS_PER_S, Calibration, ImuSamples
 from hybridlio.core.trajectory import Trajectory
 
+_TURN_ROUNDS = 4  # of solving for a rate: each leaves the product of the turn and what was missing
+
 
 def inertial_motion(
     imu: ImuSamples,
@@ -24,8 +26,11 @@ def inertial_motion(
     A drone or a hand turns without its path turning with it, and a car does the opposite; the accelerometer tells them
     apart. The speed is such that the path leads through both ends of ``T_start_end``.
 
+    Samples that start after the state's stamp, as those of an IMU that wakes up after the lidar, are continued back to
+    it: the rate changes linearly to that of the first sample, from one by which the motion turns as ``T_start_end``.
+
     Args:
-        imu: samples from the state's stamp, or before it, to beyond ``end_ns``.
+        imu: samples from the state's stamp, or before it, to beyond ``end_ns``; or starting shortly after the stamp.
         state: attitude, gravity and biases at the begin of the motion.
         T_start_end: ``(4, 4)`` lidar motion from the state's stamp to ``end_ns``.
         end_ns: a stamp.
@@ -35,6 +40,9 @@ def inertial_motion(
     Returns:
         Poses ``T_world_lidar`` at the samples' stamps; None if there is no sample at both ends, or a gap.
     """
+    begin_ns = int(imu.stamps_ns[0]) if len(imu) else 0
+    if begin_ns > state.stamp_ns:
+        imu = _with_sample_at(end_ns, imu.held_from(state.stamp_ns))
     stamps = imu.stamps_ns
     i, j = np.searchsorted(stamps, (state.stamp_ns, end_ns))
     if not (i < j < len(stamps) and stamps[i] == state.stamp_ns and stamps[j] == end_ns):
@@ -43,15 +51,17 @@ def inertial_motion(
         return None
     since_s = (stamps - state.stamp_ns) / NS_PER_S
     rates = imu.gyro_rad_s - state.gyro_bias_rad_s
+    step, turned = _of_imu(T_start_end, calibration), slice(int(i), int(j) + 1)
+    if begin_ns > state.stamp_ns:
+        before = np.maximum(1 - since_s * NS_PER_S / (begin_ns - state.stamp_ns), 0.0)
+        for _ in range(_TURN_ROUNDS):
+            rates = _turned_to(step[:3, :3], rates, before, since_s, turned)
+    elif not turns_by_gyroscope:  # where they turn most: an error of scale grows with the rate
+        rates = _turned_to(step[:3, :3], rates, np.linalg.norm(rates, axis=1), since_s, turned)
     R_world_imu = _rotations(rates, since_s)
-    if not turns_by_gyroscope:
-        turn = R_world_imu[i].T @ R_world_imu[j]
-        missing = se3.so3_log(turn.T @ _of_imu(T_start_end, calibration)[:3, :3])
-        R_world_imu = _rotations(_turned_further(rates, since_s, slice(int(i), int(j) + 1), missing), since_s)
     R_world_imu = state.T_world_imu[:3, :3] @ R_world_imu[i].T @ R_world_imu
     force = (imu.accel_m_s2 - state.accel_bias_m_s2)[..., None]
     bend = _bend((R_world_imu @ force)[..., 0] + state.gravity_m_s2, since_s, int(i))
-    step = _of_imu(T_start_end, calibration)
     velocity = (state.T_world_imu[:3, :3] @ step[:3, 3] - bend[j]) / since_s[j]
     poses = se3.make(R_world_imu, bend + since_s[:, None] * velocity)
     return Trajectory(stamps, poses @ calibration.T_imu_lidar)
@@ -69,14 +79,19 @@ def _of_imu(T_start_end: Array, calibration: Calibration) -> Array:
     return np.asarray(calibration.T_imu_lidar @ T_start_end @ se3.inverse(calibration.T_imu_lidar))
 
 
-def _turned_further(rates: Array, times_s: Array, step: slice, missing: Array) -> Array:
-    """Return rates ``(S, 3)`` that turn further by a rotation vector over a step, where they turn most.
+def _turned_to(R_step: Array, rates: Array, weights: Array, times_s: Array, turned: slice) -> Array:
+    """Return rates ``(S, 3)`` that turn nearly by ``R_step`` ``(3, 3)`` over a step, changed by weights ``(S,)``."""
+    total = float(np.trapezoid(weights[turned], times_s[turned]))
+    R = _rotations(rates[turned], times_s[turned])[-1]
+    return np.asarray(rates + se3.so3_log(R.T @ R_step) * weights[:, None] / total) if total > 0 else rates
 
-    An error of scale grows with the rate.
-    """
-    speeds = np.linalg.norm(rates, axis=1)
-    turned = float(np.trapezoid(speeds[step], times_s[step]))
-    return np.asarray(rates + missing * speeds[:, None] / turned) if turned > 0 else rates
+
+def _with_sample_at(stamp_ns: int, imu: ImuSamples) -> ImuSamples:
+    """Return the samples with one at a stamp, interpolated where there is none."""
+    at = int(np.searchsorted(imu.stamps_ns, stamp_ns))
+    if not 0 < at < len(imu) or imu.stamps_ns[at] == stamp_ns:
+        return imu
+    return ImuSamples.concatenate([imu, imu.between(stamp_ns, stamp_ns)])
 
 
 def _rotations(rates: Array, times_s: Array) -> Array:

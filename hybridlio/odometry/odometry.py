@@ -12,10 +12,11 @@ from hybridlio.core.estimates import Backend, InitialPoseSource, ResidualSource,
 from hybridlio.core.sensors import Frame, ImuNoise, Scan
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.estimate import Estimate
+from hybridlio.odometry.late_imu import take_up_imu
 from hybridlio.odometry.pipeline import Pipeline, timed
 from hybridlio.odometry.registry import check_names, make_implementations
 from hybridlio.odometry.setup import Setup
-from hybridlio.odometry.start_up import measure_step, restore_search, start_backend, start_residual, take_up_imu
+from hybridlio.odometry.start_up import measure_step, restore_search, start_backend, start_residual
 from hybridlio.record import plain_values
 from hybridlio.record.loop_keyframes import LoopKeyframeSelector
 from hybridlio.record.record import Record
@@ -158,6 +159,8 @@ class Odometry:
             "residual": plain_values.state_of(pipeline.residual),
             "gate": plain_values.state_of(pipeline.gate),
             "start_search": None if pipeline.start_search is None else plain_values.state_of(pipeline.start_search),
+            "late_start": pipeline.late_start,
+            "late_noise": pipeline.late_noise,
             "keyframe_position": self._keyframes.last_position,
             "keyframes": self._keyframes.kept_since(row),
             "start": pipeline.start,
@@ -182,6 +185,7 @@ class Odometry:
         for frame, estimate in done:
             if self._pipeline is None:
                 self._pipeline = self._make_pipeline(frame)
+                self._pipeline.late_noise = state["late_noise"]
             else:
                 difference = max(difference, self._repeat(self._pipeline, frame, estimate))
             self._keep(estimate, frame)
@@ -189,6 +193,7 @@ class Odometry:
             plain_values.restore(self._pipeline.residual, state["residual"])
             plain_values.restore(self._pipeline.gate, state["gate"])
             restore_search(self._pipeline, state["start_search"])
+            self._pipeline.late_start = state["late_start"]
         self._keyframes.restore(state["keyframes"], state["keyframe_position"])
         return difference
 

@@ -30,6 +30,7 @@ from hybridlio.odometry.second_pass import SecondCompensation
 from hybridlio.odometry.start_search import StartSearch
 from hybridlio.sources.imu_trust import ImuTrust, without_imu
 from hybridlio.sources.innovation_gate import GateResult, InnovationGate
+from hybridlio.sources.late_start import LateStart
 
 if TYPE_CHECKING:
     from hybridlio.odometry.setup import Setup
@@ -66,6 +67,8 @@ class Pipeline:
         start: state at the first scan that the backend started from; None until the second frame.
         state: the backend's state at the last scan; None until the second frame has been added.
         start_search: while the first motion is undecided, its search; None otherwise.
+        late_start: while the IMU has not covered a scan, the first one; None otherwise.
+        late_noise: ``(6, 6)`` of steps before the first samples, by what these show; None without such steps.
     """
 
     first: Frame
@@ -79,6 +82,8 @@ class Pipeline:
     start: State | None = None
     state: State | None = None
     start_search: StartSearch | None = None
+    late_start: LateStart | None = None
+    late_noise: Array | None = None
     _has_warned: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
@@ -126,7 +131,7 @@ class Pipeline:
             ConfigError: the source returned something else than a RelativePose.
         """
         with timed(seconds, "motion compensation"):
-            compensated = self._compensated(frame, initial.pose, state)
+            compensated = self.compensated(frame, initial.pose, state)
         with timed(seconds, "residual"):
             relative = _checked(self.residual.refine(compensated, initial), self.residual.name)
         return compensated, self._with_compensation_noise(frame, relative, state)
@@ -139,11 +144,12 @@ class Pipeline:
         The residual source is one that :class:`~hybridlio.core.estimates.RefinesAgain`.
         """
         assert isinstance(self.residual, RefinesAgain)
-        compensated = self._compensated(frame, second.T_start_end, state, second.turns_by_gyroscope)
+        compensated = self.compensated(frame, second.T_start_end, state, second.turns_by_gyroscope)
         again = self.residual.refine_again(compensated, initial)
         return compensated, self._with_compensation_noise(frame, again, state)
 
-    def _compensated(self, frame: Frame, T_start_end: Array, state: State, turns_by_gyroscope: bool = True) -> Frame:
+    def compensated(self, frame: Frame, T_start_end: Array, state: State, turns_by_gyroscope: bool = True) -> Frame:
+        """Return the frame compensated by a step ``(4, 4)`` to it from a state."""
         return self.compensation.compensate(
             frame, T_start_end, state.stamp_ns, frame.scan.stamp_ns, state, frame.imu,
             turns_by_gyroscope=turns_by_gyroscope,
@@ -211,6 +217,13 @@ class Pipeline:
         covariance = se3.rotate_covariance(state.covariance[:6, :6], T_lidar_imu)
         covariance = covariance + np.diag(np.r_[np.zeros(3), np.full(3, self.gate.doubt.m2)])
         return T_lidar_imu @ state.T_world_imu @ T_imu_lidar, covariance
+
+    def pose_after(self, before: State, step: RelativePose) -> Array:
+        """Return the pose ``(4, 4)`` after a step from a state, in the frame of the first scan."""
+        assert self.start is not None
+        T_imu_lidar = self.calibration.T_imu_lidar
+        T_first_before = se3.between(self.start.T_world_imu @ T_imu_lidar, before.T_world_imu @ T_imu_lidar)
+        return np.asarray(T_first_before @ step.pose)
 
     def inertial_state(self, state: State) -> InertialState | None:
         """Return the state's velocity and biases; None if no inertial data has entered it."""

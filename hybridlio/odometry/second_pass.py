@@ -16,7 +16,7 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RefinesAgain, RelativePose, State, TakesBack
 from hybridlio.core.motion_limits import UNKNOWN_TRANSLATION_SIGMA_M
-from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise
+from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples
 from hybridlio.odometry.inertial_motion import lidar_turn
 
 _LEVER_M = 10.0  # half of a scan's points are nearer; turns a rotation into a displacement
@@ -24,6 +24,12 @@ _LEVER_M = 10.0  # half of a scan's points are nearer; turns a rotation into a d
 # mean displacement, which moves the scan, is half of it.
 _LEAST_RATIO = 1.0
 _SIGMAS = 3.0  # of the gyroscope's scale
+# Of a platform at rest: standard deviations of its samples within a step, over those of consumer IMUs (0.003 rad/s and
+# 0.03 m/s² at 200 Hz) and a standing person's tremor, and below those of a walk (from 0.3 m/s²) or of motors.
+_QUIET_RAD_S, _QUIET_M_S2, _FEWEST_QUIET, _BIAS_SIGMAS = 0.02, 0.15, 5, 3.0
+_REST_M_S = 0.1  # 1 cm at 10 Hz, the error of a step; a standing person sways by less
+_MOST_LEVEL = 0.5  # sine of the angle between an open direction and the vertical
+_ANY_TURN_RAD = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,3 +96,43 @@ def without_misfit(
         residual.take_back(initial)
         return replace(initial, ok=False, drift=found.drift, details=found.details)
     return found
+
+
+def held_at_rest(calibration: Calibration, frame: Frame, step: RelativePose, before: State) -> RelativePose:
+    """Return the step with no motion along directions that the scan leaves open, if the platform is at rest.
+
+    A lidar that sees neither floor nor ceiling does not observe its height, and the speed upwards at the start is not
+    known otherwise. At rest the IMU is quiet and the scans show no motion on the level. A body that moves so does not
+    rise or sink steadily. Along the level it may: a car in a smooth tunnel looks the same.
+
+    Args:
+        calibration: the extrinsics.
+        frame: with the samples of the step.
+        step: as the scans give it.
+        before: the state at the scan before.
+    """
+    if not (step.ok and len(step.degenerate) and _is_quiet(frame.imu, before)):
+        return step
+    up = (before.T_world_imu[:3, :3] @ calibration.T_imu_lidar[:3, :3]).T @ before.gravity_m_s2
+    level = np.eye(3) - np.outer(up, up) / (up @ up)
+    rest_m = _REST_M_S * (frame.scan.stamp_ns - before.stamp_ns) / NS_PER_S
+    if (
+        np.linalg.norm(level @ step.pose[:3, 3]) > rest_m
+        or np.linalg.norm(step.degenerate[:, 3:] @ level, axis=1).max() > _MOST_LEVEL
+    ):
+        return step
+    moved, rest = se3.log(step.pose), np.diag(np.r_[np.full(3, _ANY_TURN_RAD), np.full(3, rest_m)] ** 2)
+    kept = rest @ np.linalg.inv(step.covariance + rest)  # the rest has no motion
+    covariance = kept @ step.covariance
+    drift = None if step.drift is None else kept @ step.drift @ kept.T
+    return replace(step, pose=se3.exp(kept @ moved), covariance=(covariance + covariance.T) / 2, drift=drift)
+
+
+def _is_quiet(imu: ImuSamples, state: State) -> bool:
+    """Return whether samples show neither a turn nor anything that shakes the platform."""
+    if len(imu) < _FEWEST_QUIET:
+        return False
+    bias_sigma = float(np.sqrt(np.diag(state.covariance)[12:15].max()))
+    turns = np.abs(imu.gyro_rad_s.mean(axis=0) - state.gyro_bias_rad_s).max()
+    shaken = imu.gyro_rad_s.std(axis=0).max() > _QUIET_RAD_S or imu.accel_m_s2.std(axis=0).max() > _QUIET_M_S2
+    return bool(not shaken and turns < _QUIET_RAD_S + _BIAS_SIGMAS * bias_sigma)

@@ -148,7 +148,7 @@ class StartSearch:
         before = first.sweep_imu.between(first.scan.stamp_ns - NS_PER_S, first.scan.stamp_ns)
         samples = ImuSamples.concatenate([before, *(frame.imu for frame in after), last.sweep_imu])
         motion = None
-        if start.has_imu:
+        if start.has_imu and len(samples) and samples.stamps_ns[0] <= start.stamp_ns:
             motion = inertial_motion(samples, start, np.eye(4), last.scan.stamp_ns, self._calibration)
         return None if motion is None else BaseMotion(motion, [frame.scan.stamp_ns for frame in (first, *after)])
 

@@ -15,31 +15,32 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.estimates import RefinesAgain, RelativePose, State
-from hybridlio.core.motion_limits import BRIDGED_ACCELERATION_SIGMA_M_S2
-from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuSamples, Scan
+from hybridlio.core.chi_square import chi_square_quantile
+from hybridlio.core.estimates import EarlierScanPose, RefinesAgain, RelativePose, State
+from hybridlio.core.sensors import NS_PER_S, Frame, ImuSamples
 from hybridlio.core.start_state import start_state
 from hybridlio.odometry.pipeline import Pipeline, timed
-from hybridlio.odometry.second_pass import second_compensation, without_misfit
+from hybridlio.odometry.second_pass import held_at_rest, second_compensation, without_misfit
 from hybridlio.odometry.start_search import StartEstimate, StartSearch
 from hybridlio.record import plain_values
-from hybridlio.record.record import Record
 from hybridlio.registration.cost_profile import PROBE_STEP_M
+from hybridlio.sources.late_start import LateStart, less_certain, starts_late
 from hybridlio.sources.recent_points import repeats_pattern
 from hybridlio.sources.scan_matching import LOST_COST, ScanMatching
+from hybridlio.sources.thinned_scan import thin
 
 _log = logging.getLogger(__name__)
 
 # How often the first step is repeated without an IMU. The first answer comes from a coarse search over rotations too;
 # after three repetitions, each from the answer before, it no longer changes.
 _REPETITIONS_WITHOUT_IMU = 3
+# With an IMU it is repeated until the answer changes by less than that at the distance of half of a scan's points.
+_MOST_REPETITIONS, _SETTLED_M, _LEVER_M = 6, 0.01, 10.0
+_EXCLUDED_TURN = chi_square_quantile(0.999, 3)
 _LEVELLING_NS = NS_PER_S  # samples this long before the first scan help to find the direction of gravity
-# Of a platform at rest: standard deviations of its samples within a step, over those of consumer IMUs (0.003 rad/s and
-# 0.03 m/s² at 200 Hz) and a standing person's tremor, and below those of a walk (from 0.3 m/s²) or of motors.
-_QUIET_RAD_S, _QUIET_M_S2, _FEWEST_QUIET, _BIAS_SIGMAS = 0.02, 0.15, 5, 3.0
-_REST_M_S = 0.1  # 1 cm at 10 Hz, the error of a step; a standing person sways by less
-_MOST_LEVEL = 0.5  # sine of the angle between an open direction and the vertical
-_ANY_TURN_RAD = 10.0
+
+_LONGEST_NS = 2 * NS_PER_S  # after which the first scan is given up: later ones no longer see what it saw
+_ROUNDS = 3  # of placing the first scan, which gives the speed that the second is compensated by
 
 
 def start_residual(pipeline: Pipeline) -> None:
@@ -53,15 +54,19 @@ def start_residual(pipeline: Pipeline) -> None:
         DataError: the source cannot start at this scan.
     """
     first, stamp_ns = pipeline.first, pipeline.first.scan.stamp_ns
-    pipeline.residual.start(
-        pipeline.compensation.compensate(first, np.eye(4), stamp_ns - NS_PER_S, stamp_ns, None, ImuSamples.empty())
+    compensated = pipeline.compensation.compensate(
+        first, np.eye(4), stamp_ns - NS_PER_S, stamp_ns, None, ImuSamples.empty()
     )
+    pipeline.residual.start(compensated)
+    if isinstance(pipeline.residual, ScanMatching) and starts_late(first):
+        pipeline.late_start = LateStart(first, compensated)
 
 
 def start_backend(pipeline: Pipeline, second: Frame) -> State:
     """Start the backend at the first scan and return the state there.
 
-    Gravity comes from the samples of the last second before the first scan and those up to the second one.
+    Gravity comes from the samples of the last second before the first scan and those up to the second one; where the
+    samples start later, from those of the second sweep.
 
     Raises:
         DataError: the samples hold no specific force.
@@ -70,7 +75,7 @@ def start_backend(pipeline: Pipeline, second: Frame) -> State:
     before = ImuSamples.empty()
     if len(first.imu):
         before = first.imu.between(first.scan.stamp_ns - _LEVELLING_NS, first.scan.stamp_ns)
-    samples = ImuSamples.concatenate([before, second.imu])
+    samples = ImuSamples.concatenate([before, second.imu if len(second.imu) else second.sweep_imu])
     pipeline.start = start_state(first.scan.stamp_ns, samples, pipeline.imu_noise)
     pipeline.backend.start(pipeline.start)
     return pipeline.start
@@ -108,9 +113,11 @@ def _measured(
         found = _searched(pipeline, search, frame, seconds)
         if found is not None:
             return found
+    if is_first_step and pipeline.late_start is not None and before.has_imu:
+        _restart_at(pipeline, frame, initial.pose, before)
     answer = pipeline.refine(frame, initial, before, seconds)
     if is_first_step:
-        answer = repeat_first_step(pipeline, frame, answer, before)
+        answer = repeat_first_step(pipeline, frame, initial, answer, before)
         fits_poorly = answer[1].details.get("cost", 0.0) > LOST_COST
         # Ghosts and few rings make a right match poor, too, but it converges; false ones in rooms do not.
         is_lost = not answer[1].ok or (fits_poorly and not answer[1].details.get("converged", 1.0))
@@ -122,50 +129,12 @@ def _measured(
             again = initial if len(frame.imu) else replace(initial, proposed=answer[1].pose)
             answer = pipeline.refine_again(frame, again, before, second)
         answer = answer[0], without_misfit(residual, initial, answer[1], LOST_COST)
+    if pipeline.late_start is not None:
+        answer = _with_late_imu(pipeline, frame, answer, before)
     if pipeline.start_search is not None:
-        own = None if pipeline.start_search.leads else _pose_after(pipeline, before, answer[1])
+        own = None if pipeline.start_search.leads else pipeline.pose_after(before, answer[1])
         return _searched(pipeline, pipeline.start_search, frame, seconds, own) or answer
     return answer
-
-
-def held_at_rest(calibration: Calibration, frame: Frame, step: RelativePose, before: State) -> RelativePose:
-    """Return the step with no motion along directions that the scan leaves open, if the platform is at rest.
-
-    A lidar that sees neither floor nor ceiling does not observe its height, and the speed upwards at the start is not
-    known otherwise. At rest the IMU is quiet and the scans show no motion on the level. A body that moves so does not
-    rise or sink steadily. Along the level it may: a car in a smooth tunnel looks the same.
-
-    Args:
-        calibration: the extrinsics.
-        frame: with the samples of the step.
-        step: as the scans give it.
-        before: the state at the scan before.
-    """
-    if not (step.ok and len(step.degenerate) and _is_quiet(frame.imu, before)):
-        return step
-    up = (before.T_world_imu[:3, :3] @ calibration.T_imu_lidar[:3, :3]).T @ before.gravity_m_s2
-    level = np.eye(3) - np.outer(up, up) / (up @ up)
-    rest_m = _REST_M_S * (frame.scan.stamp_ns - before.stamp_ns) / NS_PER_S
-    if (
-        np.linalg.norm(level @ step.pose[:3, 3]) > rest_m
-        or np.linalg.norm(step.degenerate[:, 3:] @ level, axis=1).max() > _MOST_LEVEL
-    ):
-        return step
-    moved, rest = se3.log(step.pose), np.diag(np.r_[np.full(3, _ANY_TURN_RAD), np.full(3, rest_m)] ** 2)
-    kept = rest @ np.linalg.inv(step.covariance + rest)  # the rest has no motion
-    covariance = kept @ step.covariance
-    drift = None if step.drift is None else kept @ step.drift @ kept.T
-    return replace(step, pose=se3.exp(kept @ moved), covariance=(covariance + covariance.T) / 2, drift=drift)
-
-
-def _is_quiet(imu: ImuSamples, state: State) -> bool:
-    """Return whether samples show neither a turn nor anything that shakes the platform."""
-    if len(imu) < _FEWEST_QUIET:
-        return False
-    bias_sigma = float(np.sqrt(np.diag(state.covariance)[12:15].max()))
-    turns = np.abs(imu.gyro_rad_s.mean(axis=0) - state.gyro_bias_rad_s).max()
-    shaken = imu.gyro_rad_s.std(axis=0).max() > _QUIET_RAD_S or imu.accel_m_s2.std(axis=0).max() > _QUIET_M_S2
-    return bool(not shaken and turns < _QUIET_RAD_S + _BIAS_SIGMAS * bias_sigma)
 
 
 def _search(pipeline: Pipeline, residual: ScanMatching, leads: bool) -> StartSearch:
@@ -202,14 +171,6 @@ def _searched(
     return found.frames[-1], found.relative
 
 
-def _pose_after(pipeline: Pipeline, before: State, step: RelativePose) -> Array:
-    """Return the scan's pose in the frame of the first scan, by the run's own step."""
-    assert pipeline.start is not None
-    T_imu_lidar = pipeline.calibration.T_imu_lidar
-    T_first_before = se3.between(pipeline.start.T_world_imu @ T_imu_lidar, before.T_world_imu @ T_imu_lidar)
-    return T_first_before @ step.pose
-
-
 def _is_elsewhere(found: StartEstimate, own: Array) -> bool:
     """Return whether the scan lies, by its median point, farther from a pose than two minima can be told apart."""
     points = found.frames[-1].scan.points
@@ -218,7 +179,7 @@ def _is_elsewhere(found: StartEstimate, own: Array) -> bool:
 
 
 def repeat_first_step(
-    pipeline: Pipeline, second: Frame, found: tuple[Frame, RelativePose], start: State
+    pipeline: Pipeline, second: Frame, initial: RelativePose, found: tuple[Frame, RelativePose], start: State
 ) -> tuple[Frame, RelativePose]:
     """Repeat the first step now that its motion is known, and return it as :meth:`Pipeline.refine` does.
 
@@ -227,20 +188,42 @@ def repeat_first_step(
     the rotation was unknown too and was searched for on a coarse grid; repeating the step from the answer improves it
     even where scans need no compensation.
     """
-    first, (compensated, relative) = pipeline.first, found
-    if start.has_imu and relative.ok:
+    compensated, relative = found
+    is_late = start.has_imu and pipeline.late_start is not None
+    if start.has_imu and relative.ok and not is_late:
         start = _with_turn_rate(pipeline, second, relative, start)
-    repetitions = int(pipeline.compensation.applies_to(first)) if start.has_imu else _REPETITIONS_WITHOUT_IMU
-    for _ in range(repetitions):
+    repetitions = _MOST_REPETITIONS * int(pipeline.compensation.applies_to(pipeline.first))
+    for _ in range(repetitions if start.has_imu else _REPETITIONS_WITHOUT_IMU):
         if not relative.ok:
             break
-        pipeline.residual.start(
-            pipeline.compensation.compensate(
-                first, relative.pose, first.scan.stamp_ns, second.scan.stamp_ns, start, second.imu
-            )
-        )
-        compensated, relative = pipeline.refine(second, relative, start, {})
+        before = relative
+        if is_late and len(second.imu):  # scans that are compensated alike fit each other whatever the turn
+            before = replace(relative, pose=se3.make(initial.pose[:3, :3], relative.pose[:3, 3]))
+        _restart_at(pipeline, second, before.pose, start)
+        compensated, relative = pipeline.refine(second, before, start, {})
+        moved = np.linalg.norm(se3.log(se3.between(before.pose, relative.pose)).reshape(2, 3), axis=1)
+        if start.has_imu and moved @ (_LEVER_M, 1.0) < _SETTLED_M:
+            break
+    if is_late and relative.ok and _turns_elsewhere(initial, relative):
+        pipeline.residual.take_back(initial)
+        relative = replace(initial, details=relative.details)
     return compensated, relative
+
+
+def _turns_elsewhere(initial: RelativePose, found: RelativePose) -> bool:
+    """Return whether a step turns by what its initial pose excludes."""
+    apart = se3.so3_log(initial.pose[:3, :3].T @ found.pose[:3, :3])
+    return bool(apart @ np.linalg.solve(initial.covariance[:3, :3], apart) > _EXCLUDED_TURN)
+
+
+def _restart_at(pipeline: Pipeline, second: Frame, step: Array, start: State) -> None:
+    """Give the first scan to the residual source again, compensated by the step ``(4, 4)`` to the second."""
+    first, samples = pipeline.first, ImuSamples.concatenate([second.imu, second.sweep_imu])
+    stamps_ns = first.scan.stamp_ns, second.scan.stamp_ns
+    compensated = pipeline.compensation.compensate(first, step, *stamps_ns, start, samples)
+    pipeline.residual.start(compensated)
+    if pipeline.late_start is not None:
+        pipeline.late_start = LateStart(first, compensated)
 
 
 def _with_turn_rate(pipeline: Pipeline, second: Frame, found: RelativePose, start: State) -> State:
@@ -255,41 +238,58 @@ def _with_turn_rate(pipeline: Pipeline, second: Frame, found: RelativePose, star
     return replace(start, gyro_bias_rad_s=start.gyro_bias_rad_s - gain @ rate_error)
 
 
-def take_up_imu(pipeline: Pipeline, record: Record, frame: Frame) -> State:
-    """Restart the backend when the first IMU samples come after some steps, and return the state at the last scan.
-
-    The samples give the direction of gravity, which the backend needs at its start. It then gets all steps of the run
-    so far again; to the graph, the run is one with a gap in its inertial data at the beginning.
+def _with_late_imu(
+    pipeline: Pipeline, frame: Frame, answer: tuple[Frame, RelativePose], before: State
+) -> tuple[Frame, RelativePose]:
+    """Return a step with what is known of the first scan: placed by this scan if samples cover it, else uncertain.
 
     Args:
-        pipeline: its state is at the last scan, without IMU.
-        record: the run so far; one step or more.
-        frame: the next frame, which carries the first samples.
-
-    Raises:
-        GraphError: the graph cannot be solved.
+        pipeline: it has a late start.
+        frame: as recorded.
+        answer: the compensated frame, and the step to it.
+        before: the backend's state at the scan before.
     """
-    assert pipeline.state is not None
-    _log.warning("frame %d: IMU samples start here; the scans before had none", frame.index)
-    R_world_imu = pipeline.state.T_world_imu[:3, :3]
-    in_world = replace(
-        frame.imu, accel_m_s2=frame.imu.accel_m_s2 @ R_world_imu.T, gyro_rad_s=frame.imu.gyro_rad_s @ R_world_imu.T
-    )
-    start = before = now = start_state(record.start.stamp_ns, in_world, record.imu_noise)
-    pipeline.backend.start(start)
-    no_points, stamps_ns = np.empty((0, 3), np.float32), record.online.stamps_ns.tolist()
-    for k, (stamp_ns, relative) in enumerate(zip(stamps_ns[1:], record.relative, strict=True), start=1):
-        step = Frame(k, Scan(stamp_ns, no_points), ImuSamples.empty(), calibration=frame.calibration)
-        before, now = now, pipeline.backend.update(step, relative)
-    pipeline.start, pipeline.state = start, _with_mean_velocity(now, before)
-    return pipeline.state
+    late = pipeline.late_start
+    assert late is not None
+    samples, is_covered = late.first_samples(frame), before.has_imu and _is_covered(frame)
+    if is_covered or frame.scan.stamp_ns - late.frame.scan.stamp_ns > _LONGEST_NS:
+        pipeline.late_start = None
+    if not answer[1].ok:
+        return answer
+    placed = _placed(pipeline, late, frame, answer, before) if is_covered else None
+    if placed is not None or pipeline.state is not None:
+        return placed or answer
+    is_known = before.has_imu and len(samples)
+    return answer[0], less_certain(answer[1], late.noise(samples) if is_known else late.noise_without_samples())
 
 
-def _with_mean_velocity(now: State, before: State) -> State:
-    """Return ``now`` with the mean velocity since ``before``; the graph has no velocity of its own without samples."""
-    dt_s = (now.stamp_ns - before.stamp_ns) / NS_PER_S
-    covariance = now.covariance.copy()
-    covariance[6:9] = covariance[:, 6:9] = 0.0
-    covariance[6:9, 6:9] = np.eye(3) * (BRIDGED_ACCELERATION_SIGMA_M_S2 * dt_s) ** 2
-    velocity = (now.T_world_imu[:3, 3] - before.T_world_imu[:3, 3]) / dt_s
-    return replace(now, velocity_m_s=velocity, covariance=covariance)
+def _placed(
+    pipeline: Pipeline, late: LateStart, frame: Frame, answer: tuple[Frame, RelativePose], before: State
+) -> tuple[Frame, RelativePose] | None:
+    """Place the first scan by a covered one, which starts the map anew; None if it does not fit."""
+    assert isinstance(pipeline.residual, ScanMatching)
+    (compensated, step), is_first_step = answer, pipeline.state is None
+    T_first_scan, settings = pipeline.pose_after(before, step), pipeline.residual.settings
+    for _ in range(_ROUNDS if is_first_step else 1):
+        surface, guess = thin(compensated.scan, settings).surface, se3.inverse(T_first_scan)
+        found = late.placed(settings, surface, late.first_samples(frame), guess, LOST_COST)
+        if found is None:
+            return None
+        T_first_scan = se3.inverse(found.pose)
+        if is_first_step:
+            compensated = pipeline.compensated(frame, T_first_scan, before)
+    pipeline.residual.start(compensated)
+    covariance = se3.rotate_covariance(found.covariance, found.pose)
+    if is_first_step:
+        return compensated, replace(step, pose=T_first_scan, covariance=covariance, drift=None)
+    earlier = EarlierScanPose(pipeline.first.scan.stamp_ns, T_first_scan, covariance)
+    wide = step.wider(added=late.noise(late.first_samples(frame)))
+    return compensated, replace(wide, drift=None, earlier_scans=(earlier,))
+
+
+def _is_covered(frame: Frame) -> bool:
+    """Return whether samples cover the whole sweep."""
+    offsets_ns, imu = frame.scan.time_offsets_ns, frame.sweep_imu
+    if offsets_ns is None or not len(imu) or not len(frame.imu):
+        return False
+    return bool(imu.stamps_ns[0] <= frame.scan.stamp_ns + offsets_ns.min())

@@ -10,7 +10,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.sensors import Calibration, Frame, ImuNoise, ImuSamples, Scan
 from hybridlio.core.start_state import start_state
-from hybridlio.odometry.start_up import held_at_rest
+from hybridlio.odometry.second_pass import held_at_rest
 from hybridlio.simulation.platforms.config import PlatformConfig
 
 UP, AHEAD = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
