@@ -44,6 +44,9 @@ def graduate(
     control, weights = 0.0, np.zeros(0)
     for step in range(_MAX_STEPS):
         squares = chi2(state)
+        if (squares <= bound).all():  # the cost is not truncated anywhere
+            weights = np.ones(len(squares))
+            break
         first = min(float(squares.max(initial=0.0)), largest * bound)
         control = control * growth if step else first_control(first, bound)
         weights = truncated_weights(squares, bound, control)

@@ -12,14 +12,13 @@ import numpy as np
 
 from hybridlio.core.arrays import Index, Mask
 from hybridlio.graph.outliers.linear_changes import LinearChanges
-from hybridlio.graph.outliers.weighted_solver import LARGEST_GROUP, Found, WeightedSolver, least
+from hybridlio.graph.outliers.weighted_solver import FAR_OFF, LARGEST_GROUP, Found, WeightedSolver, least
 
 _ROUNDS = 5  # of improvements: each lowers the cost; one or two suffice where any does
 _GAIN = 0.01  # of the price: less is a descent that went on, or a loop at the bound
 _TRIED = 3  # exchanges of a round that are solved, those that promise most
 _RESISTING = 3  # loops, and clusters, without which a group is tested
-_SURE = 10.0  # factor on the price from which a group is contradicted to first order: far off, the model is a poor one
-_NEAR = 2.0  # factor on the price within which the exchange of one loop is followed further
+_NEAR = 2.0  # factor on the price within which an exchange is of interest though it costs more, to first order
 
 
 def exchanged(solver: WeightedSolver, cluster: Index, best: Found, margin: float) -> list[Found]:
@@ -43,10 +42,10 @@ def exchanged(solver: WeightedSolver, cluster: Index, best: Found, margin: float
     return found
 
 
-def _changes_at(solver: WeightedSolver, best: Found) -> LinearChanges | None:
+def _changes_at(solver: WeightedSolver, best: Found, chosen: Mask | None = None) -> LinearChanges | None:
     """Return what exchanges change at a result; None where loops with a trace of weight alone determine some pose."""
     try:
-        return LinearChanges(solver.linear(best.values), best.correct, solver.price)
+        return LinearChanges(solver.linear(best.values), best.correct, solver.price, chosen)
     except RuntimeError:  # singular
         return None
 
@@ -86,6 +85,30 @@ def _followed(changes: LinearChanges, correct: Mask, some: Mask, price: float) -
     return change - float(gains[followers].sum()), followers
 
 
+def is_sure(solver: WeightedSolver, cluster: Index, best: Found) -> bool:
+    """Whether no rejected loop or cluster comes near to paying for itself where it is taken in, to first order.
+
+    Taking in a cluster costs at least what its worst loop alone costs. That no other map is possible follows only where
+    the accepted loops are known to be correct.
+
+    Args:
+        solver: of the graph.
+        cluster: ``(M,)`` cluster of each loop.
+        best: the result.
+    """
+    rejected = np.flatnonzero(~best.correct)
+    if not len(rejected):
+        return True
+    by_chi2 = rejected[np.argsort(-solver.chi2(best.values)[rejected], kind="stable")]
+    numbers, first = np.unique(cluster[by_chi2], return_index=True)
+    worst = by_chi2[first]  # of each cluster
+    changes = _changes_at(solver, best, np.isin(np.arange(len(cluster)), worst))
+    if changes is None:
+        return False
+    prices = [solver.cost_of_rejecting(~best.correct & (cluster == number)) for number in numbers]
+    return bool((changes.single[worst] > _NEAR * np.array(prices)).all())  # unknown ones are NaN
+
+
 def contradicted(solver: WeightedSolver, cluster: Index, best: Found, groups: list[Mask]) -> bool:
     """Whether the result contradicts each of some rejected groups, to first order, also without what resists it most.
 
@@ -105,7 +128,7 @@ def contradicted(solver: WeightedSolver, cluster: Index, best: Found, groups: li
 
 
 def _contradicts(changes: LinearChanges, solver: WeightedSolver, cluster: Index, correct: Mask, group: Mask) -> bool:
-    enough = _SURE * solver.cost_of_rejecting(group)
+    enough = FAR_OFF * solver.cost_of_rejecting(group)
     _, after = changes.exchange(group)
     if not np.isfinite(after[correct]).all():  # the work did not suffice
         return False

@@ -13,6 +13,7 @@ from hybridlio.core.arrays import Array, Index, Mask
 # Entries of the factorisation that all solutions may pass over: a few seconds. In the largest graphs the loops whose
 # residuals are nearest to the bound are tested alone.
 _WORK = 5_000_000_000
+_WORK_FOR_CHOSEN = 4 * _WORK  # where they decide alone on a result whose alternatives take minutes
 _COLUMNS = 240  # of one solution: 30 MB for 15,000 unknowns
 _LEAST = 1e-12  # χ², whose logarithm is finite
 _REGULAR = 1e-9  # of the unit matrix: loops that alone determine a pose leave it undetermined
@@ -39,6 +40,7 @@ class LinearChanges:
         linear: all factors around the result.
         correct: ``(M,)`` the accepted loops.
         price: cost of rejecting a loop.
+        chosen: ``(M,)`` loops for which changes are found, or None: all.
 
     Attributes:
         single: ``(M,)`` by how much χ² falls without an accepted loop, or rises with a rejected one; NaN where the
@@ -48,7 +50,7 @@ class LinearChanges:
         RuntimeError: the accepted loops and the trusted factors do not determine every variable.
     """
 
-    def __init__(self, linear: Linear, correct: Mask, price: float) -> None:
+    def __init__(self, linear: Linear, correct: Mask, price: float, chosen: Mask | None = None) -> None:
         count, total = len(correct), linear.jacobian.shape[0]
         self._size = (total - linear.trusted) // count
         used = np.concatenate([np.ones(linear.trusted, dtype=bool), np.repeat(correct, self._size)])
@@ -60,9 +62,10 @@ class LinearChanges:
         self._solver = splu(
             (kept.T @ kept).tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
-        self._left = _WORK // (self._solver.nnz * self._size)  # loops that can still be solved for
+        work = _WORK if chosen is None else _WORK_FOR_CHOSEN
+        self._left = work // (self._solver.nnz * self._size)  # loops that can still be solved for
         self._spreads = np.full((count, self._size, self._size), np.nan)
-        self._find_spreads()
+        self._find_spreads(np.ones(count, dtype=bool) if chosen is None else chosen)
         self.single = self._chi2(self._residuals, self._spreads)
 
     def exchange(self, some: Mask) -> tuple[float, Array]:
@@ -93,10 +96,11 @@ class LinearChanges:
         chi2 = (residuals * np.linalg.solve(innovations, residuals[..., None])[..., 0]).sum(axis=1)
         return np.where(known, chi2, np.nan)
 
-    def _find_spreads(self) -> None:
+    def _find_spreads(self, chosen: Mask) -> None:
         chi2 = (self._residuals**2).sum(axis=1)
         from_price = np.abs(np.log(np.maximum(chi2, _LEAST)) - np.log(max(self._price, _LEAST)))
-        first = np.argsort(from_price, kind="stable")[: self._left]
+        first = np.argsort(np.where(chosen, from_price, np.inf), kind="stable")
+        first = first[: min(np.count_nonzero(chosen), self._left)]
         self._left -= len(first)
         at_once = _COLUMNS // self._size
         for begin in range(0, len(first), at_once):

@@ -14,6 +14,7 @@ they show. An alternative with another map that costs hardly more makes the resu
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,11 +27,11 @@ from hybridlio.graph.model.edge_arrays import edges_of
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.outliers.condensed import condense
 from hybridlio.graph.outliers.descents import descent
-from hybridlio.graph.outliers.exchange import contradicted, exchanged
+from hybridlio.graph.outliers.exchange import contradicted, exchanged, is_sure
 from hybridlio.graph.outliers.loop_support import GraphOdometry, LoopSupport, loop_support
-from hybridlio.graph.outliers.search import all_at_once, nearest_first
+from hybridlio.graph.outliers.search import LARGEST_IN_RIGID_MAP, all_at_once, nearest_first
 from hybridlio.graph.outliers.toggling import Alternatives, toggled
-from hybridlio.graph.outliers.weighted_solver import Found, WeightedSolver, least, undominated
+from hybridlio.graph.outliers.weighted_solver import LARGEST_GROUP, Found, WeightedSolver, least, undominated
 from hybridlio.graph.solve.initial_values import find_initial_values
 from hybridlio.graph.solve.settings import IterationProgress
 
@@ -87,14 +88,15 @@ def reject_outliers(data: GraphData, start: Array | None, report: IterationProgr
     if not len(loops.i):
         return Rejection(start, frozenset())
     trusted, bound = data.copy(without=loops.ids.tolist()), loop_bound(data.tangent_size, len(loops.i))
-    whole = WeightedSolver(descent(trusted, loops), odometry, bound, report)
     if along is None:
+        whole = WeightedSolver(descent(trusted, loops), odometry, bound, report)
         best = all_at_once(whole, whole.values(start))
         return _rejection(
             whole, best, ("odometry does not reach every pose, so loops that join parts are not checked",)
         )
     chain = GraphOdometry(data, odometry, co.to_matrices(along))
     support = loop_support(loops, chain, bound)
+    whole = WeightedSolver(descent(trusted, loops), odometry, bound, report, support)
     small = condense(trusted, loops, odometry, chain)
     solver = WeightedSolver(descent(small.trusted, small.loops), small.odometry, bound, report, support)
     found, untried = _search(solver, solver.values(start[small.kept]), support)
@@ -121,8 +123,21 @@ def odometry_start(data: GraphData) -> Array | None:
 
 
 def _search(solver: WeightedSolver, start: Any, support: LoopSupport) -> Alternatives:
-    """Return all sets of correct loops that the searches find."""
-    found = [all_at_once(solver, start), nearest_first(solver, start, support, _GROWTHS[0])]
+    """Return the sets of correct loops that the searches find.
+
+    Where most loops belong to clusters that are too large to be wrong, and these make a map that contradicts every
+    rejected loop, one search is enough.
+    """
+    found: list[Found] = []
+    backbone = _backbone(support)
+    if backbone is not None:
+        known = replace(support, supported=backbone)
+        found.append(nearest_first(solver, start, known, _GROWTHS[0], LARGEST_IN_RIGID_MAP))
+        found += exchanged(solver, support.cluster, found[0], _rival_cost(solver))
+        best = least(found)
+        if best.correct[backbone].mean() > 1 - _SAME_SHARE and is_sure(solver, support.cluster, best):
+            return Alternatives(found, [])
+    found += [all_at_once(solver, start), nearest_first(solver, start, support, _GROWTHS[0])]
     as_stated = LoopSupport(1.0, np.zeros_like(support.supported), support.cluster)
     further = (as_stated, _GROWTHS[1]), (support, _GROWTHS[1]), (support, _GROWTHS[2])  # the most different ones first
     for used, growth in further:
@@ -136,6 +151,13 @@ def _search(solver: WeightedSolver, start: Any, support: LoopSupport) -> Alterna
     if not np.array_equal(least(found).correct, before.correct):
         found += exchanged(solver, support.cluster, least(found), margin)
     return Alternatives(found, untried)
+
+
+def _backbone(support: LoopSupport) -> Mask | None:
+    """Return the loops ``(M,)`` of clusters that are too large to be wrong, if they are most of all loops."""
+    sizes = np.bincount(support.cluster)
+    backbone = sizes[support.cluster] > LARGEST_GROUP
+    return backbone if backbone.mean() > 0.5 else None
 
 
 def _agreed(found: list[Found]) -> bool:

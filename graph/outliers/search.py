@@ -18,6 +18,9 @@ _COARSE_GRADUATION = 3.0  # within a round, whose candidates start near their pl
 # χ² in units of the bound from which a round starts at most: of a loop whose odometry has drifted by a hundred times
 # its stated noise. Higher starts only add steps at which no weight changes.
 _LARGEST_CHI2 = 1e4
+# The same where the map is rigid, so that correct loops are near the bound. A wrong loop that has a weight joins
+# distant poses; 245 make a step on sphere2500 take ten times as long. With 10 parking-garage loses 140 correct loops.
+LARGEST_IN_RIGID_MAP = 100.0
 _SOURCES_AT_ONCE = 256  # rows of distances in memory: 100 MB for 50,000 poses
 
 
@@ -28,7 +31,9 @@ def all_at_once(solver: WeightedSolver, start: Any) -> Found:
     return solver.found(*solver.graduate(values, candidates, solver.bound, GRADUATION))
 
 
-def nearest_first(solver: WeightedSolver, start: Any, support: LoopSupport, growth: float) -> Found:
+def nearest_first(
+    solver: WeightedSolver, start: Any, support: LoopSupport, growth: float, largest: float = _LARGEST_CHI2
+) -> Found:
     """Take in loops in rounds, those that span the fewest edges first, so that odometry has not drifted far.
 
     A round graduates over the loops so far and those whose ends are at most a number of edges apart, along odometry and
@@ -40,6 +45,7 @@ def nearest_first(solver: WeightedSolver, start: Any, support: LoopSupport, grow
         start: values along the odometry.
         support: what pairs of neighbouring loops say.
         growth: factor on the number of edges.
+        largest: χ² from which a round of all loops starts at most, in units of the bound.
     """
     count, poses = len(solver.loops.i), len(solver.poses(start))
     values, correct, tried = start, np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
@@ -53,7 +59,8 @@ def nearest_first(solver: WeightedSolver, start: Any, support: LoopSupport, grow
             candidates = correct | (near & (allowed | tried))
             if (candidates & ~tried).any():
                 bound = solver.bound * support.scale
-                values, correct = solver.graduate(values, candidates, bound, _COARSE_GRADUATION, _LARGEST_CHI2)
+                first = largest if candidates.all() else _LARGEST_CHI2
+                values, correct = solver.graduate(values, candidates, bound, _COARSE_GRADUATION, first)
                 tried |= candidates
             reach *= growth
     return solver.found(values, correct)

@@ -9,7 +9,7 @@ from hybridlio.core import se3
 from hybridlio.graph import PoseGraph
 from hybridlio.graph.model.edge_arrays import edges_of
 from hybridlio.graph.outliers.descents import GtsamDescent, PlanarDescent, descent
-from hybridlio.graph.outliers.exchange import contradicted, exchanged
+from hybridlio.graph.outliers.exchange import contradicted, exchanged, is_sure
 from hybridlio.graph.outliers.linear_changes import LinearChanges
 from hybridlio.graph.outliers.weighted_solver import LARGEST_GROUP, Found, WeightedSolver, least
 from hybridlio.graph.solve.settings import silent
@@ -133,3 +133,16 @@ def test_a_group_is_contradicted_unless_it_fits_without_one_loop_that_resists_it
     assert contradicted(solver, cluster, best, [wrong])
     assert not contradicted(solver, cluster, best, [fitting])
     assert not contradicted(solver, cluster, best, [wrong, fitting])
+
+
+def test_a_result_is_sure_unless_a_rejected_loop_nearly_pays_for_itself(rng):
+    graph = corridor(rng, 2)
+    far = graph.add_between(4, 20, se3.exp([0, 0, 0, 2, 0, 0]), sigmas=SIGMA)
+    near = graph.add_between(56, 70, se3.exp([0, 0, 0, 14.4, 0, 0]), sigmas=SIGMA)  # odometry drifts by 0.19 m there
+    solver = solver_of(graph, 4.0)
+    correct = ~np.isin(solver.loops.ids, [far, near])
+    values = solver.solve(solver.values(graph._data.initial_values), correct.astype(float), 50)
+    cluster = np.arange(len(correct))
+    assert not is_sure(solver, cluster, Found(values, correct, 0.0, 0.0))
+    solver.price = 0.4  # ten times less noise than is stated
+    assert is_sure(solver, cluster, Found(values, correct, 0.0, 0.0))

@@ -11,6 +11,7 @@ from hybridlio.core import se3
 from hybridlio.core.errors import GraphError
 from hybridlio.graph import PoseGraph
 from hybridlio.graph.base.truncated_squares import chi2_bound
+from hybridlio.graph.outliers import rejection
 
 
 def laps(rng: np.random.Generator, dimension: int, count: int = 120, lap: int = 30) -> PoseGraph:
@@ -92,6 +93,23 @@ def test_where_loops_show_that_noise_is_overstated_a_wrong_one_does_not_bend_the
     solution = graph.optimize("gnc")
     assert solution.rejected == {wrong}
     assert rmse(solution.poses, clean.poses) < 1e-3
+
+
+@pytest.mark.parametrize("times", [1, 100])
+def test_one_search_is_enough_where_large_clusters_hold_the_map(rng, monkeypatch, times):
+    """Whatever noise is stated; with a hundred times too much, wrong loops 3 m off are within the stated bound."""
+    monkeypatch.setattr(rejection, "all_at_once", lambda *_: pytest.fail("searched again"))
+    graph = laps(rng, 3, count=200)
+    clean, wrong = graph.optimize(), add_wrong_loops(graph, rng, 0.2)
+    for number, factor in graph.factors.items():
+        if factor.kind == "between":
+            changed = graph.set_noise(number, information=factor.noise.information / times**2)
+            wrong = wrong - {number} | {changed} if number in wrong else wrong
+    solution = graph.optimize("gnc")
+    assert wrong <= solution.rejected
+    assert len(solution.rejected - wrong) <= 2
+    assert not solution.doubtful
+    assert rmse(solution.poses, clean.poses) < 0.05
 
 
 def test_a_loop_that_alone_joins_a_part_is_kept(rng):
