@@ -14,7 +14,6 @@ they show. An alternative with another map that costs hardly more makes the resu
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +28,7 @@ from hybridlio.graph.outliers.condensed import condense
 from hybridlio.graph.outliers.descents import descent
 from hybridlio.graph.outliers.exchange import contradicted, exchanged, is_sure
 from hybridlio.graph.outliers.loop_support import GraphOdometry, LoopSupport, loop_support
-from hybridlio.graph.outliers.search import LARGEST_IN_RIGID_MAP, all_at_once, nearest_first
+from hybridlio.graph.outliers.search import all_at_once, backbone_first, nearest_first
 from hybridlio.graph.outliers.toggling import Alternatives, toggled
 from hybridlio.graph.outliers.weighted_solver import LARGEST_GROUP, Found, WeightedSolver, least, undominated
 from hybridlio.graph.solve.initial_values import find_initial_values
@@ -131,8 +130,7 @@ def _search(solver: WeightedSolver, start: Any, support: LoopSupport) -> Alterna
     found: list[Found] = []
     backbone = _backbone(support)
     if backbone is not None:
-        known = replace(support, supported=backbone)
-        found.append(nearest_first(solver, start, known, _GROWTHS[0], LARGEST_IN_RIGID_MAP))
+        found.append(backbone_first(solver, start, support, backbone, _GROWTHS[0]))
         found += exchanged(solver, support.cluster, found[0], _rival_cost(solver))
         best = least(found)
         if best.correct[backbone].mean() > 1 - _SAME_SHARE and is_sure(solver, support.cluster, best):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,8 @@ _COARSE_GRADUATION = 3.0  # within a round, whose candidates start near their pl
 # its stated noise. Higher starts only add steps at which no weight changes.
 _LARGEST_CHI2 = 1e4
 # The same where the map is rigid, so that correct loops are near the bound. A wrong loop that has a weight joins
-# distant poses; 245 make a step on sphere2500 take ten times as long. With 10 parking-garage loses 140 correct loops.
-LARGEST_IN_RIGID_MAP = 100.0
+# distant poses; 245 make a step on sphere2500 take ten times as long.
+_LARGEST_IN_RIGID_MAP = 100.0
 _SOURCES_AT_ONCE = 256  # rows of distances in memory: 100 MB for 50,000 poses
 
 
@@ -29,6 +30,20 @@ def all_at_once(solver: WeightedSolver, start: Any) -> Found:
     candidates = np.ones(len(solver.loops.i), dtype=bool)
     values = solver.solve(start, candidates.astype(np.float64))
     return solver.found(*solver.graduate(values, candidates, solver.bound, GRADUATION))
+
+
+def backbone_first(solver: WeightedSolver, start: Any, support: LoopSupport, backbone: Mask, growth: float) -> Found:
+    """Take in the loops of a backbone as :func:`nearest_first` does, then all others that are near the rigid map.
+
+    Near are those within the bound for the noise as stated, too: with noise that is stated far too large, correct loops
+    of a part that few loops hold can be as far from the bound for the noise that loops show.
+
+    Args:
+        solver, start, support, growth: as of :func:`nearest_first`.
+        backbone: ``(M,)`` loops that make the map rigid.
+    """
+    largest = max(_LARGEST_IN_RIGID_MAP, 1 / support.scale)
+    return nearest_first(solver, start, replace(support, supported=backbone), growth, largest)
 
 
 def nearest_first(
