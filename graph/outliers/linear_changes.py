@@ -13,7 +13,7 @@ from hybridlio.core.arrays import Array, Index, Mask
 # Entries of the factorisation that all solutions may pass over: a few seconds. In the largest graphs the loops whose
 # residuals are nearest to the bound are tested alone.
 _WORK = 5_000_000_000
-_WORK_FOR_CHOSEN = 4 * _WORK  # where they decide alone on a result whose alternatives take minutes
+_WORK_FOR_CHOSEN = 20 * _WORK  # where they decide alone on a result whose alternatives take ten times as long
 _COLUMNS = 240  # of one solution: 30 MB for 15,000 unknowns
 _LEAST = 1e-12  # χ², whose logarithm is finite
 _REGULAR = 1e-9  # of the unit matrix: loops that alone determine a pose leave it undetermined
