@@ -38,7 +38,6 @@ _REPETITIONS_WITHOUT_IMU = 3
 _MOST_REPETITIONS, _SETTLED_M, _LEVER_M = 6, 0.01, 10.0
 _EXCLUDED_TURN = chi_square_quantile(0.999, 3)
 _LEVELLING_NS = NS_PER_S  # samples this long before the first scan help to find the direction of gravity
-
 _LONGEST_NS = 2 * NS_PER_S  # after which the first scan is given up: later ones no longer see what it saw
 _ROUNDS = 3  # of placing the first scan, which gives the speed that the second is compensated by
 
@@ -282,9 +281,15 @@ def _placed(
     covariance = se3.rotate_covariance(found.covariance, found.pose)
     if is_first_step:
         return compensated, replace(step, pose=T_first_scan, covariance=covariance, drift=None)
-    earlier = EarlierScanPose(pipeline.first.scan.stamp_ns, T_first_scan, covariance)
+    earlier = EarlierScanPose(pipeline.first.scan.stamp_ns, T_first_scan, covariance + _of_speed(before, late))
     wide = step.wider(added=late.noise(late.first_samples(frame)))
     return compensated, replace(wide, drift=None, earlier_scans=(earlier,))
+
+
+def _of_speed(before: State, late: LateStart) -> Array:
+    """Return the covariance ``(6, 6)`` of the place of most points of a covered sweep, by that of the speed."""
+    variance = np.trace(before.covariance[6:9, 6:9]) / 3 * (late.duration_s / 2) ** 2
+    return np.diag(np.r_[np.zeros(3), np.full(3, variance)])
 
 
 def _is_covered(frame: Frame) -> bool:

@@ -69,7 +69,7 @@ class LateStart:
         return float(self.frame.scan.time_offsets_ns.max()) / NS_PER_S
 
     def _late_s(self, samples: ImuSamples) -> float:
-        return float(samples.stamps_ns[0] - self.frame.scan.stamp_ns) / NS_PER_S
+        return max(float(samples.stamps_ns[0] - self.frame.scan.stamp_ns) / NS_PER_S, 0.0)
 
     def _lag_s(self, samples: ImuSamples) -> float:
         """Return over which time a rate changed that is known by samples, or by the step between two scans."""
@@ -83,7 +83,7 @@ class LateStart:
         T_scan_first: Array,
         lost_cost: float,
     ) -> SweepPose | None:
-        """Place the first scan relative to a covered one; None if it does not fit.
+        """Place the first scan relative to a covered one; None if it does not fit, or if samples cover it, too.
 
         Args:
             settings: of scan matching.
@@ -92,9 +92,9 @@ class LateStart:
             T_scan_first: ``(4, 4)`` a guess.
             lost_cost: mean cost from which the first scan does not fit.
         """
-        if surface is None:
-            return None
         lag_s, without_s = self._lag_s(samples), self.without_s(samples)
+        if surface is None or without_s == 0:
+            return None
         change = _FEW_CHANGES * rate_change(samples, lag_s)
         at_end = rate_change(samples, 0.0) if lag_s <= without_s else change
         points = self.compensated.scan.points.astype(np.float64)
@@ -119,11 +119,14 @@ class LateStart:
 
 
 def starts_late(first: Frame) -> bool:
-    """Return whether samples that motion compensation needs are missing at the first scan's stamp."""
-    offsets_ns = first.scan.time_offsets_ns
+    """Return whether samples that motion compensation needs are missing at the first scan's stamp.
+
+    A first sample within a period of the stamp is not late: rates hardly change in that time.
+    """
+    offsets_ns, stamps_ns = first.scan.time_offsets_ns, first.sweep_imu.stamps_ns
     if first.calibration is None or offsets_ns is None or not len(offsets_ns) or offsets_ns.max() <= 0:
         return False
-    return not len(first.sweep_imu) or bool(first.sweep_imu.stamps_ns[0] > first.scan.stamp_ns)
+    return len(stamps_ns) < 2 or bool(stamps_ns[0] - first.scan.stamp_ns > np.median(np.diff(stamps_ns)))
 
 
 def less_certain(step: RelativePose, noise: Array) -> RelativePose:
