@@ -16,7 +16,7 @@ import numpy as np
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.chi_square import chi_square_quantile
-from hybridlio.core.estimates import EarlierScanPose, RefinesAgain, RelativePose, State
+from hybridlio.core.estimates import EarlierScanPose, RefinesAgain, RelativePose, State, TakesBack
 from hybridlio.core.sensors import NS_PER_S, Frame, ImuSamples
 from hybridlio.core.start_state import start_state
 from hybridlio.odometry.pipeline import Pipeline, timed
@@ -34,7 +34,7 @@ _log = logging.getLogger(__name__)
 # How often the first step is repeated without an IMU. The first answer comes from a coarse search over rotations too;
 # after three repetitions, each from the answer before, it no longer changes.
 _REPETITIONS_WITHOUT_IMU = 3
-# With an IMU it is repeated until the answer changes by less than that at the distance of half of a scan's points.
+# With an IMU until the answer changes by less than that at the distance of half of a scan's points.
 _MOST_REPETITIONS, _SETTLED_M, _LEVER_M = 6, 0.01, 10.0
 _EXCLUDED_TURN = chi_square_quantile(0.999, 3)
 _LEVELLING_NS = NS_PER_S  # samples this long before the first scan help to find the direction of gravity
@@ -203,7 +203,7 @@ def repeat_first_step(
         moved = np.linalg.norm(se3.log(se3.between(before.pose, relative.pose)).reshape(2, 3), axis=1)
         if start.has_imu and moved @ (_LEVER_M, 1.0) < _SETTLED_M:
             break
-    if is_late and relative.ok and _turns_elsewhere(initial, relative):
+    if is_late and relative.ok and isinstance(pipeline.residual, TakesBack) and _turns_elsewhere(initial, relative):
         pipeline.residual.take_back(initial)
         relative = replace(initial, details=relative.details)
     return compensated, relative
@@ -269,16 +269,16 @@ def _placed(
     assert isinstance(pipeline.residual, ScanMatching)
     (compensated, step), is_first_step = answer, pipeline.state is None
     T_first_scan, settings = pipeline.pose_after(before, step), pipeline.residual.settings
+    covariance = np.zeros((6, 6))
     for _ in range(_ROUNDS if is_first_step else 1):
         surface, guess = thin(compensated.scan, settings).surface, se3.inverse(T_first_scan)
         found = late.placed(settings, surface, late.first_samples(frame), guess, LOST_COST)
         if found is None:
             return None
-        T_first_scan = se3.inverse(found.pose)
+        T_first_scan, covariance = se3.inverse(found.pose), se3.rotate_covariance(found.covariance, found.pose)
         if is_first_step:
             compensated = pipeline.compensated(frame, T_first_scan, before)
     pipeline.residual.start(compensated)
-    covariance = se3.rotate_covariance(found.covariance, found.pose)
     if is_first_step:
         return compensated, replace(step, pose=T_first_scan, covariance=covariance, drift=None)
     earlier = EarlierScanPose(pipeline.first.scan.stamp_ns, T_first_scan, covariance + _of_speed(before, late))

@@ -67,7 +67,7 @@ class Sweep:
     def prior(self) -> Array:
         """Information ``(18, 18)`` of the unknowns; none of the pose."""
         turn = _ends(self.without_s, *self.rate_sigmas_rad_s)
-        return block_diag(np.zeros((6, 6)), turn, _ends(self.duration_s, *self.speed_sigmas_m_s))
+        return np.asarray(block_diag(np.zeros((6, 6)), turn, _ends(self.duration_s, *self.speed_sigmas_m_s)))
 
     def moved(self, turn: Array, shift: Array) -> Array:
         """Return the points ``(N, 3)`` with errors of the guess, ``(2, 3)`` each, taken back."""
@@ -78,7 +78,8 @@ class Sweep:
 def _ends(time_s: float, first_sigma: float, last_sigma: float) -> Array:
     """Return the information ``(6, 6)`` of the coefficients of ``s`` and ``s²`` from their derivative at both ends."""
     at_first, at_last = np.array([1.0, 0.0]) / (first_sigma * time_s), np.array([1.0, 2.0]) / (last_sigma * time_s)
-    return np.kron(np.outer(at_first, at_first) + np.outer(at_last, at_last), np.eye(3))
+    information = np.outer(at_first, at_first) + np.outer(at_last, at_last)
+    return np.asarray(np.kron(information, np.eye(3)), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
