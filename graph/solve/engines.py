@@ -19,7 +19,7 @@ from hybridlio.graph.base.isam import gtsam_message, make_isam_params
 # Changes beyond which a variable is linearised anew, checked at every tenth update: rad, m, m/s, and m/s² and rad/s of
 # the biases. Smaller than those of an odometry run (hybridlio.graph.base.isam): a pose graph may span a few metres and
 # have loops that are precise to centimetres.
-_TURN_RAD, _SHIFT_M, _SPEED_M_S, _BIASES = 0.01, 0.1, 0.1, (0.05, 0.005)
+TURN_RAD, SHIFT_M, _SPEED_M_S, _BIASES = 0.01, 0.1, 0.1, (0.05, 0.005)
 _WILDFIRE_THRESHOLD = 1e-3  # changes below it (rad, m) stay where they are: a tenth of the turn above
 
 
@@ -72,7 +72,7 @@ class Incremental:
     """iSAM2 with QR over all poses (Kaess et al., IJRR 2012)."""
 
     def __init__(self, dimension: int) -> None:
-        self._params = _params(dimension, reuse_slots=False)
+        self._params, self._newest = _params(dimension, reuse_slots=False), _Newest(dimension)
         self.solver = gtsam.ISAM2(self._params)
         self._removed: dict[int, Any] = {}  # of the last update, by slot
         self._new: Collection[int] = ()  # variables of a failed update
@@ -84,10 +84,12 @@ class Incremental:
         held = self.solver.getFactorsUnsafe() if removed else gtsam.NonlinearFactorGraph()
         self._removed = {slot: held.at(slot) for slot in removed}
         try:
-            return list(self.solver.update(graph, values, removed).getNewFactorsIndices())
+            slots = list(self.solver.update(graph, values, removed).getNewFactorsIndices())
+            self._newest.estimate(self.solver, values)
         except RuntimeError as error:
             self._new = values.keys()
             raise GraphError(f"the graph cannot be solved: {gtsam_message(error)}") from error
+        return slots
 
     def iterate(self) -> bool:
         """See :class:`Engine`."""
@@ -95,6 +97,7 @@ class Incremental:
         again.force_relinearize = True
         try:
             result = self.solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), again)
+            self._newest.estimate(self.solver, gtsam.Values())
         except RuntimeError as error:
             raise GraphError(f"the graph cannot be solved: {gtsam_message(error)}") from error
         return bool(result.getVariablesRelinearized())
@@ -121,6 +124,7 @@ class FixedLag:
 
     def __init__(self, dimension: int, lag: int) -> None:
         self._params, self._lag = _params(dimension, reuse_slots=True), float(lag)
+        self._newest = _Newest(dimension)
         self.solver = gtsam.IncrementalFixedLagSmoother(self._lag, self._params)
         self._before = gtsam.NonlinearFactorGraph(), gtsam.Values()  # a failed update
         self._landmark_stamps: dict[Any, float] = {}  # of landmarks, by variable
@@ -134,6 +138,7 @@ class FixedLag:
         values_before = gtsam.Values(self.solver.getLinearizationPoint())
         try:
             self.solver.update(graph, values, _stamps(values) | stamps, removed)
+            self._newest.estimate(self.solver, values)
         except RuntimeError as error:
             self._before = before, values_before
             raise GraphError(f"the graph cannot be solved: {gtsam_message(error)}") from error
@@ -144,6 +149,7 @@ class FixedLag:
         """See :class:`Engine`."""
         try:
             self.solver.update()
+            self._newest.estimate(self.solver, gtsam.Values())
         except RuntimeError as error:
             raise GraphError(f"the graph cannot be solved: {gtsam_message(error)}") from error
         return bool(self.solver.getISAM2Result().getVariablesRelinearized())
@@ -163,10 +169,36 @@ class FixedLag:
         return self.solver.getISAM2().jointMarginalCovariance(variables)
 
 
+class _Newest:
+    """The newest pose of a solver.
+
+    iSAM2 solves for the estimates when the first one is read. A system that is nearly indeterminate fails only there,
+    so that one is read in each update, which fails as a whole then.
+    """
+
+    def __init__(self, dimension: int) -> None:
+        self._read = f"calculateEstimatePose{dimension}"
+        self._pose: int | None = None
+
+    def estimate(self, solver: Any, new: gtsam.Values) -> None:
+        """Solve for the estimates; raise GTSAM's RuntimeError where that fails.
+
+        Args:
+            solver: after an update.
+            new: its new variables.
+        """
+        variables = new.keys()
+        poses = [variable for variable in variables if gtsam.Symbol(variable).chr() == ord("x")]
+        pose = max([*poses, self._pose] if self._pose else poses, default=None)
+        if pose is not None:
+            getattr(solver, self._read)(pose)
+        self._pose = pose
+
+
 def _params(dimension: int, reuse_slots: bool) -> gtsam.ISAM2Params:
-    turn_3, shift_3 = np.full(3, _TURN_RAD), np.full(3, _SHIFT_M)
-    pose = np.r_[turn_3, shift_3] if dimension == 3 else np.array([_SHIFT_M, _SHIFT_M, _TURN_RAD])
-    thresholds = {"x": pose, "v": np.full(3, _SPEED_M_S), "b": np.repeat(_BIASES, 3), "l": np.full(dimension, _SHIFT_M)}
+    turn_3, shift_3 = np.full(3, TURN_RAD), np.full(3, SHIFT_M)
+    pose = np.r_[turn_3, shift_3] if dimension == 3 else np.array([SHIFT_M, SHIFT_M, TURN_RAD])
+    thresholds = {"x": pose, "v": np.full(3, _SPEED_M_S), "b": np.repeat(_BIASES, 3), "l": np.full(dimension, SHIFT_M)}
     params = make_isam_params(thresholds, _WILDFIRE_THRESHOLD)
     if reuse_slots:
         # few variables are in a lag: checking all at each update is cheap

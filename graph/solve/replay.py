@@ -5,11 +5,14 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
+from hybridlio.core import se3
+from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
 from hybridlio.graph.model.checks import check_determined, check_observed
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.solve.builder import Builder
 from hybridlio.graph.solve.changes import check_followed
+from hybridlio.graph.solve.engines import SHIFT_M, TURN_RAD
 from hybridlio.graph.solve.initial_values import choose_start
 from hybridlio.graph.solve.linear_solver import poses_of
 from hybridlio.graph.solve.nonlinear import SolverResult, biases_of
@@ -32,7 +35,7 @@ def solve_online(graph: GraphData, settings: Settings, report: IterationProgress
     check_determined(graph)
     check_observed(graph)
     data = graph.copy()
-    found, updates = _replay(data, settings, report)
+    found, updates, is_settled = _replay(data, settings, report)
     values = Builder(data).values(poses_of(found, data.dimension))
     estimated = found.keys()
     for variable in estimated:
@@ -42,11 +45,11 @@ def solve_online(graph: GraphData, settings: Settings, report: IterationProgress
     factors = Builder(data, biases_of(values)).graph()
     errors = float(factors.error(start)), float(factors.error(values))
     poses = poses_of(values, data.dimension)
-    return Solution(data, SolverResult(data, poses, *errors, updates, True, (factors, values)))
+    return Solution(data, SolverResult(data, poses, *errors, updates, is_settled, (factors, values)))
 
 
-def _replay(data: GraphData, settings: Settings, report: IterationProgress) -> tuple[gtsam.Values, int]:
-    """Return all poses with the velocities and biases in the lag, and the number of updates.
+def _replay(data: GraphData, settings: Settings, report: IterationProgress) -> tuple[gtsam.Values, int, bool]:
+    """Return all poses with the velocities and biases in the lag, the number of updates, and whether they have settled.
 
     Each update brings one pose and the factors that become complete with it. Where the first poses are not determined
     by themselves, the first update waits for twice as many each time.
@@ -76,9 +79,17 @@ def _replay(data: GraphData, settings: Settings, report: IterationProgress) -> t
                 continue
             needed = 2 * (k + 1)
         report("updating", updates, 0.0)
+    before = solver.poses
     for _ in range(_LAST_UPDATES):
+        before = solver.poses
         solver.update()
-    return solver.values(), updates
+    return solver.values(), updates, _is_settled(before, solver.poses)
+
+
+def _is_settled(before: Array, after: Array) -> bool:
+    """Return whether no pose ``(N, 4, 4)`` has moved by more than GTSAM tolerates without linearising anew."""
+    moved = np.abs(se3.log(se3.between(before, after))).reshape(-1, 2, 3)
+    return bool((moved <= np.array([[TURN_RAD], [SHIFT_M]])).all())
 
 
 def _check_spans(data: GraphData, lag: int) -> None:

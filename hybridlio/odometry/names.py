@@ -8,6 +8,7 @@ from __future__ import annotations
 from hybridlio.core.errors import ConfigError
 
 INITIAL_POSES = ("preintegration", "lstm", "kalman", "constant-velocity", "identity")
+WITHOUT_IMU = ("constant-velocity", "identity")  # those of them that take no inertial data
 RESIDUALS = ("scan-matching", "network", "network+scan-matching", "none")
 BACKENDS = ("incremental", "fixed-lag", "none")
 

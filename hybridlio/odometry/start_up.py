@@ -19,6 +19,7 @@ from hybridlio.core.chi_square import chi_square_quantile
 from hybridlio.core.estimates import EarlierScanPose, RefinesAgain, RelativePose, State, TakesBack
 from hybridlio.core.sensors import NS_PER_S, Frame, ImuSamples
 from hybridlio.core.start_state import start_state
+from hybridlio.odometry.names import WITHOUT_IMU
 from hybridlio.odometry.pipeline import Pipeline, timed
 from hybridlio.odometry.second_pass import held_at_rest, second_compensation, without_misfit
 from hybridlio.odometry.start_search import StartEstimate, StartSearch
@@ -57,7 +58,8 @@ def start_residual(pipeline: Pipeline) -> None:
         first, np.eye(4), stamp_ns - NS_PER_S, stamp_ns, None, ImuSamples.empty()
     )
     pipeline.residual.start(compensated)
-    if isinstance(pipeline.residual, ScanMatching) and starts_late(first):
+    awaits_imu = pipeline.initial_pose.name not in WITHOUT_IMU
+    if awaits_imu and isinstance(pipeline.residual, ScanMatching) and starts_late(first):
         pipeline.late_start = LateStart(first, compensated)
 
 
@@ -281,15 +283,9 @@ def _placed(
     pipeline.residual.start(compensated)
     if is_first_step:
         return compensated, replace(step, pose=T_first_scan, covariance=covariance, drift=None)
-    earlier = EarlierScanPose(pipeline.first.scan.stamp_ns, T_first_scan, covariance + _of_speed(before, late))
+    earlier = EarlierScanPose(pipeline.first.scan.stamp_ns, T_first_scan, covariance + late.noise_of_speed(before))
     wide = step.wider(added=late.noise(late.first_samples(frame)))
     return compensated, replace(wide, drift=None, earlier_scans=(earlier,))
-
-
-def _of_speed(before: State, late: LateStart) -> Array:
-    """Return the covariance ``(6, 6)`` of the place of most points of a covered sweep, by that of the speed."""
-    variance = np.trace(before.covariance[6:9, 6:9]) / 3 * (late.duration_s / 2) ** 2
-    return np.diag(np.r_[np.zeros(3), np.full(3, variance)])
 
 
 def _is_covered(frame: Frame) -> bool:

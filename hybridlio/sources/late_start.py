@@ -14,7 +14,7 @@ import numpy as np
 
 from hybridlio.cloud.voxel import voxel_pick
 from hybridlio.core.arrays import Array
-from hybridlio.core.estimates import RelativePose
+from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.motion_limits import BRIDGED_ACCELERATION_SIGMA_M_S2, UNKNOWN_RATE_SIGMA_RAD_S
 from hybridlio.core.sensors import NS_PER_S, Frame, ImuSamples
 from hybridlio.core.start_state import rate_change, turn_beyond_linear_rates
@@ -57,6 +57,11 @@ class LateStart:
         """
         turn = UNKNOWN_RATE_SIGMA_RAD_S * self.duration_s / 2
         return np.diag(np.r_[np.full(3, turn), np.full(3, turn * _LEVER_M / 3)] ** 2)
+
+    def noise_of_speed(self, before: State) -> Array:
+        """Return the covariance ``(6, 6)`` of where most points of a covered sweep lie, by that of the speed."""
+        variance = np.trace(before.covariance[6:9, 6:9]) / 3 * (self.duration_s / 2) ** 2
+        return np.diag(np.r_[np.zeros(3), np.full(3, variance)])
 
     def without_s(self, samples: ImuSamples) -> float:
         """Return for how long the sweep has no samples after its stamp."""
