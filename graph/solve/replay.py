@@ -79,10 +79,10 @@ def _replay(data: GraphData, settings: Settings, report: IterationProgress) -> t
                 continue
             needed = 2 * (k + 1)
         report("updating", updates, 0.0)
-    before = solver.poses
-    for _ in range(_LAST_UPDATES):
-        before = solver.poses
+    for _ in range(_LAST_UPDATES - 1):
         solver.update()
+    before = solver.poses
+    solver.update()
     return solver.values(), updates, _is_settled(before, solver.poses)
 
 

@@ -34,6 +34,8 @@ PREDICTION_FLOOR_SIGMAS = np.r_[np.full(3, 1e-4), np.full(3, 1e-3)]
 # averaged over hundreds of points is 1 mm.
 MEASUREMENT_FLOOR_SIGMAS = np.r_[np.full(3, 5e-5), np.full(3, 1e-3)]
 
+POINT_LEVER_M = 10.0  # half of a scan's points are nearer; turns a rotation, or its uncertainty, into a displacement
+
 # An initial pose whose translation is less certain than this (all axes together) is treated as unknown: it is beyond
 # the width of registration's coarse kernel.
 UNKNOWN_TRANSLATION_SIGMA_M = 0.5

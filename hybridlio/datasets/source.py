@@ -18,7 +18,7 @@ class Source:
         sequence, reader: names, as found.
         raw_root, vertical_angle_deg, topics, rate_hz: as given.
         start, stop: first frame used, and the one after the last; None for all.
-        step: of these, one in so many is used.
+        step: every ``step``-th of these is used.
     """
 
     path: str

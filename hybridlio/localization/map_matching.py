@@ -9,6 +9,7 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
+from hybridlio.core.motion_limits import POINT_LEVER_M
 from hybridlio.core.setting_checks import check_fraction, check_not_negative, check_positive
 from hybridlio.localization.fusion import UncertainPose
 from hybridlio.localization.map_surface import MapSurface
@@ -20,7 +21,6 @@ from hybridlio.registration.surface import Surface
 from hybridlio.smoothing.loop_verification import HORIZONTAL
 from hybridlio.sources.thinned_scan import ThinnedScan
 
-_LEVER_M = 10.0  # half of a scan's points are nearer; turns a rotation's uncertainty into a displacement
 # The search from an uncertain pose. Starts are 3° and 2 m apart: as far as its kernel reaches, 3° at 40 m being 2 m.
 _SEARCH = CoarseSearch(kernel_m=2.0, iterations=8, refined=3)
 _SEARCH_STEPS = np.array([np.deg2rad(3.0), 2.0, 2.0])  # yaw, ahead, left
@@ -114,7 +114,7 @@ def match_with_map(
 
 
 def _kernel_start_m(predicted: UncertainPose, settings: MapMatchingSettings) -> float:
-    sideways_m = settings.scale * _LEVER_M * float(np.sqrt(predicted.covariance[:3, :3].trace()))
+    sideways_m = settings.scale * POINT_LEVER_M * float(np.sqrt(predicted.covariance[:3, :3].trace()))
     registration = settings.registration
     return min(max(registration.kernel_m, predicted.sigma_m, sideways_m), registration.max_distance_m)
 

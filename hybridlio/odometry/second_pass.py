@@ -15,11 +15,10 @@ import numpy as np
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RefinesAgain, RelativePose, State, TakesBack
-from hybridlio.core.motion_limits import UNKNOWN_TRANSLATION_SIGMA_M
+from hybridlio.core.motion_limits import POINT_LEVER_M, UNKNOWN_TRANSLATION_SIGMA_M
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples
 from hybridlio.odometry.inertial_motion import lidar_turn
 
-_LEVER_M = 10.0  # half of a scan's points are nearer; turns a rotation into a displacement
 # Displacement of the sweep's last points, over the spread of the residuals, from which a scan is registered again. The
 # mean displacement, which moves the scan, is half of it.
 _LEAST_RATIO = 1.0
@@ -77,7 +76,7 @@ def second_compensation(
     turn = lidar_turn(frame.imu, before, calibration) if by_imu else initial.pose[:3, :3]
     compensated_by = se3.make(turn, initial.pose[:3, 3])
     error = se3.log(se3.between(compensated_by, found.pose)) * step_s / (step_s + mean_s)
-    moved_m = np.linalg.norm(error.reshape(2, 3), axis=1) * (_LEVER_M, 1.0) * sweep_s / step_s
+    moved_m = np.linalg.norm(error.reshape(2, 3), axis=1) * (POINT_LEVER_M, 1.0) * sweep_s / step_s
     by_scale_rad = _SIGMAS * imu_noise.gyro_scale_sigma * float(np.linalg.norm(se3.so3_log(turn)))
     holds = by_imu and bool(moved_m[0] <= _LEAST_RATIO * noise_m or np.linalg.norm(error[:3]) > by_scale_rad)
     if holds:

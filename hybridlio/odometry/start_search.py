@@ -25,6 +25,7 @@ from hybridlio.core.estimates import EarlierScanPose, RelativePose, State
 from hybridlio.core.motion_limits import (
     MEAN_ACCELERATION_SIGMA_M_S2,
     MEASUREMENT_FLOOR_SIGMAS,
+    POINT_LEVER_M,
     UNKNOWN_SPEED_SIGMA_M_S,
 )
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples
@@ -47,7 +48,6 @@ _TEMPERATURE = 1.5  # of the weights of motions that are left, as there
 _FEW_JUDGED, _JUDGED = 500, 2000  # points to compare starts, some hundreds of a scan; and to find each minimum
 _COARSE_STEPS, _FINE_STEPS = 6, 5  # the kernel is halved from 1 m to 0.1 m in four
 _MOST_MOTIONS = 6
-_LEVER_M = 10.0  # half of a scan's points are nearer; makes a rotation a displacement
 # On the variance of independent residuals: that of scan matching, doubled. In the 54 starts above the squared
 # normalised error per axis was 1.6 with scan matching's.
 _SHARED_ERROR_SCALE = 2.0
@@ -222,7 +222,7 @@ class StartSearch:
 
 def _displacement_m(motion: Array, time_s: float) -> float:
     shift = time_s * motion[3:6] + time_s**2 / 2 * motion[6:]
-    return float(np.linalg.norm(shift) + _LEVER_M * time_s * np.linalg.norm(motion[:3]))
+    return float(np.linalg.norm(shift) + POINT_LEVER_M * time_s * np.linalg.norm(motion[:3]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.chi_square import chi_square_quantile
 from hybridlio.core.estimates import EarlierScanPose, RefinesAgain, RelativePose, State, TakesBack
+from hybridlio.core.motion_limits import POINT_LEVER_M
 from hybridlio.core.sensors import NS_PER_S, Frame, ImuSamples
 from hybridlio.core.start_state import start_state
 from hybridlio.odometry.names import WITHOUT_IMU
@@ -36,7 +37,7 @@ _log = logging.getLogger(__name__)
 # after three repetitions, each from the answer before, it no longer changes.
 _REPETITIONS_WITHOUT_IMU = 3
 # With an IMU until the answer changes by less than that at the distance of half of a scan's points.
-_MOST_REPETITIONS, _SETTLED_M, _LEVER_M = 6, 0.01, 10.0
+_MOST_REPETITIONS, _SETTLED_M = 6, 0.01
 _EXCLUDED_TURN = chi_square_quantile(0.999, 3)
 _LEVELLING_NS = NS_PER_S  # samples this long before the first scan help to find the direction of gravity
 _LONGEST_NS = 2 * NS_PER_S  # after which the first scan is given up: later ones no longer see what it saw
@@ -203,7 +204,7 @@ def repeat_first_step(
         _restart_at(pipeline, second, before.pose, start)
         compensated, relative = pipeline.refine(second, before, start, {})
         moved = np.linalg.norm(se3.log(se3.between(before.pose, relative.pose)).reshape(2, 3), axis=1)
-        if start.has_imu and moved @ (_LEVER_M, 1.0) < _SETTLED_M:
+        if start.has_imu and moved @ (POINT_LEVER_M, 1.0) < _SETTLED_M:
             break
     if is_late and relative.ok and isinstance(pipeline.residual, TakesBack) and _turns_elsewhere(initial, relative):
         pipeline.residual.take_back(initial)

@@ -21,14 +21,13 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.registration.information import free_basis, least_share, scale_of
 from hybridlio.registration.point_to_point import MixedMatches, MixedNeighbours
-from hybridlio.registration.settings import RegistrationSettings
+from hybridlio.registration.settings import MATCH_KERNELS, RegistrationSettings
 from hybridlio.registration.surface import Neighbours, PlaneMatches, Surface
 
 if TYPE_CHECKING:
     from hybridlio.registration.loops import Followed
 
 _MAX_MATCHINGS = 8  # points midway between two neighbours can make the pose alternate without end; 3 to 5 are usual
-_MATCH_KERNELS = 3  # kernel widths within which neighbours count; the weight of a residual beyond is below 1 %
 
 _LEAST_COVERAGE = 0.3  # a surface that covers less of a scan says little about it
 
@@ -146,7 +145,7 @@ def register_neighbours(
     )
     match = neighbours.mixed if match_thick_as_points else neighbours.matches
     for _ in range(_MAX_MATCHINGS):
-        matches = match(descent.pose, max(settings.max_distance_m, _MATCH_KERNELS * descent.kernel_m))
+        matches = match(descent.pose, max(settings.max_distance_m, MATCH_KERNELS * descent.kernel_m))
         if not descent.follow(matches):
             break
     return descent.result(len(neighbours))
@@ -202,7 +201,7 @@ def fit_at(
     Neighbours farther than ``max_distance_m``, by default three times the kernel, are not matched.
     """
     if max_distance_m is None:
-        max_distance_m = _MATCH_KERNELS * kernel_m
+        max_distance_m = MATCH_KERNELS * kernel_m
     matches = Neighbours(surface, source, threads).matches(pose, max_distance_m)
     return Fit(robust_cost(matches.distances, len(source), kernel_m), len(matches) / max(len(source), 1))
 

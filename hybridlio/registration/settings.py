@@ -9,6 +9,8 @@ from hybridlio.core.setting_checks import check_positive, check_setting
 
 _MAX_NEIGHBOURS = 1000  # at spacings of 0.1 m a disc of 1.8 m radius, which is no place on a surface any more
 
+MATCH_KERNELS = 3  # kernel widths within which neighbours count; the weight of a residual beyond is below 1 %
+
 
 @dataclass(frozen=True)
 class RegistrationSettings:

@@ -23,13 +23,12 @@ from scipy.linalg import block_diag
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.motion_limits import MEASUREMENT_FLOOR_SIGMAS
-from hybridlio.registration.settings import RegistrationSettings
+from hybridlio.registration.settings import MATCH_KERNELS, RegistrationSettings
 from hybridlio.registration.surface import PlaneMatches, Surface
 
 _POSE, _TURN, _SHIFT = slice(0, 6), slice(6, 12), slice(12, 18)
 _ITERATIONS = 15
 _WIDEST_KERNELS = 8  # of the first kernel, which is halved at every step
-_MATCH_KERNELS = 3  # as in hybridlio/registration/icp.py
 _SETTLED = 1e-4  # rad and m; a hundredth of what a scan is known by
 
 
@@ -152,7 +151,7 @@ def _linearised(
     placed = se3.transform(pose, points)
     index, squares = surface.nearest(placed, settings.threads)
     planes = surface.planes(index)
-    near = squares < max(settings.max_distance_m, _MATCH_KERNELS * kernel_m) ** 2
+    near = squares < max(settings.max_distance_m, MATCH_KERNELS * kernel_m) ** 2
     if surface.one_sided:
         near &= planes[:, :3] @ pose[:3, 3] > planes[:, 3]
     matches = PlaneMatches.linearised(pose, points[near], planes[near])

@@ -15,7 +15,7 @@ import numpy as np
 from hybridlio.cloud.voxel import voxel_pick
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose, State
-from hybridlio.core.motion_limits import BRIDGED_ACCELERATION_SIGMA_M_S2, UNKNOWN_RATE_SIGMA_RAD_S
+from hybridlio.core.motion_limits import BRIDGED_ACCELERATION_SIGMA_M_S2, POINT_LEVER_M, UNKNOWN_RATE_SIGMA_RAD_S
 from hybridlio.core.sensors import NS_PER_S, Frame, ImuSamples
 from hybridlio.core.start_state import rate_change, turn_beyond_linear_rates
 from hybridlio.registration.surface import Surface
@@ -25,7 +25,6 @@ from hybridlio.sources.settings import ScanMatchingSettings
 
 # Of the guessed velocity: that of a step between two scans which are both distorted by a decimetre.
 _SPEED_SIGMA_M_S = 1.0
-_LEVER_M = 10.0  # half of a scan's points are nearer
 # Samples of two scans show about one change of each axis' rate. The variance of a new one is that of three values times
 # 3, as that of Student's t with three degrees of freedom.
 _FEW_CHANGES = np.sqrt(3.0)
@@ -56,7 +55,7 @@ class LateStart:
         A sweep that is compensated by a wrong turn is displaced as well, by about a third of its points' displacement.
         """
         turn = UNKNOWN_RATE_SIGMA_RAD_S * self.duration_s / 2
-        return np.diag(np.r_[np.full(3, turn), np.full(3, turn * _LEVER_M / 3)] ** 2)
+        return np.diag(np.r_[np.full(3, turn), np.full(3, turn * POINT_LEVER_M / 3)] ** 2)
 
     def noise_of_speed(self, before: State) -> Array:
         """Return the covariance ``(6, 6)`` of where most points of a covered sweep lie, by that of the speed."""

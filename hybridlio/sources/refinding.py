@@ -9,14 +9,13 @@ import numpy as np
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose
-from hybridlio.core.motion_limits import VAGUE_TRANSLATION_SIGMA_M
+from hybridlio.core.motion_limits import POINT_LEVER_M, VAGUE_TRANSLATION_SIGMA_M
 
 # Mean cost of the best of many starts, some of which fit by chance. Scans on their path cost 0.3 to 0.47 in simulated
 # towns, the best wrong place in 10 m 0.55 and more. To miss a place costs a new map, to believe a wrong one the run.
 REFOUND_COST = 0.5
 
 _REACH_SIGMAS = 2.5  # along each axis: 1.2 % of the places lie beyond
-_LEVER_M = 10.0  # half of a scan's points are nearer; turns a rotation into a displacement
 _MOST_STARTS = 400  # a fifth of a second for scans of 500 compared points
 
 
@@ -28,7 +27,7 @@ def starts_within(T_map_lidar: Array, covariance: Array, step_m: float) -> list[
         covariance: ``(6, 6)`` of a right perturbation of it, rad² and m², rotation first.
         step_m: about the distance between two starts. Where there would be too many, the only start is the most likely.
     """
-    units = np.r_[np.full(3, 1 / _LEVER_M), np.ones(3)]  # of a perturbation by which points move one metre
+    units = np.r_[np.full(3, 1 / POINT_LEVER_M), np.ones(3)]  # of a perturbation by which points move one metre
     variances, axes = np.linalg.eigh(covariance / np.outer(units, units))
     reach_m = _REACH_SIGMAS * np.sqrt(np.maximum(variances, 0.0))
     counts = np.floor(reach_m / step_m).astype(int)

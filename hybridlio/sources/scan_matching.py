@@ -11,7 +11,7 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.estimates import RelativePose
-from hybridlio.core.motion_limits import MEASUREMENT_FLOOR_SIGMAS, UNKNOWN_TRANSLATION_SIGMA_M
+from hybridlio.core.motion_limits import MEASUREMENT_FLOOR_SIGMAS, POINT_LEVER_M, UNKNOWN_TRANSLATION_SIGMA_M
 from hybridlio.core.sensors import NS_PER_S, Frame, Scan
 from hybridlio.registration.degeneracy import ObservedRegistration, RegistrationProblem, register_with_degeneracy
 from hybridlio.registration.local_map import LocalMap
@@ -28,7 +28,6 @@ from hybridlio.sources.thinned_scan import ThinnedScan, thin
 # An initial rotation less certain than this (all axes together) is searched for as well: 1.1°, which displaces points
 # 10 m away by 0.2 m, two of the default kernels.
 _UNKNOWN_ROTATION_SIGMA_RAD = 0.02
-_LEVER_M = 10.0  # half of a scan's points are nearer; turns a rotation's uncertainty into a displacement
 LOST_COST = 0.6  # mean cost of the points that the map covers; well above that of any scan that is placed correctly
 # A new map starts after this number of scans in a row that have enough points and do not fit. A passing occlusion lasts
 # less than half a second at 10 Hz; bridging longer adds more error than a new map, which starts at the bridges' error.
@@ -282,7 +281,7 @@ class ScanMatching:
         """Register from ``start``, or from the proposed pose if the scan fits the map better there."""
         problem, is_vague = self._problem(scan), has_vague_start(initial)
         surface, settings = problem.surface, problem.settings
-        sideways_m = _LEVER_M * float(np.sqrt(initial.covariance[:3, :3].trace()))
+        sideways_m = POINT_LEVER_M * float(np.sqrt(initial.covariance[:3, :3].trace()))
         # beyond the distance within which points are matched, a wider kernel has no effect
         kernel_start_m = min(max(settings.kernel_m, initial.translation_sigma_m, sideways_m), settings.max_distance_m)
         if initial.proposed is not None:
