@@ -91,8 +91,11 @@ class Sequence:
 
         Raises:
             IndexError: there is no such frame.
+            ConfigError: the index is a slice, for which :meth:`part` and :meth:`every` are.
             DataError: the scan cannot be read. :meth:`without_scan` returns the frame without it.
         """
+        if isinstance(index, slice):
+            raise ConfigError(f"{self.name}: one frame at a time; part(start, stop) and every(step) return a sequence")
         k = range(len(self))[index]
         return self._frame(k, self._scan(k))
 

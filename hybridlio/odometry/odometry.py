@@ -26,6 +26,10 @@ from hybridlio.sources.imu_trust import without_imu
 # The first pose defines the frame, so it is exact. GTSAM and the file formats need a positive definite covariance;
 # 1e-6 rad and m are far below any sensor's noise.
 _FIRST_COVARIANCE = np.eye(6) * 1e-12
+_STATE_NAMES = (
+    "residual", "gate", "start_search", "late_start", "late_noise", "keyframe_position", "keyframes", "start",
+    "imu_noise",
+)  # fmt: skip
 
 
 class Odometry:
@@ -180,7 +184,11 @@ class Odometry:
         Returns:
             The largest difference between a stored pose and the pose now, in metres and radians; 0 with the same
             processor and libraries.
+
+        Raises:
+            DataError: the state lacks a value or has one that is not known, as that of another version.
         """
+        plain_values.check_names(state, _STATE_NAMES, "state")
         difference = 0.0
         for frame, estimate in done:
             if self._pipeline is None:

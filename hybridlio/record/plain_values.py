@@ -8,13 +8,17 @@ is made by its constructor, which checks them.
 from __future__ import annotations
 
 import dataclasses
+import dis
 import importlib
 import json
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache
 from typing import Any, Literal, cast
 
 import numpy as np
+
+from hybridlio.core.errors import DataError
 
 _PACKAGE = "hybridlio."
 _KINDS = "biufU"  # of NumPy types: numbers and text, no objects
@@ -63,13 +67,29 @@ def state_of(source: object) -> dict[str, Any]:
 
 
 def restore(target: object, state: Mapping[str, Any]) -> None:
-    """Set the attributes of an object as :func:`state_of` returned them. Objects inside it are restored in place."""
+    """Set the attributes of an object as :func:`state_of` returned them. Objects inside it are restored in place.
+
+    Raises:
+        DataError: one is missing, or hybridlio's own class does not know it, as in the state of another version.
+    """
+    expected = set(state_of(target))
+    found = set(state) if _is_own(type(target)) else expected & set(state)  # a user's class may add attributes later
+    check_names(found, expected, type(target).__name__)
     for name, value in state.items():
         current = getattr(target, name, None)
         if type(current) is type(value) and _is_own(type(value)) and not dataclasses.is_dataclass(value):
             restore(current, vars(value))
         else:
             setattr(target, name, value)
+
+
+def check_names(found: Iterable[str], expected: Iterable[str], what: str) -> None:
+    """Raise a DataError unless stored values have exactly the expected names."""
+    found, expected = set(found), set(expected)
+    if found != expected:
+        faults = [f"{name!r} is missing" for name in sorted(expected - found)]
+        faults += [f"{name!r} is not known" for name in sorted(found - expected)]
+        raise DataError(f"{what}: {', '.join(faults)}")
 
 
 def _is_own(kind: type) -> bool:
@@ -202,11 +222,21 @@ def _find(name: str) -> type:
 def _made(kind: Any, attributes: Any) -> Any:
     if hasattr(kind, "_fields"):
         return kind(*attributes)
-    if dataclasses.is_dataclass(kind):
+    if dataclasses.is_dataclass(kind):  # a default is for callers; where a value was stored, none is right but its own
+        check_names(attributes, [one.name for one in dataclasses.fields(kind)], cast("type", kind).__name__)
         return cast("Callable[..., Any]", kind)(**attributes)
     made = kind.__new__(kind)
     if "__setstate__" in vars(kind):
         made.__setstate__(attributes)
     else:
+        check_names(attributes, _assigned(kind), kind.__name__)
         vars(made).update(attributes)
     return made
+
+
+@cache
+def _assigned(kind: type) -> frozenset[str]:
+    """Return the names of the attributes that a class's constructor assigns, without those that are no state."""
+    constructor = cast("Any", kind).__init__
+    stored = (one.argval for one in dis.get_instructions(constructor) if one.opname == "STORE_ATTR")
+    return frozenset(stored) - set(getattr(kind, "NOT_STATE", ()))

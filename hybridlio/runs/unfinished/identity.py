@@ -13,6 +13,11 @@ from hybridlio.datasets.notes import labelled
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.odometry.config import Config
 
+HEADER_NAMES = (
+    "version", "settings", "name", "digest", "stamps_ns", "calibration", "imu_noise", "reference", "pose_file_frame",
+    "notes",
+)  # fmt: skip
+
 
 def header_of(sequence: Sequence, config: Config) -> dict[str, Any]:
     """Return what identifies a run, and what smoothing needs beside its estimates."""

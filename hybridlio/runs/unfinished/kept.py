@@ -22,12 +22,12 @@ from hybridlio.odometry.config import Config
 from hybridlio.odometry.estimate import Estimate, steps_of, trajectory_of
 from hybridlio.record import journal
 from hybridlio.record.loop_keyframes import PackedKeyframe, unpacked
-from hybridlio.record.plain_values import decode
+from hybridlio.record.plain_values import check_names, decode
 from hybridlio.record.record import Record
 from hybridlio.record.recorder import Recorder
 from hybridlio.runs.folder import StoredRun
 from hybridlio.runs.run import FrameByFrame, Run
-from hybridlio.runs.unfinished.identity import header_of, points_digest
+from hybridlio.runs.unfinished.identity import HEADER_NAMES, header_of, points_digest
 from hybridlio.runs.whole_folder import JOURNAL, STATE, partial_folder
 
 _log = logging.getLogger(__name__)
@@ -36,6 +36,8 @@ _log = logging.getLogger(__name__)
 # below any standard deviation, and with wrong data the first steps differ by more.
 _MAX_DIFFERENCE = 1e-6
 _MALFORMED = (ValueError, TypeError, KeyError, IndexError, AttributeError, ImportError, HybridLioError)
+_ROW_LISTS = ("estimates", "inputs", "reading_s", "keyframes")  # that each block continues
+_LATEST = ("start", "imu_noise", "unreadable", "skipped", "seconds")  # that each block replaces
 
 Inputs = tuple[ImuSamples, tuple[GpsFix, ...]]  # of one frame
 
@@ -124,17 +126,19 @@ def read_kept(folder: Path, rows: int | None = None) -> Kept | None:
         for end, content in journal.blocks(folder / JOURNAL):
             block = decode(content)
             if kept is None:
+                check_names(block, HEADER_NAMES, "header")
                 kept = Kept(block, end)
                 continue
             if rows is not None and len(kept.estimates) >= rows:
                 break
-            for name in ("estimates", "inputs", "reading_s", "keyframes"):
+            check_names(block, (*_ROW_LISTS, *_LATEST), "block")
+            for name in _ROW_LISTS:
                 getattr(kept, name).extend(block[name])
-            for name in ("start", "imu_noise", "unreadable", "skipped", "seconds"):
+            for name in _LATEST:
                 setattr(kept, name, block[name])
             kept.length = end
     except _MALFORMED as error:
-        raise DataError(f"{folder / JOURNAL}: not the journal of a run ({error}); give --overwrite") from error
+        raise _of_another_version(folder / JOURNAL, error) from error
     return kept if kept is not None and kept.estimates else None
 
 
@@ -169,16 +173,21 @@ def resume_run(folder: Path, sequence: Sequence, config: Config, odometry: Frame
     """
     run = Run(sequence, odometry)
     state = _read_state(folder)
-    kept = read_kept(folder, None if state is None else state["rows"])
-    if kept is None or state is None or len(kept.estimates) != state["rows"]:
+    rows = None if state is None else state.pop("rows")
+    kept = read_kept(folder, rows)
+    if kept is None or state is None or len(kept.estimates) != rows:
         if kept is not None:
             _check_same(kept.header, header_of(sequence, config), folder)
         return run, 0  # killed within the first second
     _check_same(kept.header, header_of(sequence, config), folder)
     start_s = time.perf_counter()
-    difference = odometry.resume(kept.frames(), {**state, "keyframes": kept.keyframes})
+    points = state.pop("points")
+    try:
+        difference = odometry.resume(kept.frames(), {**state, "keyframes": kept.keyframes})
+    except DataError as error:
+        raise _of_another_version(folder / STATE, error) from error
     run.last_points = _last_points(sequence, kept.estimates[-1].index)
-    if difference > _MAX_DIFFERENCE or points_digest(run.last_points) != state["points"]:
+    if difference > _MAX_DIFFERENCE or points_digest(run.last_points) != points:
         raise ConfigError(f"{folder}: the unfinished run is of other scans than {sequence.name}; give --overwrite")
     for estimate in kept.estimates:
         run.estimates.append(estimate)
@@ -218,23 +227,43 @@ def _read_state(folder: Path) -> dict[str, Any] | None:
         return None
     try:
         for _, content in journal.blocks(path):
-            return dict(decode(content))
+            state = dict(decode(content))
+            check_names(state.keys() & {"rows", "points"}, ("rows", "points"), "state")
+            return state
     except _MALFORMED as error:
-        raise DataError(f"{path}: not the state of a run ({error}); give --overwrite") from error
+        raise _of_another_version(path, error) from error
     return None
 
 
+def _of_another_version(path: Path, error: Exception) -> DataError:
+    """Return the error for a file whose checksums are right and whose values are not those of this version."""
+    smooth = "" if path.name == JOURNAL else "smooth what it has estimated, "
+    return DataError(
+        f"{path}: written by another version of hybridlio, or damaged ({error}); resume it with that version, "
+        f"{smooth}or give --overwrite to start again"
+    )
+
+
 def _check_same(before: dict[str, Any], now: dict[str, Any], folder: Path) -> None:
+    settings, own = _flat(before["settings"]), _flat(now["settings"])
+    remedy = "use the same options, or give --overwrite"
     if before["version"] != now["version"]:
         what = f"by hybridlio {before['version']}, not {now['version']}"
-    elif before["settings"] != now["settings"]:
-        what = f"with other settings ({', '.join(_changed(before['settings'], now['settings']))})"
+    elif names := sorted(settings.keys() ^ own.keys()):
+        what = f"by another version of hybridlio, with other settings ({', '.join(names)})"
+        remedy = "resume it with that version, or give --overwrite"
+    elif settings != own:
+        what = f"with other settings ({', '.join(name for name in own if settings[name] != own[name])})"
     elif (before["name"], before["digest"]) != (now["name"], now["digest"]):
         what = f"of another recording, or of other frames of it ({before['name']})"
     else:
         return
-    raise ConfigError(f"{folder}: the unfinished run is {what}; use the same options, or give --overwrite")
+    raise ConfigError(f"{folder}: the unfinished run is {what}; {remedy}")
 
 
-def _changed(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
-    return [name for name in now if before.get(name) != now[name]]
+def _flat(settings: dict[str, Any], group: str = "") -> dict[str, Any]:
+    """Return settings by their dotted names."""
+    found: dict[str, Any] = {}
+    for name, value in settings.items():
+        found |= _flat(value, f"{group}{name}.") if isinstance(value, dict) else {group + name: value}
+    return found

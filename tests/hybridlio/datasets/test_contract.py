@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hybridlio.core.errors import DataError
+from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.core.sensors import Scan
 from hybridlio.datasets import READERS, Sequence, open_sequence, sequence_names
 from hybridlio.datasets.published.table import PUBLISHED
@@ -189,6 +189,11 @@ def check_bridged(sequence: Sequence, frame: int) -> None:
     bridged = sequence.without_scan(frame)
     assert (bridged.index, bridged.scan.stamp_ns, len(bridged.scan)) == (frame, sequence.stamps_ns[frame], 0)
     assert len(bridged.imu) >= 10
+
+
+def test_a_slice_of_a_sequence_is_refused_with_what_to_use(tiny_drive: Path):
+    with pytest.raises(ConfigError, match=r"part\(start, stop\) and every\(step\)"):
+        open_sequence(tiny_drive)[1:3]  # type: ignore[index]
 
 
 def test_a_sequences_repr_is_one_line(tiny_drive: Path):

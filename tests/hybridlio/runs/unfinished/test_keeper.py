@@ -230,4 +230,4 @@ def test_damaged_files_are_named(killed: Path, tiny_drive: Path) -> None:
     with (part / STATE).open("wb") as file:
         journal.append_block(file, b"something else")
     error = refused(2, "odometry", tiny_drive, "-o", killed, "--resume")
-    assert f"{STATE}: not the state of a run" in error
+    assert f"{STATE}: written by another version of hybridlio, or damaged" in error
