@@ -83,13 +83,14 @@ def parse_rows(path: Path, tag: str, table: TextTable, repair: bool) -> ParsedRo
         split = [rest.split(None, head) for rest in table.rests]
         if min(map(len, split)) <= head:
             _raise_for_first_bad_row(path, tag, table)
-        heads = _parse_numbers(path, tag, table, [" ".join(words[:-1]) for words in split])
-        last_row = {words[-1]: k for k, words in enumerate(split)}  # by the matrix's text
-        number = {text: k for k, text in enumerate(last_row)}
-        matrices = _parse_numbers(path, tag, table, list(last_row), skipped=row_format.head)
-        lines = [table.lines[k] for k in last_row.values()]
+        texts = [words[-1] for words in split]  # of the matrices
+        poses = [rest[: -len(text)] for rest, text in zip(table.rests, texts, strict=True)]
+        heads = _parse_numbers(path, tag, table, poses)
+        number: dict[str, int] = {}
+        rows = [number.setdefault(text, len(number)) for text in texts]
+        matrices = _parse_numbers(path, tag, table, list(number), skipped=head)
+        lines = [table.lines[k] for k in np.unique(rows, return_index=True)[1]]
         distinct, wrong = _check_information(path, tag, lines, matrices, repair)
-        rows = [number[words[-1]] for words in split]
         information, repaired = distinct[rows], int(wrong[rows].sum())
     ids = _ids(path, tag, table, heads)
     keys = _keys(path, table.lines, ids[: row_format.keys])
@@ -236,13 +237,11 @@ def _as_information(values: Array, row_format: RowFormat) -> Array:
 def _information(values: Array, row_format: RowFormat) -> Array:
     """Return matrices ``(M, d, d)``, rotation first, from the numbers of their upper triangles."""
     size = 1 + max(row for row, _ in row_format.triangle)
+    place = range(size) if row_format.values == "point" else co.TEXT_ORDER[row_format.dimension]
     matrix = np.empty((len(values), size, size))
     for column, (i, j) in enumerate(row_format.triangle):
-        matrix[:, i, j] = matrix[:, j, i] = values[:, column]
-    if row_format.values == "point":
-        return matrix
-    order = np.argsort(co.TEXT_ORDER[row_format.dimension])
-    return matrix[:, order][:, :, order]
+        matrix[:, place[i], place[j]] = matrix[:, place[j], place[i]] = values[:, column]
+    return matrix
 
 
 def _not_positive_definite(information: Array) -> Mask:

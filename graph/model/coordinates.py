@@ -93,8 +93,8 @@ def gtsam_poses(coordinates: Array) -> list[Any]:
         return [gtsam.Pose2(x, y, theta) for x, y, theta in coordinates.tolist()]
     make_rotation, make_pose = gtsam.Rot3.Quaternion, gtsam.Pose3
     quaternions = coordinates[:, 3:] / np.linalg.norm(coordinates[:, 3:], axis=1, keepdims=True)
-    columns = zip(quaternions.tolist(), coordinates[:, :3], strict=True)
-    return [make_pose(make_rotation(w, x, y, z), t) for (x, y, z, w), t in columns]
+    x, y, z, w = quaternions.T.tolist()
+    return list(map(make_pose, map(make_rotation, w, x, y, z), coordinates[:, :3]))
 
 
 def our_order(matrix: Array, dimension: Dimension) -> Array:

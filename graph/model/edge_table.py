@@ -58,6 +58,13 @@ class EdgeTable:
         """Noise ``(M, d, d)``, each in the form it was given; sigmas are on the diagonal."""
         return self._columns["noise"].array
 
+    def noise_bytes(self, rows: slice) -> list[bytes]:
+        """Return the bytes of the noise of some rows, by which equal noise is found, in one call for all."""
+        values = self.noise_values[rows]
+        flat = values.reshape(-1, values.shape[1] * values.shape[2])
+        found: list[bytes] = flat.view(f"V{flat.itemsize * flat.shape[1]}")[:, 0].tolist()
+        return found
+
     @property
     def form(self) -> NDArray[np.int8]:
         """Form of the noise ``(M,)``, an index into :data:`FORMS`."""

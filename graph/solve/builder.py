@@ -102,7 +102,7 @@ class Builder:
     def values(self, poses: Array) -> gtsam.Values:
         """Return initial values: poses at their coordinates, and what factors concern beside them."""
         values = gtsam.Values()
-        insert = values.insert
+        insert = values.insert_or_assign  # takes poses in half the time of insert, which tries vectors first
         for k, pose in enumerate(co.gtsam_poses(poses), _X0):
             insert(k, pose)
         for k, velocity in _initial_velocities(self.data, poses).items():
@@ -174,8 +174,8 @@ class Builder:
         kernels = table.robust if robust else {}
         forms, ids = table.form[rows].tolist(), table.ids[rows].tolist()
         found = []
-        for factor_id, form, value in zip(ids, forms, values, strict=True):
-            name = form, value.tobytes(), kernels.get(factor_id)
+        for factor_id, form, value, text in zip(ids, forms, values, table.noise_bytes(rows), strict=True):
+            name = form, text, kernels.get(factor_id)
             if (model := models.get(name)) is None:
                 own = np.diagonal(value) if FORMS[form] == "sigmas" else value
                 model = models[name] = _model(FORMS[form], own, kernels.get(factor_id))

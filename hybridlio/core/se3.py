@@ -17,6 +17,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError, shown
 
 _EYE, _LAST = np.eye(3), [0.0, 0.0, 0.0, 1.0]  # the identity rotation; the last row of every pose
+_ROTATION_TOLERANCE = 1e-9  # of a quaternion's squared length, up to which a matrix is a rotation within rounding
 _SMALL_ANGLE_RAD = 1e-4  # below it the closed forms lose digits, while the series' next terms are below 1e-17
 
 
@@ -41,8 +42,24 @@ def so3_log(R: ArrayLike) -> Array:
     R = np.asarray(R, dtype=np.float64)
     if R.ndim == 2 and (rotvec := se3_single.rotation_vector(R)) is not None:
         return np.array(rotvec)
-    flat = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec()
-    return np.asarray(flat.reshape(*R.shape[:-2], 3))
+    return _rotation_vectors(R.reshape(-1, 3, 3)).reshape(*R.shape[:-2], 3)
+
+
+def _rotation_vectors(R: Array) -> Array:
+    """Return the rotation vectors ``(N, 3)`` of matrices ``(N, 3, 3)``: below 90° by the quaternion, else by SciPy's.
+
+    SciPy takes ten times as long, for a choice of the quaternion's component and a check of the matrix for each.
+    """
+    axis = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=-1)
+    w, squared = 1 + np.trace(R, axis1=1, axis2=2), np.einsum("ni,ni->n", axis, axis)
+    sine = np.sqrt(squared)
+    factor = np.where(sine > 0, 2 * np.arctan2(sine, w) / np.where(sine > 0, sine, 1.0), 2 / np.maximum(w, 1.0))
+    rotvec = np.asarray(factor[:, None] * axis)
+    # the quaternion of a rotation has a length of 2√w here; another matrix is left to SciPy, which orthonormalises
+    other = ~((w > 2) & (np.abs(w**2 + squared - 4 * w) < _ROTATION_TOLERANCE))
+    if other.any():
+        rotvec[other] = Rotation.from_matrix(R[other]).as_rotvec()
+    return rotvec
 
 
 def so3_left_jacobian(rotvec: ArrayLike) -> Array:
@@ -80,8 +97,17 @@ def log(T: ArrayLike) -> Array:
     if T.ndim == 2 and (xi := se3_single.log(T)) is not None:
         return xi
     rotvec = so3_log(T[..., :3, :3])
-    v = np.linalg.solve(so3_left_jacobian(rotvec), T[..., :3, 3, None])[..., 0]
-    return np.concatenate([rotvec, v], axis=-1)
+    return np.concatenate([rotvec, _left_jacobian_solved(rotvec, T[..., :3, 3])], axis=-1)
+
+
+def _left_jacobian_solved(rotvec: Array, t: Array) -> Array:
+    """Return ``J⁻¹·t`` ``(..., 3)`` for the left Jacobians ``J`` of rotation vectors of at most π (Solà, eq. 146)."""
+    angle = np.linalg.norm(rotvec, axis=-1)[..., None]
+    small = angle < _SMALL_ANGLE_RAD
+    half = np.where(small, 1.0, angle) / 2
+    c = np.where(small, 1 / 12 + angle**2 / 720, (1 - half / np.tan(half)) / (4 * half**2))
+    turned = np.cross(rotvec, t)
+    return np.asarray(t - turned / 2 + c * np.cross(rotvec, turned))
 
 
 def inverse(T: ArrayLike) -> Array:

@@ -16,7 +16,7 @@ close = partial(np.testing.assert_allclose, rtol=0)  # its default rtol of 1e-7 
 
 NEAR_IDENTITY = [0.0, 1e-15, 1e-9, 1e-6, 0.999e-4, 1.001e-4, 1e-3]
 NEAR_HALF_A_TURN = [np.pi - 1e-3, np.pi - 1e-6, np.pi - 1e-7, np.pi]
-ANGLES = [*NEAR_IDENTITY, 0.1, 1.0, 3.0, *NEAR_HALF_A_TURN]
+ANGLES = [*NEAR_IDENTITY, 0.1, 1.0, np.pi / 2 - 1e-9, np.pi / 2 + 1e-9, 3.0, *NEAR_HALF_A_TURN]
 COUNT = 20
 
 
