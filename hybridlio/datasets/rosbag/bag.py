@@ -13,6 +13,7 @@ from hybridlio.core.errors import DataError, HybridLioError
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.datasets.rosbag.heads import messages_and_heads
 from hybridlio.datasets.rosbag.recovery import RecoveredFile
+from hybridlio.datasets.rosbag.spans import span_of
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -46,7 +47,8 @@ class Topic:
         name: such as ``/points``.
         type: such as ``sensor_msgs/PointCloud2``, the same for ROS 1 and ROS 2.
         count: number of messages.
-        rate_hz: messages per second over the bag's duration; 0 for fewer than two messages.
+        rate_hz: messages per second from the topic's first message to its last; 0 where the bag's index does not tell
+            them, and for fewer than two messages.
     """
 
     name: str
@@ -103,13 +105,21 @@ class Bag:
                 self._connections.setdefault(connection.topic, []).append(connection)
                 self._types[connection.topic] = connection.msgtype
             # metadata of ROS 2 may hold words in the place of numbers
-            seconds = max(self._reader.duration, 1) / NS_PER_S
             counts = {name: sum(c.msgcount for c in found) for name, found in self._connections.items()}
-        self.topics = {
-            name: Topic(name, self._types[name].replace("/msg/", "/"), count, (count - 1) / seconds)
-            for name, count in sorted(counts.items())
-            if count
-        }
+            self.topics = {
+                name: Topic(name, self._types[name].replace("/msg/", "/"), count, self._rate_hz(name, count))
+                for name, count in sorted(counts.items())
+                if count
+            }
+
+    def _rate_hz(self, topic: str, count: int) -> float:
+        try:
+            span = span_of(self._connections[topic])
+        except Exception:  # of the library, or of a damaged index; messages may be readable all the same
+            span = None
+        if span is None or span[1] <= span[0]:
+            return 0.0
+        return (count - 1) * NS_PER_S / (span[1] - span[0])
 
     @property
     def duration_s(self) -> float:

@@ -44,7 +44,7 @@ def _of_owner(owner: Any, connections: list[Any], cut: Collection[str]) -> Itera
 
     if isinstance(owner, DirectoryReader) and owner.metadata.compression_mode != "message":
         for storage in owner.storages:
-            if kept := [c for c in storage.connections if any(_is_part(c, whole) for whole in connections)]:
+            if kept := [c for c in storage.connections if any(is_part(c, whole) for whole in connections)]:
                 yield from _of_owner(storage, kept, cut)
     elif isinstance(owner, Sqlite3Reader):
         yield from _sqlite(owner, connections, cut)
@@ -57,7 +57,7 @@ def _of_owner(owner: Any, connections: list[Any], cut: Collection[str]) -> Itera
             yield connection.topic, received_ns, raw
 
 
-def _is_part(part: Any, whole: Any) -> bool:
+def is_part(part: Any, whole: Any) -> bool:
     """Return whether a connection of a folder's file is one of the folder, by the rule of ``rosbags``."""
     same = part.topic == whole.topic and part.msgtype == whole.msgtype and part.ext == whole.ext
     return same and (not part.digest or not whole.digest or part.digest == whole.digest)

@@ -87,7 +87,7 @@ def _most(topics: Iterable[Topic]) -> Topic:
 
 
 def _rate(topic: Topic) -> str:
-    return f"{topic.rate_hz:.1f} Hz" if topic.count > 1 else ""
+    return f"{topic.rate_hz:.1f} Hz" if topic.rate_hz else ""
 
 
 def table(topics: Iterable[Topic], marks: Mapping[str, str] | None = None) -> str:

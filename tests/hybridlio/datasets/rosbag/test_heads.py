@@ -60,6 +60,15 @@ def test_of_clouds_only_heads_are_read(bag: tuple[str, Bag]) -> None:
     assert sizes == {HEAD_BYTES}
 
 
+def test_the_rate_of_a_topic_is_that_between_its_own_first_and_last_message(bag: tuple[str, Bag]) -> None:
+    received: dict[str, list[int]] = {}
+    for topic, at, _ in bag[1].messages(list(bag[1].topics)):
+        received.setdefault(topic, []).append(at)
+    for name, topic in bag[1].topics.items():
+        span_s = (max(received[name]) - min(received[name])) / 1e9
+        assert topic.rate_hz == pytest.approx((topic.count - 1) / span_s if span_s else 0.0)
+
+
 def test_a_topic_that_is_not_asked_for_is_left_out(bag: tuple[str, Bag]) -> None:
     assert {topic for topic, _, _ in bag[1].messages_and_heads(["/points"], ["/points"])} == {"/points"}
 

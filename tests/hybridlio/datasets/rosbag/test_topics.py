@@ -10,6 +10,7 @@ import pytest
 
 from hybridlio.core.errors import ConfigError, DataError
 from hybridlio.datasets import open_sequence
+from hybridlio.datasets.rosbag.bag import Bag
 from hybridlio.datasets.rosbag.choices import BagTopics
 
 STAMP = 1_700_000_000_000_000_000
@@ -25,9 +26,17 @@ class TestChoice:
             "small.bag: 2 lidar topics; choose one, for example --lidar-topic /points, or several to merge them"
         )
         assert [row.split() for row in rows] == [
-            ["/filtered", "sensor_msgs/PointCloud2", "2", "2.8", "Hz"],
-            ["/points", "sensor_msgs/PointCloud2", "4", "8.3", "Hz"],
+            ["/filtered", "sensor_msgs/PointCloud2", "2", "10.0", "Hz"],
+            ["/points", "sensor_msgs/PointCloud2", "4", "10.0", "Hz"],
         ]
+
+    @pytest.mark.parametrize("name", ["small.bag", "small"])
+    def test_the_rate_of_a_topic_that_starts_late_is_its_own(self, name: str, small: Any, small_2: Any) -> None:
+        bags = small if name.endswith(".bag") else small_2
+        late = [(t + 60 * 10**9, *rest) for t, *rest in bags.imu("/late")]
+        topics = Bag(bags.write(bags.standard(), late, name=name)).topics
+        rates = {topic: round(found.rate_hz, 6) for topic, found in topics.items()}
+        assert rates == {"/points": 10.0, "/imu": 100.0, "/late": 100.0, "/tf_static": 0.0}
 
     def test_a_chosen_topic_is_used_with_and_without_its_slash(self, small: Any) -> None:
         bag = small.write(small.standard(), small.clouds("/filtered", count=2))
