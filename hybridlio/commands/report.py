@@ -38,6 +38,7 @@ def report(
     from hybridlio.evaluation.reference_check import reference_doubts
     from hybridlio.evaluation.report import write_report
     from hybridlio.evaluation.report_data import ReportData, analyse
+    from hybridlio.runs.results.report_input import stored_map_points
 
     check_new_file(out, overwrite)
     pairs = [load_pair(path, reference) for path in estimates]
@@ -52,6 +53,7 @@ def report(
         others=others,
         final_poses=None if steps is None else steps.poses,
         step_covariances=None if steps is None else steps.covariances,
+        map_points=stored_map_points(estimates[0], first),
         reference_doubts=reference_doubts(true),
     )
     findings = analyse(data)

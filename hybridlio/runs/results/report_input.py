@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
@@ -120,15 +121,23 @@ def _conflicts(run: Run) -> dict[str, Index]:
 
 def _map_points(record: Record, trajectory: Trajectory, stored: StoredRun | None = None) -> Array | None:
     """Return the points ``(P, 3)`` of the loop keyframes in the trajectory's frame; None if there are none."""
-    keyframes = record.keyframes if stored is None else _stored_keyframes(stored)
-    if keyframes is None or not len(keyframes):
+    return _placed(record.keyframes if stored is None else _stored_keyframes(stored.path), trajectory)
+
+
+def stored_map_points(path: Path, trajectory: Trajectory) -> Array | None:
+    """Return the points ``(P, 3)`` of a run's loop keyframes in its trajectory's frame; None if ``path`` has none."""
+    return _placed(_stored_keyframes(path), trajectory)
+
+
+def _placed(keyframes: LoopKeyframes | None, trajectory: Trajectory) -> Array | None:
+    if keyframes is None or not len(keyframes) or keyframes.rows.max() >= len(trajectory):
         return None
     rows = keyframes.rows.tolist()
     return np.concatenate([se3.transform(trajectory.poses[row], keyframes.points(k)) for k, row in enumerate(rows)])
 
 
-def _stored_keyframes(stored: StoredRun) -> LoopKeyframes | None:
-    path = stored.path / KEYFRAMES
+def _stored_keyframes(folder: Path) -> LoopKeyframes | None:
+    path = folder / KEYFRAMES
     return LoopKeyframes.load(path) if path.is_file() else None
 
 

@@ -17,6 +17,9 @@ def test_runs_and_files_of_poses_share_a_page(finished_run: Path, tmp_path: Path
     html = (tmp_path / "r.html").read_text()
     for name in (finished_run.name, "poses_tum.txt", "reference"):
         assert name in html
+    assert '"name":"points"' in html.replace(" ", ""), "the points of the first run, below all paths"
+    ok("report", poses, finished_run, "--reference", truth, "-o", tmp_path / "files.html")
+    assert '"name":"points"' not in (tmp_path / "files.html").read_text().replace(" ", "")
 
 
 def test_the_reference_of_the_run_is_the_default(finished_run: Path, tmp_path: Path) -> None:
