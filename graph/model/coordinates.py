@@ -105,20 +105,20 @@ def our_order(matrix: Array, dimension: Dimension) -> Array:
     return np.asarray(matrix[np.ix_(order, order)])
 
 
-def relative_covariance(joint: Any, a: int, b: int, T_b_a: Array, dimension: Dimension) -> Array:
+def relative_covariance(joint: Array, T_b_a: Array, dimension: Dimension) -> Array:
     """Return the covariance ``(d, d)`` of pose ``b`` in the frame of pose ``a``.
 
     First-order propagation through ``T_a_b = T_a⁻¹ T_b``: a right perturbation of ``T_a`` acts on ``T_a_b`` by
     ``-Ad(T_b_a)``, one of ``T_b`` by the identity.
 
     Args:
-        joint: GTSAM's joint marginal covariance of both poses.
-        a, b: GTSAM's variables of the poses.
+        joint: GTSAM's joint marginal covariance of both poses, ``(2d, 2d)``.
         T_b_a: pose ``a`` in the frame of pose ``b``, ``(4, 4)``.
         dimension: of the graph.
     """
-    blocks = np.block([[our_order(joint.at(m, n), dimension) for n in (a, b)] for m in (a, b)])
-    J = np.hstack([-adjoint(T_b_a, dimension), np.eye(TANGENT_SIZE[dimension])])
+    d = TANGENT_SIZE[dimension]
+    blocks = np.block([[our_order(joint[m : m + d, n : n + d], dimension) for n in (0, d)] for m in (0, d)])
+    J = np.hstack([-adjoint(T_b_a, dimension), np.eye(d)])
     covariance = J @ blocks @ J.T
     return np.asarray((covariance + covariance.T) / 2)
 

@@ -8,7 +8,8 @@ from gtsam.symbol_shorthand import O
 
 from hybridlio.core.arrays import Array
 from hybridlio.graph.base import noise
-from hybridlio.graph.run.calibration_prior import SETTLED, Covariance, prior_covariance
+from hybridlio.graph.base.marginals import Covariance
+from hybridlio.graph.run.calibration_prior import SETTLED, prior_covariance
 from hybridlio.graph.run.factor_groups import GroupFactors
 from hybridlio.smoothing.calibration import Parameter, undetermined_directions
 

@@ -27,7 +27,8 @@ from hybridlio.core.arrays import Array, Index
 from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.sensors import NS_PER_S, ImuSamples
 from hybridlio.graph.base import noise
-from hybridlio.graph.run.calibration_prior import SETTLED, Covariance, prior_covariance
+from hybridlio.graph.base.marginals import Covariance
+from hybridlio.graph.run.calibration_prior import SETTLED, prior_covariance
 from hybridlio.record.record import Record
 from hybridlio.smoothing.calibration import CalibrationPriors, Parameter, moved_extrinsics, undetermined_directions
 

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TypeAlias
-
 import numpy as np
 
 from hybridlio.core.arrays import Array
-
-Covariance: TypeAlias = Callable[[Sequence[int]], Array]  # joint marginal covariance of variables
 
 _HELD = 1e-4  # of the prior's standard deviation: of directions that are held at it
 SETTLED = 0.1  # of the standard deviations, by which a round's changes no longer matter

@@ -16,6 +16,7 @@ import numpy as np
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import State
 from hybridlio.graph.base import noise
+from hybridlio.graph.base.marginals import Covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +69,7 @@ class GroupSolution:
     states: list[State]
     weights: Array
     chi2: Array
-    covariance: Callable[[Sequence[int]], Array]
+    covariance: Covariance
 
 
 class FactorGroup(Protocol):

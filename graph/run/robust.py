@@ -15,6 +15,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.estimates import State
 from hybridlio.graph.base import noise
+from hybridlio.graph.base.marginals import Covariance
 from hybridlio.graph.base.truncated_squares import chi2_bound, graduate
 from hybridlio.graph.model.noise import Robust, default_width
 from hybridlio.graph.run.factor_groups import (
@@ -119,12 +120,8 @@ class AddedGroups:
             out.append(KindFit.of(group.name, fits))
         return out
 
-    def results(self, values: gtsam.Values, states: list[State], isam: gtsam.ISAM2) -> dict[str, Any]:
+    def results(self, values: gtsam.Values, states: list[State], covariance: Covariance) -> dict[str, Any]:
         """Return each group's result in the solved graph, by the group's name."""
-
-        def covariance(keys: Sequence[int]) -> Array:
-            return np.asarray(isam.jointMarginalCovariance(list(keys)).fullMatrix())
-
         out: dict[str, Any] = {}
         for group, part, method, weights in zip(self._groups, self._parts, self._methods, self._weights, strict=True):
             chi2 = squared_residuals(part.possible_outliers, values)

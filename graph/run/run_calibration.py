@@ -9,12 +9,10 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import T
 
-from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import State
-from hybridlio.graph.base.marginals import bayes_tree
+from hybridlio.graph.base.marginals import Covariance, Marginals
 from hybridlio.graph.run.antenna import Antenna
 from hybridlio.graph.run.calibrated_links import CalibratedLinks
-from hybridlio.graph.run.calibration_prior import Covariance
 from hybridlio.graph.run.gps_factors import GpsGroup
 from hybridlio.graph.run.loop_factors import LoopClosures
 from hybridlio.record.record import Record
@@ -66,7 +64,7 @@ class RunCalibration:
         """Take over a round's solution; return whether no further round is needed for the calibration."""
         if not self._parts:
             return False
-        covariance = _covariance_in(bayes_tree(graph, values))
+        covariance = Marginals(graph, values).covariance
         settled = [part.take(values, covariance) for part in self._parts]
         for group in self._mounted if self._links is not None else []:
             group.T_imu_lidar = self.applied().calibration.T_imu_lidar
@@ -78,11 +76,10 @@ class RunCalibration:
         """Whether the last round, of ``iterations``, was the last that is needed."""
         return self._is_settled if self._parts else iterations < self.iterations
 
-    def results(self, values: gtsam.Values, isam: gtsam.ISAM2) -> dict[str, Calibrated]:
+    def results(self, values: gtsam.Values, covariance: Covariance) -> dict[str, Calibrated]:
         """Return what was found as ``calibration``; nothing where nothing is calibrated."""
         if not self._names:
             return {}
-        covariance = _covariance_in(isam)
         parameters = [parameter for part in self._parts for parameter in part.parameters(covariance)]
         shift_s = float(values.atVector(T(0))[0]) if self._fixes else 0.0
         if "gps_clock" in self._names:
@@ -94,12 +91,3 @@ class RunCalibration:
             calibration = replace(calibration, antenna_imu_m=self._fixes[0].antenna.position_m)
         offset_s = self._record.imu_time_offset_s + (0.0 if self._links is None else self._links.offset_s)
         return {"calibration": Calibrated(calibration, offset_s, shift_s, tuple(parameters))}
-
-
-def _covariance_in(isam: gtsam.ISAM2) -> Covariance:
-    def covariance(keys: Sequence[int]) -> Array:
-        if len(keys) == 1:
-            return np.asarray(isam.marginalCovariance(keys[0]))
-        return np.asarray(isam.jointMarginalCovariance(list(keys)).fullMatrix())
-
-    return covariance

@@ -20,7 +20,7 @@ from hybridlio.core.progress import Progress
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.graph.base.deep_stack import on_deep_stack
 from hybridlio.graph.base.isam import gtsam_message
-from hybridlio.graph.base.marginals import bayes_tree, pose_covariances
+from hybridlio.graph.base.marginals import Marginals, pose_covariances
 from hybridlio.graph.base.preintegration import covers, makes_one_factor, preintegrate
 from hybridlio.graph.run import factors
 from hybridlio.graph.run.factor_groups import FactorGroup
@@ -123,10 +123,10 @@ def _optimise(record: Record, added: AddedGroups, calibration: RunCalibration, r
         added.start_next_from(values)
         if calibration.take(graph, values):
             break
-    isam = bayes_tree(graph, values)
-    covariances = pose_covariances(isam, np.array([state.T_world_imu for state in states]), report)
-    found = added.results(values, states, isam)
-    found |= calibration.results(values, isam)
+    marginals = Marginals(graph, values)
+    covariances = pose_covariances(marginals, np.array([state.T_world_imu for state in states]), report)
+    found = added.results(values, states, marginals.covariance)
+    found |= calibration.results(values, marginals.covariance)
     verdict = Verdict.of(kind_fits(graph, own, values, added))
     for doubt in verdict.doubts:
         _log.warning("smoothing: %s", doubt)

@@ -164,8 +164,8 @@ class OnlineSolver:
         if a == b:
             return np.zeros((self._data.tangent_size,) * 2)
         T_j_i = se3.between(self._estimate(b), self._estimate(a))
-        joint = on_deep_stack(len(self), lambda: self._engine.joint([X(a), X(b)]))
-        return co.relative_covariance(joint, X(a), X(b), T_j_i, self._data.dimension)
+        joint = on_deep_stack(len(self), lambda: self._engine.joint([X(a), X(b)])).fullMatrix()
+        return co.relative_covariance(joint, T_j_i, self._data.dimension)
 
     def _marginal(self, variable: int) -> Array:
         return on_deep_stack(len(self), lambda: np.asarray(self._engine.solver.marginalCovariance(variable)))

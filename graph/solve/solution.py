@@ -6,15 +6,15 @@ from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
-import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
+from scipy.linalg import block_diag
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import GraphError
 from hybridlio.graph.base.deep_stack import on_deep_stack
-from hybridlio.graph.base.isam import gtsam_message, incremental_solver
+from hybridlio.graph.base.marginals import Marginals
 from hybridlio.graph.calibration.estimates import CalibrationEstimate, estimate, reported
 from hybridlio.graph.model import coordinates as co
 from hybridlio.graph.model.graph_data import GraphData
@@ -175,9 +175,9 @@ class Solution(SolutionViews):
         a, b = self._known(i), self._known(j)
         if a == b:
             return np.zeros((self._data.tangent_size,) * 2)
-        joint = on_deep_stack(len(self._index), lambda: self._marginals.jointMarginalCovariance([X(a), X(b)]))
+        joint = self._joint([X(a), X(b)])
         T_j_i = se3.between(self.poses[b], self.poses[a])
-        return co.relative_covariance(joint, X(a), X(b), T_j_i, self._data.dimension)
+        return co.relative_covariance(joint, T_j_i, self._data.dimension)
 
     def velocity_covariance(self, key: Key) -> Array:
         """Return the covariance ``(3, 3)`` of a velocity in world, m²/s²; raises as :meth:`velocity`."""
@@ -196,8 +196,8 @@ class Solution(SolutionViews):
         if len(found) == 1:
             return self.covariance(keys[0])
         variables = [variable for variable, _ in found]
-        joint: Any = on_deep_stack(len(self._index), lambda: self._marginals.jointMarginalCovariance(variables))
-        return _symmetric(np.block([[M @ joint.at(a, b) @ N.T for b, N in found] for a, M in found]))
+        M = block_diag(*(M for _, M in found))
+        return _symmetric(M @ self._joint(variables) @ M.T)
 
     def residual(self, factor_id: int) -> Array:
         """Return the difference of a factor's measurement and the solution, not whitened; of rejected factors too.
@@ -251,25 +251,21 @@ class Solution(SolutionViews):
         return found
 
     def _marginal(self, variable: int) -> Array:
-        return on_deep_stack(len(self._index), lambda: np.asarray(self._marginals.marginalCovariance(variable)))
+        return self._joint([variable])
+
+    def _joint(self, variables: Sequence[int]) -> Array:
+        """Return the joint covariance of GTSAM's variables, in its order of tangent vectors."""
+        return on_deep_stack(len(self._index), lambda: self._marginals.covariance(variables))
 
     @cached_property
-    def _marginals(self) -> gtsam.Marginals | gtsam.ISAM2:
-        if not self._result.uses_qr:
-            try:
-                return gtsam.Marginals(self._result.graph, self._result.values)
-            except RuntimeError:  # Cholesky finds the system indeterminate
-                return self._marginals_by_qr()
-        return self._marginals_by_qr()
-
-    def _marginals_by_qr(self) -> gtsam.ISAM2:
-        """Return iSAM2 with QR: GTSAM's ``Marginals`` fails on long chains."""
-        isam = incremental_solver()
+    def _marginals(self) -> Marginals:
+        graph, values, by_qr = self._result.graph, self._result.values, self._result.uses_qr
         try:
-            isam.update(self._result.graph, self._result.values)
-        except RuntimeError as error:
-            raise GraphError(f"covariances cannot be computed: {gtsam_message(error)}") from error
-        return isam
+            return Marginals(graph, values, by_qr)
+        except GraphError:
+            if by_qr:
+                raise
+            return Marginals(graph, values)  # Cholesky finds the system indeterminate
 
     def _known(self, key: Key) -> int:
         if (known := check_key(key)) not in self._index:
