@@ -200,5 +200,14 @@ def check_pose(T: ArrayLike, name: str) -> Array:
         return T.copy()  # almost always; the singular value decomposition below takes three times as long
     clean = orthonormalise(T)
     if np.abs(clean[:3, :3] - T[:3, :3]).max() > 1e-3 or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-9:
-        raise DataError(f"{name}: not a rigid transform (rotation not orthonormal, or last row not 0 0 0 1)")
+        raise DataError(f"{name}: not a rigid transform ({_why_not_rigid(T)})")
     return clean
+
+
+def _why_not_rigid(T: Array) -> str:
+    if np.abs(T[3] - _LAST).max() > 1e-9:
+        transposed = bool(T[:, 3].tolist() == _LAST)
+        return "last row not 0 0 0 1" + ("; transposed, the translation belongs in the last column" * transposed)
+    R = T[:3, :3]
+    mirrored = bool(np.abs(R.T @ R - _EYE).max() < 1e-3)
+    return "an axis is mirrored, the determinant is -1" if mirrored else "rotation not orthonormal"

@@ -1,11 +1,19 @@
-"""CSV files with a header, separated by commas, semicolons or tabs, as rows of text with their line numbers."""
+"""CSV files with a header, separated by commas, semicolons or tabs, as rows of text with their line numbers.
+
+Where semicolons or tabs separate and no value has a point, as spreadsheets write in half of the world, a comma inside a
+number is a decimal one. Where each comma stands before just three digits, it could as well part thousands, and stays.
+"""
 
 from __future__ import annotations
 
 import csv
+import re
 from pathlib import Path
 
 from hybridlio.core.errors import DataError
+
+_WITH_COMMA = re.compile(r"\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*")
+_PERHAPS_THOUSANDS = re.compile(r"\s*[+-]?[1-9]\d{0,2},\d{3}\s*")
 
 
 def read_csv(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
@@ -33,4 +41,13 @@ def read_csv(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     for line, row in rows:
         if len(row) != len(header):
             raise DataError(f"{path}, line {line}: {len(row)} columns, but the header has {len(header)}")
-    return header, rows
+    return header, rows if delimiter == "," else _with_points(rows)
+
+
+def _with_points(rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
+    """Return the rows with decimal commas as points."""
+    commas = [field for _, row in rows for field in row if "," in field]
+    told = any(not _PERHAPS_THOUSANDS.fullmatch(field) for field in commas)
+    if not told or not all(map(_WITH_COMMA.fullmatch, commas)) or any("." in field for _, row in rows for field in row):
+        return rows
+    return [(line, [field.replace(",", ".") for field in row]) for line, row in rows]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal
@@ -19,6 +20,13 @@ _TIMES = ("stamp", "headerstamp", "t", "time", "timestamp", "stamps", "timestamp
 _STATED = {"s": NS_PER_S, "sec": NS_PER_S, "ms": 10**6, "us": 1000, "µs": 1000, "ns": 1, "nsec": 1}
 _TOLD = {unit: _STATED[unit] for unit in ("ns", "us", "ms", "s")}  # units that are told from the values
 _PAIRS = (("secs", "nsecs"), ("sec", "nsec"), ("sec", "nanosec"), ("seconds", "nanoseconds"))
+
+_YEARS = (1678, 2261)  # whole years that fit int64 nanoseconds; NumPy wraps others around without an error
+_ISO = re.compile(r"(\d{4}-\d\d-\d\d.*?)(?:Z|([+-])(\d\d):?(\d\d))?")
+
+
+class Date(int):
+    """Nanoseconds since 1970 of a time that stands as an ISO 8601 date."""
 
 
 class ColumnError(ValueError):
@@ -42,12 +50,14 @@ class TimeColumn:
     nanoseconds: int | None = None
 
     def read(self, row: Sequence[str]) -> int | Decimal:
-        """Return a row's time: an integer for nanoseconds, else decimal in the header's unit, both exact.
+        """Return a row's time: an integer for nanoseconds and dates, else decimal in the header's unit, all exact.
 
         Raises:
-            ValueError, decimal.InvalidOperation: it is no finite number.
+            ValueError, OverflowError, decimal.InvalidOperation: it is no finite number, and no date.
         """
         text = row[self.column].strip()
+        if self.nanoseconds is None and is_date(text):
+            return Date(iso_ns(text))
         if self.nanoseconds is not None:
             return int(text) * NS_PER_S + int(row[self.nanoseconds])
         if self.unit_ns == 1:
@@ -72,8 +82,14 @@ class TimeColumn:
             notes: receives the unit that was found.
 
         Raises:
-            DataError: no unit fits, or a time is beyond int64 nanoseconds.
+            DataError: no unit fits, a time is beyond int64 nanoseconds, or only some times are dates.
         """
+        dates = sum(isinstance(time, Date) for time in times)
+        if dates:
+            if dates < len(times):
+                raise DataError(f"{file}: '{self.name}' holds dates in some rows and numbers in others")
+            notes.found(f"{file}: '{self.name}' holds dates, in UTC where they state no offset")
+            return np.array(times, dtype=np.int64)
         unit_ns = 1 if self.nanoseconds is not None else self.unit_ns
         if unit_ns is None and times:
             unit_ns = self._told_unit(times, steps_ns, what, file, notes)
@@ -95,6 +111,29 @@ class TimeColumn:
             )
         notes.found(f"{file}: '{self.name}' is read in {fitting[0]}, {what} are {step:g} apart")
         return _TOLD[fitting[0]]
+
+
+def is_date(text: str) -> bool:
+    """Return whether a text begins with an ISO 8601 date."""
+    return re.match(r"\d{4}-\d\d-\d\d", text) is not None
+
+
+def iso_ns(text: str) -> int:
+    """Convert an ISO 8601 date with a time, in UTC or with an offset, to nanoseconds since 1970.
+
+    Raises:
+        ValueError, OverflowError: it is none, or beyond int64.
+    """
+    date, sign, hours, minutes = _ISO.fullmatch(text).groups(default="0")  # type: ignore[union-attr]
+    if not _YEARS[0] <= int(date[:4]) <= _YEARS[1]:
+        raise OverflowError
+    east_ns = int(f"{sign}1") * (60 * int(hours) + int(minutes)) * 60 * NS_PER_S if sign != "0" else 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)  # NumPy warns of what it takes for the name of a time zone
+        try:
+            return int(np.datetime64(date.replace(" ", "T"), "ns").astype(np.int64)) - east_ns
+        except UserWarning:
+            raise ValueError from None
 
 
 def plain_name(name: str) -> str:

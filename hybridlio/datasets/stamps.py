@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from bisect import bisect_left
 from collections.abc import Callable
 from decimal import Decimal, InvalidOperation
@@ -16,6 +15,7 @@ from hybridlio.core.arrays import Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import NS_PER_S
 from hybridlio.core.tables import counted
+from hybridlio.datasets.csv_times import is_date, iso_ns
 from hybridlio.datasets.notes import Notes
 
 MISSING_STAMP = int(np.iinfo(np.int64).min)  # stands for a blank line; NumPy's NaT has the same bits
@@ -26,21 +26,6 @@ _MIN_SCAN_STEP_NS = 5_000_000  # no lidar makes 200 scans a second: the unit is 
 _MAX_STEP_S = 10.0  # no sensor is slower: the unit is wrong
 _MIN_WHOLE_STEP_NS = 1000  # no sensor delivers whole nanoseconds at over 1 MHz: these are seconds
 _MAX_UNCOVERED_S = 0.15  # beyond the first or last scan: one and a half scans at 10 Hz
-_YEARS = (1678, 2261)  # whole years that fit int64 nanoseconds; NumPy wraps others around without an error
-_ISO = re.compile(r"(\d{4}-\d\d-\d\d.*?)(?:Z|([+-])(\d\d):?(\d\d))?")
-
-
-def _iso_ns(text: str) -> int:
-    date, sign, hours, minutes = _ISO.fullmatch(text).groups(default="0")  # type: ignore[union-attr]
-    if not _YEARS[0] <= int(date[:4]) <= _YEARS[1]:
-        raise OverflowError
-    east_ns = int(f"{sign}1") * (60 * int(hours) + int(minutes)) * 60 * NS_PER_S if sign != "0" else 0
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", UserWarning)  # NumPy warns of what it takes for the name of a time zone
-        try:
-            return int(np.datetime64(date.replace(" ", "T"), "ns").astype(np.int64)) - east_ns
-        except UserWarning:
-            raise ValueError from None
 
 
 def seconds_ns(text: str) -> int:
@@ -50,8 +35,8 @@ def seconds_ns(text: str) -> int:
 
 def _parser(lines: list[str]) -> Callable[[str], int]:
     first = next(filter(None, lines))
-    if re.match(r"\d{4}-\d\d-\d\d", first):
-        return _iso_ns
+    if is_date(first):
+        return iso_ns
     # all lines, because a single stamp among seconds may be written without a point
     is_seconds = any(re.search(r"[.eE]", line) for line in lines)
     return seconds_ns if is_seconds or not re.fullmatch(r"[+-]?\d+", first) else int

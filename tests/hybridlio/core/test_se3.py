@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -246,3 +247,16 @@ def test_check_pose_makes_rounded_poses_exact() -> None:
 def test_check_pose_refuses_and_names_poses_that_are_not_rigid(wrong: Array) -> None:
     with pytest.raises(DataError, match="T_imu_lidar"):
         se3.check_pose(wrong, "T_imu_lidar")
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (np.transpose, "transposed, the translation belongs in the last column"),
+        (lambda T: np.diag([1.0, -1.0, 1.0, 1.0]) @ T, "an axis is mirrored"),
+        (lambda T: np.diag([1.1, 1.0, 1.0, 1.0]) @ T, "rotation not orthonormal"),
+    ],
+)
+def test_check_pose_says_what_is_wrong(change: Any, why: str) -> None:
+    with pytest.raises(DataError, match=why):
+        se3.check_pose(change(se3.exp([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])), "T")

@@ -195,9 +195,13 @@ class TestCalibration:
         np.testing.assert_array_equal(calibration.T_imu_lidar, np.eye(4))
         np.testing.assert_allclose(calibration.T_camera_lidar, se3.exp([0, 0, 0.1, 1, 2, 3]))
 
-    def test_lengths_in_millimetres_are_noted(self, folder: Path) -> None:
-        (folder / "calibration.yaml").write_text(f"T_imu_lidar: {se3.make(np.eye(3), [810, -320, 800]).tolist()}")
-        assert any("must be in metres" in note for note in open_sequence(folder).notes)
+    def test_long_lever_arms_are_noted_and_lengths_in_millimetres_refused(self, folder: Path) -> None:
+        for lever_m in ([21, 0, 0], [0, 0, -90]):
+            (folder / "calibration.yaml").write_text(f"T_imu_lidar: {se3.make(np.eye(3), lever_m).tolist()}")
+            assert any("must be in metres" in note for note in open_sequence(folder).notes)
+        (folder / "calibration.yaml").write_text(f"T_imu_lidar: {se3.make(np.eye(3), [110, -320, 80]).tolist()}")
+        with pytest.raises(DataError, match=r"is 347.* m from the IMU; the last column must be in metres"):
+            open_sequence(folder)
 
     def test_the_lidar_model_is_read(self, folder: Path) -> None:
         with (folder / "calibration.yaml").open("a") as file:

@@ -121,3 +121,39 @@ def test_a_time_whose_unit_cannot_be_told_is_refused_with_the_names_that_say_it(
 def test_times_beyond_int64_are_refused(tmp_path: Path, time: str) -> None:
     with pytest.raises(DataError, match=r"imu\.csv"):
         read(tmp_path / "imu.csv", ["t_s", *PLAIN[1:]], [time, *(str(k * 0.005) for k in range(COUNT - 1))])
+
+
+@pytest.mark.parametrize(
+    ("form", "east_h"), [("%sT%s.%09dZ", 0), ("%s %s.%09d", 0), ("%sT%s.%09d+02:00", 2)], ids=["Z", "bare", "offset"]
+)
+def test_dates_are_times_to_the_nanosecond(tmp_path: Path, form: str, east_h: int) -> None:
+    local = (STAMPS + east_h * 3600 * 10**9).astype("datetime64[ns]").astype(str)
+    dates = [form % (*text.partition(".")[0].split("T"), int(text.partition(".")[2])) for text in local]
+    imu, notes = read(tmp_path / "imu.csv", ["time", "gx", "gy", "gz", "ax", "ay", "az"], dates)
+    assert np.array_equal(imu.stamps_ns, STAMPS)
+    assert any("'time' holds dates, in UTC where they state no offset" in note for note in notes)
+
+
+@pytest.mark.parametrize("second", ["2024-05-01T25:00:00Z", "1714550400.5"], ids=["no date", "a number"])
+def test_a_date_that_is_none_is_refused(tmp_path: Path, second: str) -> None:
+    names = ["time", "gx", "gy", "gz", "ax", "ay", "az"]
+    with pytest.raises(DataError, match=r"line 3: expected numbers|holds dates in some rows and numbers in others"):
+        read(tmp_path / "imu.csv", names, ["2024-05-01T12:00:00Z", second], GYRO[:2], ACCEL[:2])
+
+
+@pytest.mark.parametrize("sign", [";", "\t"])
+def test_decimal_commas_are_read_where_they_separate_nothing(tmp_path: Path, sign: str) -> None:
+    names = ["t_s", "gx", "gy", "gz", "ax", "ay", "az"]
+    stamps = [seconds(ns) for ns in STAMPS]
+    plain, _ = read(tmp_path / "plain.csv", names, stamps)
+    lines = (tmp_path / "plain.csv").read_text().replace(",", sign).replace(".", ",")
+    (tmp_path / "commas.csv").write_text(lines)
+    found = read_imu_csv(tmp_path / "commas.csv", Notes("ride"))
+    for name in ("stamps_ns", "gyro_rad_s", "accel_m_s2"):
+        assert np.array_equal(getattr(found, name), getattr(plain, name))
+
+
+def test_a_comma_that_may_part_thousands_is_no_decimal_one(tmp_path: Path) -> None:
+    (tmp_path / "imu.csv").write_text("t_s;gx;gy;gz;ax;ay;az\n1;0;0;0;1,234;0;9,810\n2;0;0;0;1,234;0;9,810\n")
+    with pytest.raises(DataError, match="line 2: expected numbers"):
+        read_imu_csv(tmp_path / "imu.csv", Notes("ride"))
