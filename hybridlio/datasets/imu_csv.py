@@ -12,14 +12,14 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.sensors import ImuSamples
 from hybridlio.datasets.csv_rows import read_csv
 from hybridlio.datasets.csv_times import ColumnError
-from hybridlio.datasets.imu_columns import STANDARD_GRAVITY_M_S2, ImuColumns, imu_columns
+from hybridlio.datasets.imu_columns import STANDARD_GRAVITY_M_S2, imu_columns
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.stamps import IMU_GAP_FACTOR, note_gaps, sorted_unique
 
 _PLAUSIBLE_FORCE_M_S2 = (5.0, 20.0)  # of the median: half to twice gravity; values in g (1) or mm/s² (9810) are outside
 _MAX_RATE_RAD_S = 6.0  # 95 % quantile; a turn per second is beyond vehicles and hands, but 6 °/s taken for rad/s is not
 _NO_RATE_RAD_S = 35.0  # 95 % quantile: 2000 °/s, the full scale of usual gyroscopes, so the unit is °/s
-ONE_G = (0.8, 1.25)  # of the median force: gravity in g, and some motion
+_ONE_G = (0.8, 1.25)  # of the median force: gravity in g, and some motion
 _STEPS_NS = (500_000, 400_000_000)  # between samples, 2.5 Hz to 2 kHz: units are 1000 apart, so at most one fits
 _IMPOSSIBLE = 1e6  # in m/s² or rad/s, and in units that are mistaken for them: damaged numbers, which would overflow
 _EXPECTED = (
@@ -58,30 +58,38 @@ def read_imu_csv(path: Path, notes: Notes) -> ImuSamples:
             values[k] = [float(row[column]) * (scale or 1.0) for column, scale in columns.values]
         except (ValueError, InvalidOperation, OverflowError):
             raise DataError(f"{path}, line {line}: expected numbers, found {','.join(row)[:80]}") from None
+    units = [scale is not None for _, scale in columns.values]
+    stated = any(units[:3]), any(units[3:])
     stamps = columns.time.stamps(times, _STEPS_NS, "samples", str(path), notes)
-    return clean_imu(str(path), stamps, _in_si_units(path, values, columns, notes), notes)
+    return clean_imu(str(path), stamps, in_si_units(str(path), values, notes, stated), notes)
 
 
 @np.errstate(over="ignore")  # damaged files hold any number
-def _in_si_units(path: Path, values: Array, columns: ImuColumns, notes: Notes) -> Array:
-    """Return the values in rad/s and m/s², where the header gives no unit and the values leave no doubt."""
+def in_si_units(source: str, values: Array, notes: Notes, stated: tuple[bool, bool] = (False, False)) -> Array:
+    """Return values ``(S, 6)`` in rad/s and m/s², where no unit is stated and the values leave no doubt; noted.
+
+    Args:
+        source: the file or topic, for messages.
+        values: ``(S, 6)`` angular velocities and specific forces.
+        notes: receives the notes.
+        stated: whether the unit of the velocities, and of the forces, is stated.
+    """
     finite = values[np.isfinite(values).all(axis=1)]
     if not len(finite):
         return values
     factors = np.ones(6)
     force = float(np.median(np.linalg.norm(finite[:, 3:], axis=1)))
     rate = float(np.quantile(np.linalg.norm(finite[:, :3], axis=1), 0.95))
-    stated = [scale is not None for _, scale in columns.values]
     for unit, size in (("g", 1.0), ("mg", 1000.0)):
-        if not any(stated[3:]) and ONE_G[0] * size < force < ONE_G[1] * size:
+        if not stated[1] and _ONE_G[0] * size < force < _ONE_G[1] * size:
             factors[3:] = STANDARD_GRAVITY_M_S2 / size
             notes.corrected(
-                f"{path}: the median specific force is {force:.3g}: read in {unit}; columns in m/s² have 9.8 there"
+                f"{source}: the median specific force is {force:.3g}: read in {unit}; in m/s² it is near 9.8"
             )
-    if not any(stated[:3]) and rate > _NO_RATE_RAD_S:
+    if not stated[0] and rate > _NO_RATE_RAD_S:
         factors[:3] = np.pi / 180
         notes.corrected(
-            f"{path}: angular velocities reach {rate:.0f}: read in °/s, as that many rad/s exceed any gyroscope's range"
+            f"{source}: angular velocities reach {rate:.0f}: read in °/s, as so many rad/s exceed any gyroscope's range"
         )
     return values * factors
 
@@ -115,6 +123,6 @@ def clean_imu(source: str, stamps: Stamps, values: Array, notes: Notes) -> ImuSa
     rate = float(np.quantile(np.linalg.norm(values[:, :3], axis=1), 0.95))
     if rate > _MAX_RATE_RAD_S:
         notes.add(
-            f"{source}: angular velocities reach {rate:.0f} rad/s; check the unit (name columns gx_deg_s for °/s)"
+            f"{source}: angular velocities reach {rate:.0f} rad/s; check the unit (gx_deg_s names °/s in imu.csv)"
         )
     return ImuSamples(stamps, values[:, :3], values[:, 3:])

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from hybridlio.core.arrays import NS_PER_S, Stamps
 from hybridlio.core.errors import DataError
 from hybridlio.datasets.notes import Notes
+from hybridlio.datasets.points.likely_times import note_likely
 from hybridlio.datasets.points.whole_times import HOW_TO_STATE, readable, whole_ns
 
 Columns = Mapping[str, NDArray[Any]]
@@ -32,7 +33,6 @@ _NAMES = (
     *("point_timestamp", "toffset", "t_offset", "point_time", "point_time_offset", "rel_time", "reltime", "time_rel"),
     *("gps_time", "stamp"),
 )
-_LIKELY = ("time", "stamp", "offset", "delta", "nsec", "usec")  # parts of other names that may mean a time
 _SUFFIXES = {"_s": "s", "_sec": "s", "_ms": "ms", "_us": "us", "_ns": "ns", "_nsec": "ns"}
 
 _MAX_OFFSET_NS = NS_PER_S  # no lidar turns slower than once a second
@@ -161,18 +161,8 @@ def find_point_times(
             return _convention(name, values, step_ns, notes, stated)
         notes.add(f"point times: column '{name}' {fault}; not used")
     if not names:
-        _note_likely(list(samples[0][1]), notes)
+        note_likely(samples, step_ns, notes)
     return None
-
-
-def _note_likely(names: list[str], notes: Notes) -> None:
-    """Note columns that no known name means a time by, but whose names sound like one."""
-    likely = [name for name in names if any(part in name.lower() for part in _LIKELY)]
-    if likely:
-        notes.add(
-            f"point times: {' or '.join(repr(name) for name in likely)} may hold them, and is not used; "
-            f"'point_times: {{column: {likely[0]}}}' in calibration.yaml uses it"
-        )
 
 
 def _base(name: str) -> tuple[str, str | None]:

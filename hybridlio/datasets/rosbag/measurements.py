@@ -14,8 +14,7 @@ from hybridlio.core.geodesy import GeodeticPoint, check_geodetic, enu_from_geode
 from hybridlio.core.sensors import NS_PER_S, GpsFix, ImuSamples
 from hybridlio.core.tables import counted
 from hybridlio.datasets.gps_csv import assumed_where_unknown, usable_covariance
-from hybridlio.datasets.imu_columns import STANDARD_GRAVITY_M_S2
-from hybridlio.datasets.imu_csv import ONE_G, clean_imu
+from hybridlio.datasets.imu_csv import clean_imu, in_si_units
 from hybridlio.datasets.notes import Notes
 from hybridlio.datasets.rosbag.transforms import pose_of
 from hybridlio.datasets.rosbag.wire import Header
@@ -113,12 +112,7 @@ def imu_samples(log: Log, topic: str, notes: Notes) -> ImuSamples:
             f"{topic}: its messages say that they hold no {' and no '.join(absent)} (zeros, with a covariance of -1); "
             "choose another IMU by --imu-topic, or none by '--imu-topic none'"
         )
-    force = np.linalg.norm(values[:, 3:], axis=1)
-    median = float(np.median(force[np.isfinite(force)])) if np.isfinite(force).any() else 0.0
-    if ONE_G[0] < median < ONE_G[1]:
-        notes.corrected(f"{topic}: the median specific force is {median:.2f}, so it is in g; multiplied by 9.80665")
-        values[:, 3:] *= STANDARD_GRAVITY_M_S2
-    return clean_imu(topic, stamps[known], values[known], notes)
+    return clean_imu(topic, stamps[known], in_si_units(topic, values[known], notes), notes)
 
 
 def fix_values(message: Any) -> tuple[float, ...]:

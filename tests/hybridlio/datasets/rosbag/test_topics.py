@@ -164,7 +164,17 @@ class TestMeasurements:
     def test_forces_in_g_are_scaled_with_a_note(self, small: Any) -> None:
         sequence = open_sequence(small.write(small.clouds(), small.imu(factor=1 / 9.81), [small.mount()]))
         np.testing.assert_allclose(sequence.imu.accel_m_s2[:, 2], 9.80665)
-        assert any("/imu: the median specific force is 1.00, so it is in g" in note for note in sequence.notes)
+        assert any("/imu: the median specific force is 1: read in g" in note for note in sequence.notes)
+
+    def test_units_beyond_any_gyroscope_and_forces_in_mg_are_read_as_in_csv_files(self, small: Any) -> None:
+        imu = small.imu(factor=1000 / 9.81)
+        for _, _, _, message in imu:
+            message.angular_velocity.x = 90.0
+        sequence = open_sequence(small.write(small.clouds(), imu, [small.mount()]))
+        np.testing.assert_allclose(sequence.imu.accel_m_s2[:, 2], 9.80665)
+        np.testing.assert_allclose(sequence.imu.gyro_rad_s[:, 0], np.pi / 2)
+        for text in ("read in mg", "angular velocities reach 90: read in °/s"):
+            assert any(text in note for note in sequence.notes)
 
     def test_zero_stamps_are_replaced_by_times_of_receipt(self, small: Any) -> None:
         content = small.standard()
