@@ -51,6 +51,15 @@ class PathPoint:
             self.T_map_lidar @ initial.pose, None, True, covariance, self.map_changed, self.weak_covariance
         )
 
+    def added_since(self, before: PathPoint, initial: RelativePose) -> Array:
+        """Return the covariance ``(6, 6)`` that the step from the point before has added to the bridges' errors.
+
+        A chain of independent steps with these covariances has the same sum. Without an IMU the error of one velocity
+        is in all of them.
+        """
+        moved = se3.compose_covariance(before.bridge_covariance, initial.pose, np.zeros((6, 6)))
+        return self.bridge_covariance - moved
+
 
 def _sum_of_correlated(before: Array, step: RelativePose) -> Array:
     """Return a covariance ``(6, 6)`` of a pose after a step that no correlation of the two exceeds.

@@ -188,8 +188,9 @@ class ScanMatching:
 
     def _bridge(self, scan: ThinnedScan, initial: RelativePose, observed: ObservedRegistration | None) -> RelativePose:
         """Move the state on by the initial pose and return that pose as a failed step."""
-        first = scan.points if self._map.surface is None else None  # no scan so far had planes to match
-        self._state = self._state.bridged(initial, first)
+        before = self._state.current
+        self._state = self._state.bridged(initial, scan.points if self._map.surface is None else None)  # no planes yet
+        added = initial.covariance if initial.from_imu else self._state.current.added_since(before, initial)
         drift = self._drift(_FLOOR_COVARIANCE, map_changed=False)
         details = {"points": float(len(scan.points)), **(observed.registration.diagnostics if observed else {})}
         self._state = replace(self._state, unmatched=self._state.unmatched + (observed is not None))
@@ -199,7 +200,7 @@ class ScanMatching:
             self._state = self._state.restarted(scan.points)
             details[NEW_MAP] = 1.0
         return RelativePose(
-            initial.pose, initial.covariance, initial.source,
+            initial.pose, added, initial.source,
             ok=False, from_imu=initial.from_imu, drift=drift, details=details,
         )  # fmt: skip
 

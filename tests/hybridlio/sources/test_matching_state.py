@@ -111,3 +111,17 @@ def test_a_state_placed_by_two_poses_moves_on_by_their_twist():
     np.testing.assert_array_equal(state.current.T_map_lidar, STEP)
     assert state.current.map_changed
     assert state.keyframe is POINTS
+
+
+def test_independent_steps_with_what_bridges_add_sum_up_to_errors_that_are_all_one(matched: MatchingState):
+    """Ten steps at a velocity whose error lasts are off by ten times that of one; independent ones by √10 of it."""
+    straight = RelativePose(se3.exp([0.0, 0.0, 0.0, 0.4, 0.0, 0.0]), np.diag([1e-12] * 3 + [1e-2] * 3), "velocity")
+    chained, point, bridge = np.zeros((6, 6)), matched.current, matched
+    for _ in range(10):
+        bridge = bridge.bridged(straight)
+        added = bridge.current.added_since(point, straight)
+        assert np.linalg.eigvalsh(added).min() > 0
+        chained = se3.compose_covariance(chained, straight.pose, added)
+        point = bridge.current
+    np.testing.assert_allclose(chained, point.bridge_covariance, atol=1e-12)
+    np.testing.assert_allclose(np.sqrt(np.diag(chained)[3:]), 10 * 0.1, rtol=1e-3)
