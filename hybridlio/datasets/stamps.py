@@ -70,7 +70,8 @@ def read_stamps(path: Path) -> Stamps:
     known = stamps[stamps != MISSING_STAMP]
     if parse is int and len(known) > 1 and 0 < np.median(np.abs(np.diff(known))) < _MIN_WHOLE_STEP_NS:
         raise DataError(
-            f"{path}: whole numbers are read as nanoseconds, but these are under 1 µs apart; write seconds as 1.0"
+            f"{path}: whole numbers are read as nanoseconds, but these are under 1 µs apart; write nanoseconds, or "
+            "seconds as 1.0"
         )
     return stamps
 

@@ -26,7 +26,7 @@ Columns = Mapping[str, NDArray[Any]]
 UNITS_NS = {"s": NS_PER_S, "ms": 1_000_000, "us": 1000, "ns": 1}
 NORMALISED = "normalised"
 ORIGINS = ("stamp", "absolute", "start", "middle", "end")
-# in order of preference; lower case, without a suffix that names the unit
+# in order of preference; lower case, without a suffix that names the unit; compared without underscores
 _NAMES = (
     *("t", "time", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset", "timeoffset", "ts", "offset"),
     *("relative_time", "time_relative", "relative_timestamp", "dt", "delta_t", "delta_time", "utime"),
@@ -125,7 +125,8 @@ class PointTimes:
 
 def time_columns(names: Sequence[str]) -> list[str]:
     """Return those of the column names that mean a point's time, the most usual first."""
-    ranks = {name: _NAMES.index(base) for name in names if (base := _base(name)[0]) in _NAMES}
+    known = [name.replace("_", "") for name in _NAMES]
+    ranks = {name: known.index(base) for name in names if (base := _base(name)[0].replace("_", "")) in known}
     return sorted(ranks, key=lambda name: ranks[name])
 
 

@@ -168,6 +168,11 @@ def test_every_usual_name_is_recognised_also_with_its_unit() -> None:
     usual = ["t", "time", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset", "ts", "offset"]
     assert set(time_columns([*usual, "x", "ring", "intensity", "tag"])) == set(usual)
     assert time_columns(["offset_ns", "Timestamp", "T", "tx"]) == ["T", "Timestamp", "offset_ns"]
+    assert set(time_columns(["GpsTime", "PointTime", "OffsetTime_us", "timer"])) == {
+        "GpsTime",
+        "PointTime",
+        "OffsetTime_us",
+    }
     found, _ = find([SWEEP // 1000], "offset_us", stamps=STAMPS[:1], step_ns=None)
     assert found == PointTimes("offset_us", 1000, "stamp")
 
