@@ -122,3 +122,25 @@ def flagged(points: Array, low: Array, side_m: float, most: Array, table: NDArra
             block = block * (np.int64(most[j]) + 1) + cell
         out[i] = table[block]
     return out
+
+
+@compiled
+def merge(rows: Keys, index: Keys, distance2: Array, more: Keys, more2: Array) -> None:
+    """Merge nearest points of some of the rows with others, in place; both in ascending order.
+
+    Args:
+        rows: ``(R,)`` numbers of the rows.
+        index, distance2: ``(N, K)`` points and their squared distances.
+        more, more2: ``(R, K)`` the others.
+    """
+    count = index.shape[1]
+    kept, kept2 = np.empty(count, np.int64), np.empty(count)
+    for r in range(len(rows)):
+        row, a, b = rows[r], 0, 0
+        for k in range(count):
+            if more2[r, b] < distance2[row, a]:
+                kept[k], kept2[k], b = more[r, b], more2[r, b], b + 1
+            else:
+                kept[k], kept2[k], a = index[row, a], distance2[row, a], a + 1
+        for k in range(count):
+            index[row, k], distance2[row, k] = kept[k], kept2[k]

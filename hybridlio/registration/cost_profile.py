@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 from hybridlio.core.arrays import Array
 from hybridlio.registration.information import UNKNOWN_SIGMA_M
 
-# Displacement h of the parabola: larger than the spacing of map points, so that points find other neighbours there.
+# Displacement h of the parabola at the default kernel: larger than the spacing of map points, so that points find other
+# neighbours there.
 PROBE_STEP_M = 0.5
 # Rise over scatter of an observed direction. On simulated drives smooth walls stayed at or below 3.5, and an open field
 # with bushes was at 6 or more.
@@ -44,22 +45,23 @@ _SHARED_ERROR_SCALE = 2.0
 _UNINFORMATIVE_SHARE = 0.9
 
 
-def parabola_minimum(rises_back: Array, rises_ahead: Array) -> tuple[float, float]:
+def parabola_minimum(rises_back: Array, rises_ahead: Array, step_m: float = PROBE_STEP_M) -> tuple[float, float]:
     """Return the offset of the cost's minimum, metres, and its standard deviation.
 
     Args:
-        rises_back, rises_ahead: ``(N,)``, ``(M,)`` rises of the points' costs :data:`PROBE_STEP_M` to either side.
+        rises_back, rises_ahead: ``(N,)``, ``(M,)`` rises of the points' costs ``step_m`` to either side.
+        step_m: the displacement h.
 
     Returns:
-        both, the offset at most :data:`PROBE_STEP_M` either way. For an unobserved direction the standard deviation is
+        both, the offset at most ``step_m`` either way. For an unobserved direction the standard deviation is
         infinite, and the offset is 0, or a whole step towards a side on which costs fall clearly.
     """
     rise = float(rises_back.sum() + rises_ahead.sum())
     scatter = float(np.sqrt(rises_back @ rises_back + rises_ahead @ rises_ahead))
     if rise <= _OBSERVED_RATIO * scatter:
-        return PROBE_STEP_M * (_falls(rises_ahead) - _falls(rises_back)), np.inf
-    offset_m = PROBE_STEP_M * float(rises_back.sum() - rises_ahead.sum()) / (2 * rise)
-    return float(np.clip(offset_m, -PROBE_STEP_M, PROBE_STEP_M)), PROBE_STEP_M * scatter / (2 * rise)
+        return step_m * (_falls(rises_ahead) - _falls(rises_back)), np.inf
+    offset_m = step_m * float(rises_back.sum() - rises_ahead.sum()) / (2 * rise)
+    return float(np.clip(offset_m, -step_m, step_m)), step_m * scatter / (2 * rise)
 
 
 def _falls(rises: Array) -> bool:

@@ -8,6 +8,11 @@ are minimised again, and a parabola through the three costs gives the minimum, i
 deviation (:mod:`hybridlio.registration.cost_profile`). If the start is not known to a decimetre, costs up to two metres
 away are weighed as likelihoods.
 
+Half a metre is five default kernels. In rooms the kernel is half as wide, and points are matched within a quarter of a
+metre: points of floor and ceiling lost their neighbours half a metre away and did not count, and the ends of what had
+been seen of the walls looked like structure. So the probe's lengths shrink with the kernel, and neighbours count twice
+as far away as it reaches.
+
 A lidar's own pattern looks like structure: where its rings fall on the ground, and the offset of each beam, are the
 same in every scan. A scan therefore fits a single other scan best where it has not moved at all; between smooth walls
 such minima were up to twelve times as deep as their scatter. A minimum within half a metre of the only other scan is
@@ -72,6 +77,16 @@ class RegistrationProblem:
     settings: RegistrationSettings
     dense_source: Array | None = None
     only_scan_pose: Array | None = None
+
+    @property
+    def probe_scale(self) -> float:
+        """Of the lengths of a probe: one at the default kernel, smaller in rooms, where the kernel is."""
+        return self.settings.kernel_m / RegistrationSettings().kernel_m
+
+    @property
+    def reach_m(self) -> float:
+        """How far neighbours count for a probe: a point that is displaced from its plane is farther away than that."""
+        return max(self.settings.max_distance_m, 2 * PROBE_STEP_M * self.probe_scale)
 
     def neighbours(self) -> MixedNeighbours:
         """Return the source's neighbours on the surface, to be followed from a pose."""
@@ -208,7 +223,7 @@ class _Probe:
             if not minima.offsets_m.any():
                 break
             found = self._register_strong(found.pose @ se3.exp(minima.offsets_m @ minima.tangents))
-            if np.abs(minima.offsets_m).max() < _SETTLED_M:
+            if np.abs(minima.offsets_m).max() < _SETTLED_M * self.problem.probe_scale:
                 break
             minima = self._parabolas(found)
         return found, minima
@@ -228,7 +243,9 @@ class _Probe:
     def may_match_itself(self, pose: Array) -> bool:
         """Whether a scan at this pose is so near the only other scan that the lidar's pattern matches itself."""
         only = self.problem.only_scan_pose
-        return only is not None and bool(np.linalg.norm(pose[:3, 3] - only[:3, 3]) < _SELF_MATCH_M)
+        if only is None:
+            return False
+        return bool(np.linalg.norm(pose[:3, 3] - only[:3, 3]) < _SELF_MATCH_M * self.problem.probe_scale)
 
     def refine_by_points(
         self, found: Registration, sigmas_m: Array, is_observed: NDArray[np.bool_]
@@ -247,7 +264,7 @@ class _Probe:
         near, other = (self._register_by_points(found.pose, way, narrow_m) for way in (1.0, -1.0))
         to_weak = (self.basis / self.to_tangent[:, None]).T
         apart_m, moved_m = (to_weak @ se3.log(se3.between(near.pose, pose)) for pose in (other.pose, found.pose))
-        if np.abs(apart_m).max() > narrow_m or np.abs(moved_m).max() > PROBE_STEP_M:
+        if np.abs(apart_m).max() > narrow_m or np.abs(moved_m).max() > PROBE_STEP_M * self.problem.probe_scale:
             return of_parabola
         noise = self.problem.surface.normal_noise.mean
         covariance = covariance_of(near.hessian, near.sigma_m, _POINT_VARIANCE_SCALE, found.lever_arms_m, noise)
@@ -263,12 +280,13 @@ class _Probe:
 
     def _parabolas(self, found: Registration) -> _Minima:
         costs_here, count = self._costs(found.pose), self.basis.shape[1]
+        step_m = PROBE_STEP_M * self.problem.probe_scale
         minima = _Minima(np.empty(count), np.empty((count, 6)), np.empty(count))
         for i, direction in enumerate((self.to_tangent[:, None] * self.basis).T):
-            back, rises_back = self._displace(found.pose, costs_here, -PROBE_STEP_M * direction)
-            ahead, rises_ahead = self._displace(found.pose, costs_here, PROBE_STEP_M * direction)
-            minima.tangents[i] = se3.log(se3.between(back, ahead)) / (2 * PROBE_STEP_M)
-            minima.offsets_m[i], minima.sigmas_m[i] = parabola_minimum(rises_back, rises_ahead)
+            back, rises_back = self._displace(found.pose, costs_here, -step_m * direction)
+            ahead, rises_ahead = self._displace(found.pose, costs_here, step_m * direction)
+            minima.tangents[i] = se3.log(se3.between(back, ahead)) / (2 * step_m)
+            minima.offsets_m[i], minima.sigmas_m[i] = parabola_minimum(rises_back, rises_ahead, step_m)
         return minima
 
     def _register_strong(self, pose: Array) -> Registration:
@@ -280,10 +298,10 @@ class _Probe:
         settings = replace(self.problem.settings, max_iterations=_PROBE_ITERATIONS)
         neighbours = self.problem.neighbours()
         there = register_neighbours(neighbours, pose @ se3.exp(xi), settings, fixed=self.basis).pose
-        rises = neighbours.costs(there, settings.kernel_m, settings.max_distance_m) - costs_here
+        rises = neighbours.costs(there, settings.kernel_m, self.problem.reach_m) - costs_here
         return there, np.asarray(rises[~np.isnan(rises)])  # points matched at both poses
 
     def _costs(self, pose: Array) -> Array:
         """Return the robust cost of each point ``(N,)``, between 0 and 1; NaN where it has no neighbour."""
         settings = self.problem.settings
-        return self.neighbours.costs(pose, settings.kernel_m, settings.max_distance_m)
+        return self.neighbours.costs(pose, settings.kernel_m, self.problem.reach_m)

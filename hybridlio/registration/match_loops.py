@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from hybridlio.cloud.compiled import compiled
@@ -13,6 +15,20 @@ THIN_PLANE_WEIGHT = 0.9
 # Sine of the angle under which the lidar may seem to be behind a plane that it sees: twice the usual tilt of normals,
 # 0.045 rad (hybridlio/registration/information.py).
 _LARGEST_FROM_BEHIND = 0.1
+
+
+class Candidates(NamedTuple):
+    """The points of a surface among which the nearest stays while a query moves.
+
+    Attributes:
+        nearest: ``(N, K)`` indices of the K nearest points of each query, the nearest first.
+        own_m: ``(N,)`` how far the query may move with the same nearest point.
+        reach_m: ``(N,)`` how far it may move with its nearest point among the K.
+    """
+
+    nearest: Index
+    own_m: Array
+    reach_m: Array
 
 
 @compiled
@@ -49,14 +65,26 @@ def near(
 
 
 @compiled
-def stale(pose: Array, source: Array, searched: Array, margin_m: Array) -> tuple[Index, Array]:
-    """Return the points ``(K,)`` that have moved by their margin or more, and where they are now ``(K, 3)``.
+def follow(
+    pose: Array,
+    source: Array,
+    searched: Array,
+    candidates: Candidates,
+    points: Array,
+    index: Index,
+) -> tuple[Index, Array]:
+    """Take the neighbours at a pose from their candidates; return the points ``(K,)`` that have moved too far for that.
 
     Args:
         pose: ``(4, 4)``.
         source: ``(N, 3)`` scan frame.
         searched: ``(N, 3)`` where each point was when its neighbour was searched; for the returned ones it is updated.
-        margin_m: ``(N,)``.
+        candidates: of all points, where they were searched.
+        points: ``(M, 3)`` of the surface.
+        index: ``(N,)`` of the neighbours; updated for the points that are not returned.
+
+    Returns:
+        those points, and where they are now ``(K, 3)``.
     """
     which, queries, count = np.empty(len(source), np.int64), np.empty(source.shape), 0
     for i in range(len(source)):
@@ -65,9 +93,20 @@ def stale(pose: Array, source: Array, searched: Array, margin_m: Array) -> tuple
             moved = pose[row, 0] * source[i, 0] + pose[row, 1] * source[i, 1] + pose[row, 2] * source[i, 2]
             queries[count, row] = moved + pose[row, 3]
             squared += (queries[count, row] - searched[i, row]) ** 2
-        if squared >= margin_m[i] ** 2:
+        if squared >= candidates.reach_m[i] ** 2:
             which[count], searched[i] = i, queries[count]
             count += 1
+            continue
+        index[i] = candidates.nearest[i, 0]
+        if squared < candidates.own_m[i] ** 2:
+            continue
+        least = np.inf
+        for k in candidates.nearest[i]:
+            distance2 = 0.0
+            for row in range(3):
+                distance2 += (queries[count, row] - points[k, row]) ** 2
+            if distance2 < least:
+                least, index[i] = distance2, k
     return which[:count].copy(), queries[:count].copy()
 
 

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from hybridlio.cloud.kd_tree import GrowingKdTree
-from hybridlio.registration.surface import Surface
+from hybridlio.core import se3
+from hybridlio.registration.surface import Neighbours, Surface
 
 
 def brute(points: np.ndarray, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -30,22 +31,28 @@ def test_an_extended_tree_finds_what_one_tree_over_all_points_finds(
     index, nearest2 = tree.nearest(queries, threads)
     np.testing.assert_array_equal(index, order[:, 0])
     np.testing.assert_allclose(nearest2, distance2[:, 0], rtol=1e-9)
-    index, first2, second2 = tree.two_nearest(queries, threads)
-    np.testing.assert_array_equal(index, order[:, 0])
-    np.testing.assert_allclose(first2, distance2[:, 0], rtol=1e-9)
-    others2 = distance2[:, 1] if sizes[-1] > 1 else np.full(len(queries), np.inf)
-    np.testing.assert_allclose(np.minimum(second2, 1.0), np.minimum(others2, 1.0), rtol=1e-9)
-    assert (second2 <= others2 * (1 + 1e-9)).all()
+    count = 3
+    more = np.full((len(queries), count), np.inf)
+    distance2 = np.column_stack([distance2, more])[:, : count + 1]
+    index, found2, others2 = tree.several_nearest(queries, count, threads)
+    np.testing.assert_array_equal(index[:, 0], order[:, 0])
+    np.testing.assert_allclose(found2[:, 0], distance2[:, 0], rtol=1e-9)
+    np.testing.assert_allclose(np.minimum(found2, 1.0), np.minimum(distance2[:, :count], 1.0), rtol=1e-9)
+    known = np.isfinite(found2)
+    to_found2 = ((queries[:, None] - points[index]) ** 2).sum(axis=2)
+    np.testing.assert_allclose(found2[known], to_found2[known], rtol=1e-9)
+    assert (others2 <= distance2[:, count - 1] * (1 + 1e-9)).all()
+    np.testing.assert_allclose(np.minimum(others2, 1.0), np.minimum(distance2[:, count - 1], 1.0), rtol=1e-9)
 
 
 def test_extending_a_tree_leaves_it_unchanged(rng: np.random.Generator):
     points, queries = rng.uniform(-10, 10, (300, 3)), rng.uniform(-10, 10, (50, 3))
     first = GrowingKdTree(points[:200], 1)
     once = first.extended(points[:250], 1)
-    before = [tree.two_nearest(queries, 1) for tree in (first, once)]
+    before = [tree.several_nearest(queries, 3, 1) for tree in (first, once)]
     once.extended(points, 1)
     for tree, found in zip((first, once), before, strict=True):
-        for now, then in zip(tree.two_nearest(queries, 1), found, strict=True):
+        for now, then in zip(tree.several_nearest(queries, 3, 1), found, strict=True):
             np.testing.assert_array_equal(now, then)
     assert [len(first), len(once), len(once.extended(points, 1))] == [200, 250, 300]
     assert [tree.appended_ratio for tree in (first, once)] == [0.0, 0.25]
@@ -61,7 +68,33 @@ def test_an_extended_surface_equals_one_built_from_all_points(rng: np.random.Gen
     np.testing.assert_array_equal(grown.normals, normals)
     np.testing.assert_array_equal(grown.planes(np.arange(500)), whole.planes(np.arange(500)))
     queries = points + 0.1 * rng.standard_normal((500, 3))
-    (index, free), (grown_index, grown_free) = (surface.nearest_with_margin(queries, 1) for surface in (whole, grown))
-    np.testing.assert_array_equal(index, grown_index)
-    assert (grown_free <= free + 1e-12).all()
-    assert np.mean(grown_free > free - 1e-12) > 0.5
+    all_at_once, by_parts = (surface.candidates(queries, 1) for surface in (whole, grown))
+    np.testing.assert_array_equal(all_at_once.nearest[:, 0], by_parts.nearest[:, 0])
+    for free, grown_free in ((all_at_once.own_m, by_parts.own_m), (all_at_once.reach_m, by_parts.reach_m)):
+        assert (grown_free <= free + 1e-12).all()
+        assert np.mean(grown_free > free - 1e-12) > 0.5
+
+
+def test_a_tree_that_is_searched_often_becomes_one_when_it_is_extended(rng: np.random.Generator):
+    points, queries = rng.uniform(-10, 10, (400, 3)), rng.uniform(-10, 10, (300, 3))
+    seldom, often = (GrowingKdTree(points[:300], 1).extended(points[:350], 1) for _ in range(2))
+    often.nearest(queries, 1)
+    assert (often.appended_ratio, seldom.appended_ratio) == (50 / 300, 50 / 300)
+    for tree, settled in ((seldom, 300), (often, 400)):
+        grown = tree.extended(points, 1)
+        assert grown.__getstate__()[2] == settled
+        assert grown.appended_ratio == 100 / 300  # since it was made
+        np.testing.assert_array_equal(grown.nearest(queries, 1)[0], brute(points, queries)[0][:, 0])
+
+
+def test_neighbours_that_are_followed_are_the_nearest_at_every_pose(rng: np.random.Generator):
+    """Over moves of millimetres to decimetres, back and forth, with and without a search."""
+    points, source = rng.uniform(-2, 2, (1500, 3)), rng.uniform(-2, 2, (400, 3))
+    normals = rng.standard_normal((1500, 3))
+    surface = Surface(points[:1400], normals[:1400]).extended(points[1400:], normals[1400:])
+    neighbours = Neighbours(surface, source, 1)
+    for size in (0.0, 0.003, 0.01, 0.03, 0.1, 0.03, 0.3, 0.01):
+        pose = se3.exp(size * rng.standard_normal(6))
+        index, kept = neighbours.within(pose, 10.0)
+        np.testing.assert_array_equal(kept, source)
+        np.testing.assert_array_equal(index, brute(points, se3.transform(pose, source))[0][:, 0])

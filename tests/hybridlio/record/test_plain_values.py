@@ -77,7 +77,7 @@ def test_a_growing_tree_finds_the_same_points_again(rng: np.random.Generator) ->
     tree = GrowingKdTree(points[:300], 1).extended(points, 1)
     found = decode(encode(tree))
     queries = rng.normal(size=(50, 3)) * 10
-    for a, b in zip(tree.two_nearest(queries, 1), found.two_nearest(queries, 1), strict=True):
+    for a, b in zip(tree.several_nearest(queries, 3, 1), found.several_nearest(queries, 3, 1), strict=True):
         assert np.array_equal(a, b)
     assert found.appended_ratio == tree.appended_ratio
 

@@ -21,8 +21,10 @@ from weak_scenes import (
 
 from hybridlio.core import se3
 from hybridlio.registration.cost_profile import PROBE_STEP_M
-from hybridlio.registration.degeneracy import ObservedRegistration
+from hybridlio.registration.degeneracy import ObservedRegistration, RegistrationProblem, register_with_degeneracy
 from hybridlio.registration.icp import register
+from hybridlio.registration.settings import RegistrationSettings
+from hybridlio.registration.surface import Surface
 
 DRAWS = range(6)
 
@@ -99,3 +101,27 @@ def test_a_right_start_between_trunks_is_kept(rng: np.random.Generator):
     surface, source, points = between_trunks(rng)
     observed = observe(surface, source, TRUTH, 0.1, dense=points)
     assert np.abs(error(observed)[3:5]).max() < 0.02
+
+
+def shrunk(seed: int, factor: float) -> ObservedRegistration:
+    """Register a scan of a corridor with eight bushes whose lengths, noise and settings are all times a factor."""
+    rng = np.random.default_rng(seed)
+    where = np.column_stack([rng.uniform(-22, 22, 8), rng.uniform(-3, 3, 8)])
+    surface = noisy_surface(rng, joined(bend(rng, 1e6, 6000), bushes(rng, where, 60)), 0.03)
+    source = scan(rng, joined(bend(rng, 1e6, 3000), bushes(rng, where, 16)))
+    start = off_by(0.2)
+    start[:3, 3] *= factor
+    settings = RegistrationSettings(factor * SETTINGS.kernel_m, factor * SETTINGS.max_distance_m, threads=1)
+    surface = Surface(factor * surface.points, surface.normals, 1)
+    return register_with_degeneracy(RegistrationProblem(surface, factor * source, settings), start)
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.25])
+def test_a_scene_that_is_smaller_is_observed_as_well_and_more_precisely(factor: float):
+    """Probes shrink with the kernel; half a metre in every scene is too far to see what a small one observes."""
+    for seed in DRAWS[:3]:
+        whole, small = shrunk(seed, 1.0), shrunk(seed, factor)
+        np.testing.assert_array_equal(small.is_observed, whole.is_observed)
+        np.testing.assert_allclose(small.weak_sigmas_m, factor * whole.weak_sigmas_m, rtol=0.1)
+        moved = small.registration.pose[:3, 3] - factor * whole.registration.pose[:3, 3]
+        assert np.abs(moved).max() < 0.002
