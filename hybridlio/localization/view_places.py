@@ -19,8 +19,8 @@ from hybridlio.localization.fusion import UncertainPose
 from hybridlio.localization.map_matching import MapMatch, MapMatchingSettings, match_with_map
 from hybridlio.localization.map_surface import MapSurface
 from hybridlio.localization.viewpoints import Eye, Viewpoints, ground_m
-from hybridlio.registration.icp import Registration
 from hybridlio.registration.motion_search import CoarseSearch, refine_best
+from hybridlio.registration.results import Registration
 from hybridlio.smoothing.place_recognition import DescriptorSettings, descriptor_spectrum, place_descriptor
 from hybridlio.smoothing.places import levelling_rotations
 from hybridlio.sources.thinned_scan import ThinnedScan

@@ -18,6 +18,12 @@ same in every scan. A scan therefore fits a single other scan best where it has 
 such minima were up to twelve times as deep as their scatter. A minimum within half a metre of the only other scan is
 ignored.
 
+In rooms, what observes a weak direction is mostly a few points of planes, such as the floor's. Some kernels away their
+cost hardly changes any more, and a parabola through such costs has its minimum where the pose is, whatever centimetres
+are missing. So there Gauss-Newton steps along the observed directions end the registration, and the Hessian gives their
+standard deviations. In streets a few trunks and bushes observe them, whose planes are what cannot be trusted, and of a
+lidar that does not repeat its pattern single scans are too sparse: an office with a rosette got ten times worse.
+
 On open ground, where all three horizontal directions are weak and observed, a last registration matches thick objects
 point by point (:mod:`hybridlio.registration.point_to_point`), with a kernel too narrow to find the minimum by itself.
 """
@@ -32,9 +38,10 @@ from numpy.typing import NDArray
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.registration.cost_profile import OFFSETS_M, PROBE_STEP_M, parabola_minimum, weigh_offsets
-from hybridlio.registration.icp import Registration, register, register_neighbours
+from hybridlio.registration.icp import register, register_neighbours
 from hybridlio.registration.information import UNKNOWN_SIGMA_M, covariance_of, weak_basis
 from hybridlio.registration.point_to_point import MixedNeighbours
+from hybridlio.registration.results import ObservedRegistration, Registration
 from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Surface
 
@@ -70,6 +77,7 @@ class RegistrationProblem:
         settings: of the registration.
         dense_source: ``(M, 3)`` more of the scan's points, for point-to-point matches; None for ``source``.
         only_scan_pose: ``(4, 4)`` pose of the single scan of which the surface is made; None for several scans.
+        has_rooms_planes: what observes a weak direction is planes of a room, seen densely.
     """
 
     surface: Surface
@@ -77,6 +85,7 @@ class RegistrationProblem:
     settings: RegistrationSettings
     dense_source: Array | None = None
     only_scan_pose: Array | None = None
+    has_rooms_planes: bool = False
 
     @property
     def probe_scale(self) -> float:
@@ -91,79 +100,6 @@ class RegistrationProblem:
     def neighbours(self) -> MixedNeighbours:
         """Return the source's neighbours on the surface, to be followed from a pose."""
         return MixedNeighbours(self.surface, self.source, self.settings.threads)
-
-
-@dataclass(frozen=True, eq=False)
-class ObservedRegistration:
-    """A registration, and which of its weak directions are observed.
-
-    Attributes:
-        registration: along unobserved directions its pose is the initial one.
-        weak_basis: ``(6, D)`` the weak directions, orthonormal in the units of
-            :func:`hybridlio.registration.information.scaled_spectrum`; D is 0 in most scenes.
-        weak_tangents: ``(D, 6)`` tangent vectors: change of the pose for each metre along a weak direction. Between
-            curved walls it includes a rotation.
-        is_observed: ``(D,)``.
-        weak_sigmas_m: ``(D,)`` standard deviations along them, 10 m where unknown.
-        normal_noise: spurious share of the surface's information.
-    """
-
-    registration: Registration
-    weak_basis: Array
-    weak_tangents: Array
-    is_observed: NDArray[np.bool_]
-    weak_sigmas_m: Array
-    normal_noise: float
-
-    @property
-    def degenerate(self) -> Array:
-        """``(U, 6)`` unit tangent directions that are not observed."""
-        unobserved = self.weak_tangents[~self.is_observed]
-        return np.asarray(unobserved / np.linalg.norm(unobserved, axis=1, keepdims=True))
-
-    def within_coverage(self, coverage: float) -> ObservedRegistration:
-        """As :meth:`hybridlio.registration.icp.Registration.within_coverage`."""
-        return replace(self, registration=self.registration.within_coverage(coverage))
-
-    def covariance(self, scale: float) -> Array:
-        """Return ``(6, 6)`` rad² and m², rotation first: from the Hessian in strong directions, from costs in weak
-        ones.
-
-        Args:
-            scale: ratio of the strong directions' covariance to that of independent residuals.
-        """
-        found = self.registration
-        strong = covariance_of(
-            found.hessian, found.sigma_m, scale, found.lever_arms_m, self.normal_noise, fixed=self.weak_basis
-        )
-        weak = self.weak_tangents * np.minimum(self.weak_sigmas_m, UNKNOWN_SIGMA_M)[:, None]
-        return np.asarray(strong + weak.T @ weak)
-
-    def weighed_with(self, start: Array, predicted: Array) -> tuple[Array, Array]:
-        """Return the pose ``(4, 4)`` with its weak directions weighed with a prediction, and their covariance.
-
-        Along a direction that few points observe, the cost's minimum scatters by centimetres from scan to scan, while
-        an IMU knows a step to millimetres. As in a Kalman filter each counts by its information. Strong directions are
-        left to the registration.
-
-        Args:
-            start: ``(4, 4)`` the predicted pose.
-            predicted: ``(6, 6)`` its covariance relative to the surface.
-
-        Returns:
-            the registration's own pose and zeros where no direction is weak.
-        """
-        pose = self.registration.pose
-        if not self.weak_basis.shape[1]:
-            return pose, np.zeros((6, 6))
-        from_tangent = np.r_[self.registration.lever_arms_m, 1.0, 1.0, 1.0]
-        to_weak = (self.weak_basis * from_tangent[:, None]).T
-        moved_m = to_weak @ se3.log(se3.between(start, pose))
-        known = to_weak @ predicted @ to_weak.T
-        gain = known @ np.linalg.inv(known + np.diag(self.weak_sigmas_m**2))
-        remaining = known - gain @ known
-        back = (gain @ moved_m - moved_m) @ self.weak_tangents
-        return pose @ se3.exp(back), self.weak_tangents.T @ ((remaining + remaining.T) / 2) @ self.weak_tangents
 
 
 def register_with_degeneracy(
@@ -188,10 +124,13 @@ def register_with_degeneracy(
     found, minima = probe.descend(found)
     is_observed = np.isfinite(minima.sigmas_m) & (not probe.may_match_itself(found.pose))
     found, sigmas_m = probe.refine_by_points(found, minima.sigmas_m, is_observed)
+    is_settled = problem.has_rooms_planes and bool(is_observed.any())
+    if is_settled:
+        found, sigmas_m = probe.settle(found, is_observed)
     sigmas_m = np.where(is_observed, sigmas_m, UNKNOWN_SIGMA_M)
     if is_start_vague and not is_observed.all():
         found, sigmas_m = probe.weigh_costs(found, minima.tangents, sigmas_m, is_observed)
-    return ObservedRegistration(found, basis, minima.tangents, is_observed, sigmas_m, noise.mean)
+    return ObservedRegistration(found, basis, minima.tangents, is_observed, sigmas_m, noise.mean, is_settled)
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,6 +166,17 @@ class _Probe:
                 break
             minima = self._parabolas(found)
         return found, minima
+
+    def settle(self, found: Registration, is_observed: NDArray[np.bool_]) -> tuple[Registration, Array]:
+        """Step to the minimum along the observed directions, too; return their deviations ``(D,)`` by the Hessian."""
+        fixed = self.basis[:, ~is_observed]
+        found = register_neighbours(self.neighbours, found.pose, self.problem.settings, fixed=fixed)
+        noise = self.problem.surface.normal_noise.mean
+        covariance = covariance_of(
+            found.hessian, found.sigma_m, 1.0, found.lever_arms_m, noise, np.zeros(6), fixed=fixed
+        )
+        to_weak = (self.basis / self.to_tangent[:, None]).T
+        return found, np.sqrt(np.einsum("ij,jk,ik->i", to_weak, covariance, to_weak))
 
     def weigh_costs(
         self, found: Registration, tangents: Array, sigmas_m: Array, is_observed: NDArray[np.bool_]

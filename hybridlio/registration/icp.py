@@ -12,8 +12,7 @@ minimum is found under the narrow kernel, which wrong matches hardly influence.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.registration.information import free_basis, least_share, scale_of
 from hybridlio.registration.point_to_point import MixedMatches, MixedNeighbours
+from hybridlio.registration.results import Fit, Registration
 from hybridlio.registration.settings import MATCH_KERNELS, RegistrationSettings
 from hybridlio.registration.surface import Neighbours, PlaneMatches, Surface
 
@@ -28,78 +28,6 @@ if TYPE_CHECKING:
     from hybridlio.registration.loops import Followed
 
 _MAX_MATCHINGS = 8  # points midway between two neighbours can make the pose alternate without end; 3 to 5 are usual
-
-_LEAST_COVERAGE = 0.3  # a surface that covers less of a scan says little about it
-
-
-class Fit(NamedTuple):
-    """How well points lie on a surface.
-
-    Attributes:
-        cost: mean robust cost over all points, between 0 and 1; unmatched points cost 1.
-        matched: share of points with a neighbour within the matching distance.
-    """
-
-    cost: float
-    matched: float
-
-    @property
-    def matched_cost(self) -> float:
-        """Mean robust cost of the matched points alone."""
-        return (self.cost - (1 - self.matched)) / max(self.matched, 1e-12)
-
-
-@dataclass(frozen=True, eq=False)
-class Registration:
-    """Result of a registration.
-
-    Attributes:
-        pose: ``(4, 4)``; maps the scan's points to the surface's frame.
-        hessian: ``(6, 6)`` of half the weighted squared residuals at the result, for a right perturbation. The
-            information is ``hessian / σ²``.
-        lever_arms_m: ``(3,)`` of the matched points about the scan's axes.
-        sigma_m: robust standard deviation of the residuals.
-        matched: share of points with a neighbour within the matching distance.
-        cost: mean robust cost over all points, between 0 and 1; unmatched points cost 1.
-        iterations: steps taken.
-        converged: whether the last step was below the convergence limits.
-    """
-
-    pose: Array
-    hessian: Array
-    lever_arms_m: Array
-    sigma_m: float
-    matched: float
-    cost: float
-    iterations: int
-    converged: bool
-
-    @property
-    def diagnostics(self) -> dict[str, float]:
-        """Numbers that say how well it went, by name."""
-        return {
-            "matched": self.matched,
-            "iterations": float(self.iterations),
-            "converged": float(self.converged),
-            "sigma_m": self.sigma_m,
-            "cost": self.cost,
-        }
-
-    @property
-    def fit(self) -> Fit:
-        """How well the points lie on the surface at the result."""
-        return Fit(self.cost, self.matched)
-
-    def within_coverage(self, coverage: float) -> Registration:
-        """Return the registration with its share of matches and its cost relative to the points that could match.
-
-        Args:
-            coverage: share of the scan's points that the surface covers, see
-                :meth:`hybridlio.registration.local_map.LocalMap.covered`; values beyond the limits are taken for those.
-        """
-        coverage = min(max(coverage, _LEAST_COVERAGE), 1.0)
-        matched = min(self.matched / coverage, 1.0)
-        return replace(self, matched=matched, cost=max(1 - (1 - self.cost) / coverage, 0.0))
 
 
 def register(

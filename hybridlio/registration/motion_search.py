@@ -15,7 +15,8 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.registration.icp import Fit, Registration, fit_at, register
+from hybridlio.registration.icp import fit_at, register
+from hybridlio.registration.results import Fit, Registration
 from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Surface
 

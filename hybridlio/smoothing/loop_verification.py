@@ -20,9 +20,10 @@ from hybridlio.cloud.voxel import voxel_average, voxel_pick
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.setting_checks import check_fraction, check_not_negative, check_positive, check_setting
-from hybridlio.registration.icp import Fit, Registration, fit_at, register
+from hybridlio.registration.icp import fit_at, register
 from hybridlio.registration.information import NORMAL_NOISE, covariance_of, degenerate_directions
 from hybridlio.registration.motion_search import CoarseSearch, refine_best
+from hybridlio.registration.results import Fit, Registration
 from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Surface
 from hybridlio.smoothing.places import Places

@@ -13,9 +13,10 @@ from hybridlio.core.errors import DataError
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.motion_limits import MEASUREMENT_FLOOR_SIGMAS, POINT_LEVER_M, UNKNOWN_TRANSLATION_SIGMA_M
 from hybridlio.core.sensors import NS_PER_S, Frame, Scan
-from hybridlio.registration.degeneracy import ObservedRegistration, RegistrationProblem, register_with_degeneracy
+from hybridlio.registration.degeneracy import RegistrationProblem, register_with_degeneracy
 from hybridlio.registration.local_map import LocalMap
 from hybridlio.registration.motion_search import best_start, coarse_kernel_m, fits_better, motions, rotated
+from hybridlio.registration.results import ObservedRegistration
 from hybridlio.sources import map_errors
 from hybridlio.sources.matching_state import MatchingState, PathPoint
 from hybridlio.sources.position_doubt import NEW_MAP
@@ -161,8 +162,7 @@ class ScanMatching:
     ) -> RelativePose:
         """Move the state on to the pose found and return the step to it."""
         pose, before, weak = observed.registration.pose, self._state.current, np.zeros((6, 6))
-        # A spinning lidar sees the same few trunks from scan to scan, so that its minima err alike: weighed so, the
-        # drift in an open field is a third larger.
+        # A spinning lidar's minima err alike, on the same few trunks: weighed so, drift in a field is a third larger.
         if initial.from_imu and not self._recent.repeats:
             predicted = before.predicted_covariance(initial)
             pose, weak = observed.weighed_with(before.T_map_lidar @ initial.pose, predicted)
@@ -296,5 +296,5 @@ class ScanMatching:
     def _problem(self, scan: ThinnedScan) -> RegistrationProblem:
         surface = self._map.surface
         assert surface is not None
-        settings, only_keyframe = self.settings.registration, self._map.only_keyframe_pose
-        return RegistrationProblem(surface, scan.source, settings, scan.points, only_keyframe)
+        settings, only, in_room = self.settings.registration, self._map.only_keyframe_pose, surface.one_sided
+        return RegistrationProblem(surface, scan.source, settings, scan.points, only, in_room and self._recent.repeats)

@@ -17,10 +17,11 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Mask
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuSamples, Scan
 from hybridlio.core.trajectory import Trajectory
-from hybridlio.registration.icp import Registration, register
+from hybridlio.registration.icp import register
 from hybridlio.registration.information import weak_basis
 from hybridlio.registration.local_map import LocalMap
 from hybridlio.registration.motion_search import best_start, fits_better, motions
+from hybridlio.registration.results import Registration
 from hybridlio.sources.scene_scale import SceneScale
 from hybridlio.sources.settings import ScanMatchingSettings
 from hybridlio.sources.thinned_scan import ThinnedScan, thin

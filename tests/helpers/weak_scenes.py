@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from hybridlio.core import se3
-from hybridlio.registration.degeneracy import ObservedRegistration, RegistrationProblem, register_with_degeneracy
+from hybridlio.registration.degeneracy import RegistrationProblem, register_with_degeneracy
+from hybridlio.registration.results import ObservedRegistration
 from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Surface
 

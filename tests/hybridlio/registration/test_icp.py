@@ -3,8 +3,9 @@ import pytest
 from rooms import ROOM, scene, seen_from
 
 from hybridlio.core import se3
-from hybridlio.registration.icp import Registration, register
+from hybridlio.registration.icp import register
 from hybridlio.registration.information import covariance_of
+from hybridlio.registration.results import Registration
 from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Surface
 

@@ -5,8 +5,9 @@ import pytest
 from rooms import FLOOR, ROOM, scene, seen_from, wall
 
 from hybridlio.core import se3
-from hybridlio.registration.icp import Registration, fit_at, register
+from hybridlio.registration.icp import fit_at, register
 from hybridlio.registration.point_to_point import MixedNeighbours
+from hybridlio.registration.results import Registration
 from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.registration.surface import Surface
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.registration.degeneracy import ObservedRegistration
-from hybridlio.registration.icp import Registration
+from hybridlio.registration.results import ObservedRegistration, Registration
 
 LEVER_ARMS_M = np.array([4.0, 5.0, 6.0])
 START = se3.exp(np.array([0.1, 0.2, -0.3, 1.0, 2.0, 3.0]))
@@ -52,3 +53,11 @@ def test_without_weak_directions_the_registration_stays() -> None:
     pose, covariance = observed.weighed_with(START, predicted(1e-3))
     assert pose is observed.registration.pose
     assert not covariance.any()
+
+
+def test_deviations_of_settled_directions_are_scaled_as_those_of_strong_ones() -> None:
+    observed = replace(registered([0.02, 10.0]), is_observed=np.array([True, False]), is_settled=True)
+    for scale in (1.0, 5.0):
+        covariance = observed.covariance(scale)
+        assert np.sqrt(covariance[3, 3]) == pytest.approx(np.sqrt(scale) * 0.02, rel=0.05)
+        assert np.sqrt(covariance[4, 4]) == pytest.approx(10.0)
