@@ -11,7 +11,8 @@ away are weighed as likelihoods.
 Half a metre is five default kernels. In rooms the kernel is half as wide, and points are matched within a quarter of a
 metre: points of floor and ceiling lost their neighbours half a metre away and did not count, and the ends of what had
 been seen of the walls looked like structure. So the probe's lengths shrink with the kernel, and neighbours count twice
-as far away as it reaches.
+as far away as it reaches. Not so while the map is one scan or the start is sought: 16 beams hardly see the floor then,
+and platforms at rest rose by up to 0.9 m.
 
 A lidar's own pattern looks like structure: where its rings fall on the ground, and the offset of each beam, are the
 same in every scan. A scan therefore fits a single other scan best where it has not moved at all; between smooth walls
@@ -77,7 +78,7 @@ class RegistrationProblem:
         settings: of the registration.
         dense_source: ``(M, 3)`` more of the scan's points, for point-to-point matches; None for ``source``.
         only_scan_pose: ``(4, 4)`` pose of the single scan of which the surface is made; None for several scans.
-        has_rooms_planes: what observes a weak direction is planes of a room, seen densely.
+        has_rooms_planes: what observes a weak direction is planes of a room, seen densely, in a map of several scans.
     """
 
     surface: Surface
@@ -89,13 +90,14 @@ class RegistrationProblem:
 
     @property
     def probe_scale(self) -> float:
-        """Of the lengths of a probe: one at the default kernel, smaller in rooms, where the kernel is."""
-        return self.settings.kernel_m / RegistrationSettings().kernel_m
+        """Of the lengths of a probe: one, in rooms smaller as the kernel is."""
+        return self.settings.kernel_m / RegistrationSettings().kernel_m if self.has_rooms_planes else 1.0
 
     @property
     def reach_m(self) -> float:
         """How far neighbours count for a probe: a point that is displaced from its plane is farther away than that."""
-        return max(self.settings.max_distance_m, 2 * PROBE_STEP_M * self.probe_scale)
+        reach_m = self.settings.max_distance_m
+        return max(reach_m, 2 * PROBE_STEP_M * self.probe_scale) if self.has_rooms_planes else reach_m
 
     def neighbours(self) -> MixedNeighbours:
         """Return the source's neighbours on the surface, to be followed from a pose."""

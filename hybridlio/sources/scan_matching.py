@@ -207,9 +207,8 @@ class ScanMatching:
     @property
     def _keyframes(self) -> int:
         """Number of keyframes in the map, with the pending one."""
-        if self.settings.target == "last-scan":
-            return 1
-        return self._map.keyframes + (self._state.keyframe is not None)
+        is_single = self.settings.target == "last-scan"
+        return 1 if is_single else self._map.keyframes + (self._state.keyframe is not None)
 
     def _covariance(self, observed: ObservedRegistration, keyframes: int) -> Array:
         return observed.covariance(self.settings.covariance_scale * map_errors.inflation(keyframes))
@@ -280,7 +279,7 @@ class ScanMatching:
 
     def _register_from(self, start: Array, scan: ThinnedScan, initial: RelativePose) -> ObservedRegistration:
         """Register from ``start``, or from the proposed pose if the scan fits the map better there."""
-        problem, is_vague = self._problem(scan), has_vague_start(initial)
+        problem = self._problem(scan, is_vague := has_vague_start(initial))
         surface, settings = problem.surface, problem.settings
         sideways_m = POINT_LEVER_M * float(np.sqrt(initial.covariance[:3, :3].trace()))
         # beyond the distance within which points are matched, a wider kernel has no effect
@@ -293,8 +292,9 @@ class ScanMatching:
                     return observed
         return register_with_degeneracy(problem, start, kernel_start_m, is_vague)
 
-    def _problem(self, scan: ThinnedScan) -> RegistrationProblem:
+    def _problem(self, scan: ThinnedScan, is_start_vague: bool = True) -> RegistrationProblem:
         surface = self._map.surface
         assert surface is not None
-        settings, only, in_room = self.settings.registration, self._map.only_keyframe_pose, surface.one_sided
-        return RegistrationProblem(surface, scan.source, settings, scan.points, only, in_room and self._recent.repeats)
+        only = self._map.only_keyframe_pose
+        has_planes = surface.one_sided and self._recent.repeats and only is None and not is_start_vague
+        return RegistrationProblem(surface, scan.source, self.settings.registration, scan.points, only, has_planes)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from scipy import ndimage
 
@@ -41,7 +43,7 @@ def note_vehicle(clouds: list[Floats], notes: Notes) -> None:
         return
     above = _without_ground(clouds)
     bodies = _bodies(above)
-    if bodies.any() and not _stands([cloud[~_within(bodies, cloud)] for cloud in above]):
+    if bodies.any() and not _stands(cloud[~_within(bodies, cloud)] for cloud in above):
         voxels = np.argwhere(bodies) - _HALF
         low, high = voxels.min(axis=0) * _VOXEL_M, (voxels.max(axis=0) + 1) * _VOXEL_M
         share = sum(int(_within(bodies, cloud).sum()) for cloud in above) / sum(map(len, clouds))
@@ -55,19 +57,23 @@ def note_vehicle(clouds: list[Floats], notes: Notes) -> None:
 
 def _bodies(clouds: list[Floats]) -> Mask:
     """Return which voxels hold bodies that stay at one place and end there, as a grid around the lidar."""
-    counts = [_counts(cloud) for cloud in clouds]
-    still = np.all(counts, axis=0)
-    labels, number = ndimage.label(ndimage.binary_dilation(still, _CUBE), _CUBE)
+    numbers = [_numbers(cloud) for cloud in clouds]
+    still = np.ones(_SHAPE, bool)
+    for occupied in numbers:
+        seen = np.zeros(still.size, bool)
+        seen[occupied] = True
+        still &= seen.reshape(_SHAPE)
+    labels, count = ndimage.label(ndimage.binary_dilation(still, _CUBE), _CUBE)
     around = ndimage.maximum_filter(labels, size=2 * _AROUND - 1)
     around[labels > 0] = 0
     own, others = (
-        np.median([np.bincount(grid.ravel(), count.ravel(), number + 1) for count in counts], axis=0)
+        np.median([np.bincount(grid.ravel()[occupied], minlength=count + 1) for occupied in numbers], axis=0)
         for grid in (labels, around)
     )  # what passes close by is there in few scans
     inner = slice(_AROUND, -_AROUND)
     edge = np.ones_like(still)
     edge[inner, inner, inner] = False
-    voxels = np.bincount(labels.ravel(), still.ravel(), number + 1)
+    voxels = np.bincount(labels[still], minlength=count + 1)
     sides = 4.0 * (_AROUND - 1) * np.sqrt(voxels)  # voxels around such a square
     ends = others * voxels < _MAX_AROUND * own * sides
     ends[np.unique(labels[edge])] = False  # and 0, which is no body
@@ -75,13 +81,11 @@ def _bodies(clouds: list[Floats]) -> Mask:
     return np.asarray(ends[labels])
 
 
-def _counts(points: Floats) -> Index:
-    """Return the number of points in each voxel near the lidar."""
+def _numbers(points: Floats) -> Index:
+    """Return the numbers of the voxels of the points near the lidar."""
     voxels = _voxels(points)
     near = ((voxels >= 0) & (voxels < 2 * _HALF)).all(axis=1)
-    numbers = np.ravel_multi_index(tuple(voxels[near].T), _SHAPE)
-    counts: Index = np.bincount(numbers, minlength=int(np.prod(_SHAPE)))
-    return counts.reshape(_SHAPE)
+    return np.asarray(np.ravel_multi_index(tuple(voxels[near].T), _SHAPE))
 
 
 def _voxels(points: Floats) -> Index:
@@ -95,13 +99,14 @@ def _within(bodies: Mask, points: Floats) -> Mask:
     return np.asarray(bodies[x, y, z])
 
 
-def _stands(clouds: list[Floats]) -> bool:
+def _stands(clouds: Iterable[Floats]) -> bool:
     """Return whether the scene does not move in the lidar's frame, or nobody can see whether it does.
 
     Ranges tell it and voxels do not: lidars whose pattern does not repeat hit other voxels at rest as well.
     """
-    first, *others = (_nearest(cloud) for cloud in clouds)
-    for other in others:
+    nearest = (_nearest(cloud) for cloud in clouds)
+    first = next(nearest)
+    for other in nearest:
         seen = np.isfinite(first) & np.isfinite(other)
         same = np.abs(first[seen] - other[seen]) < _VOXEL_M
         if seen.sum() >= _MIN_CELLS and same.mean() < _MAX_SAME:

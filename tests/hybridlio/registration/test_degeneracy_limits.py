@@ -114,7 +114,8 @@ def shrunk(seed: int, factor: float) -> ObservedRegistration:
     start[:3, 3] *= factor
     settings = RegistrationSettings(factor * SETTINGS.kernel_m, factor * SETTINGS.max_distance_m, threads=1)
     surface = Surface(factor * surface.points, surface.normals, 1)
-    return register_with_degeneracy(RegistrationProblem(surface, factor * source, settings), start)
+    problem = RegistrationProblem(surface, factor * source, settings, has_rooms_planes=True)
+    return register_with_degeneracy(problem, start)
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.25])
