@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from hybridlio.core.arrays import Array, Floats, Index, Mask
@@ -41,7 +42,7 @@ def note_vehicle(clouds: list[Floats], notes: Notes) -> None:
     """
     if len(clouds) < _MIN_SCANS:
         return
-    above = _without_ground(clouds)
+    above = _AboveGround(clouds)
     bodies = _bodies(above)
     if bodies.any() and not _stands(cloud[~_within(bodies, cloud)] for cloud in above):
         voxels = np.argwhere(bodies) - _HALF
@@ -55,7 +56,7 @@ def note_vehicle(clouds: list[Floats], notes: Notes) -> None:
             )
 
 
-def _bodies(clouds: list[Floats]) -> Mask:
+def _bodies(clouds: Iterable[Floats]) -> Mask:
     """Return which voxels hold bodies that stay at one place and end there, as a grid around the lidar."""
     numbers = [_numbers(cloud) for cloud in clouds]
     still = np.ones(_SHAPE, bool)
@@ -63,7 +64,8 @@ def _bodies(clouds: list[Floats]) -> Mask:
         seen = np.zeros(still.size, bool)
         seen[occupied] = True
         still &= seen.reshape(_SHAPE)
-    labels, count = ndimage.label(ndimage.binary_dilation(still, _CUBE), _CUBE)
+    labels = np.empty(_SHAPE, np.int16)  # a body takes 27 voxels and more, so that there are fewer than 2^15
+    count = ndimage.label(ndimage.binary_dilation(still, _CUBE), _CUBE, output=labels)
     around = ndimage.maximum_filter(labels, size=2 * _AROUND - 1)
     around[labels > 0] = 0
     own, others = (
@@ -81,11 +83,11 @@ def _bodies(clouds: list[Floats]) -> Mask:
     return np.asarray(ends[labels])
 
 
-def _numbers(points: Floats) -> Index:
+def _numbers(points: Floats) -> NDArray[np.int32]:
     """Return the numbers of the voxels of the points near the lidar."""
     voxels = _voxels(points)
     near = ((voxels >= 0) & (voxels < 2 * _HALF)).all(axis=1)
-    return np.asarray(np.ravel_multi_index(tuple(voxels[near].T), _SHAPE))
+    return np.asarray(np.ravel_multi_index(tuple(voxels[near].T), _SHAPE), dtype=np.int32)
 
 
 def _voxels(points: Floats) -> Index:
@@ -126,20 +128,38 @@ def _nearest(points: Floats) -> Array:
     return nearest
 
 
-def _without_ground(clouds: list[Floats]) -> list[Floats]:
-    """Return the clouds without points on the ground: on a plane, each ring of the lidar stays at its place, too.
+def _between(cloud: Floats, least_m: float, most_m: float) -> Floats:
+    """Return the points whose largest coordinate is between two bounds."""
+    across = np.abs(cloud).max(axis=1)
+    return np.asarray(cloud[(across >= least_m) & (across < most_m)])
 
-    The plane is fitted to the lowest of the farther points in each cell, and again without those high above it.
+
+class _AboveGround:
+    """The clouds without points on the ground, made one at a time, as a recording's may be large.
+
+    On a plane each ring of the lidar stays at its place, too. The plane is fitted to the lowest of the farther points
+    in each cell, and again without those high above it.
     """
-    pooled = np.concatenate(clouds)
-    across = np.abs(pooled).max(axis=1)
-    farther = pooled[(across >= _NEAR_M) & (across < _FAR_M)]
+
+    def __init__(self, clouds: list[Floats]) -> None:
+        self._clouds, self._plane = clouds, _ground(clouds)
+
+    def __iter__(self) -> Iterator[Floats]:
+        a, b, c = self._plane
+        for cloud in self._clouds:
+            yield cloud[np.abs(cloud[:, 2] - cloud[:, :2] @ [a, b] - c) >= _GROUND_M]
+
+
+def _ground(clouds: list[Floats]) -> Array:
+    """Return the plane z = a·x + b·y + c as ``(3,)``; zeros without farther points."""
+    farther = np.concatenate([_between(cloud, _NEAR_M, _FAR_M) for cloud in clouds])
     cells = (np.floor(farther[:, :2] / _CELL_M) + round(_FAR_M / _CELL_M)).astype(int) @ [1000, 1]
     order = np.lexsort((farther[:, 2], cells))
     lowest = farther[order[np.diff(cells[order], prepend=-1) > 0]].astype(np.float64)
     columns, height = np.column_stack([lowest[:, :2], np.ones(len(lowest))]), lowest[:, 2]
-    kept, plane = np.ones(len(lowest), bool), np.zeros(3)
+    kept = np.ones(len(lowest), bool)
+    plane: Array = np.zeros(3)
     for _ in range(_FITS):
         plane = np.linalg.lstsq(columns[kept], height[kept], rcond=None)[0]
         kept = height - columns @ plane < _GROUND_M
-    return [c[np.abs(c[:, 2] - c[:, :2] @ plane[:2] - plane[2]) >= _GROUND_M] for c in clouds]
+    return plane

@@ -194,20 +194,20 @@ def find_format(
     stated = stated or StatedFormat()
     scale_m = _scale_m([coordinates(columns) for _, columns in samples], notes)
     plain = PointFormat(scale_m)
-    clouds = [plain._points(columns) for _, columns in samples]
-    zeros = float(np.mean([(_sums(cloud) == 0).mean() for cloud in clouds if len(cloud)] or [0.0]))
-    if zeros:
+    seen, shares = [], []
+    for _, columns in samples:
+        cloud = plain._points(columns)
+        seen.append(cloud[plain._returns(cloud)])
+        shares += [float((_sums(cloud) == 0).mean())] if len(cloud) else []
+    if zeros := float(np.mean(shares or [0.0])):
         notes.found(f"points at the origin, {zeros:.1%} of a scan, are left out: beams without a return")
-    seen = [cloud[plain._returns(cloud)] for cloud in clouds]
     ranges = [_ranges(points) for points in seen]
     found = PointFormat(scale_m, _no_return_m(seen, ranges, notes), None, stated.limits_m, stated.vehicle)
     code_m = np.inf if found.no_return_m is None else found.no_return_m - _SAME_RANGE_M
     check_ranges([of_scan[of_scan < code_m] for of_scan in ranges], MAX_RANGE_M, notes)
     if stated.vehicle is None:
         note_vehicle(seen, notes)
-    valid = []
-    for (stamp, columns), cloud in zip(samples, clouds, strict=True):
-        valid.append((stamp, _rows(columns, found._returns(cloud))))
+    valid = [(stamp, _rows(columns, found._returns(plain._points(columns)))) for stamp, columns in samples]
     return replace(found, times=find_point_times(valid, step_ns, notes, stated.times))
 
 
