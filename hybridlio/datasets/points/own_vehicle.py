@@ -160,6 +160,6 @@ def _ground(clouds: list[Floats]) -> Array:
     kept = np.ones(len(lowest), bool)
     plane: Array = np.zeros(3)
     for _ in range(_FITS):
-        plane = np.linalg.lstsq(columns[kept], height[kept], rcond=None)[0]
+        plane = np.asarray(np.linalg.lstsq(columns[kept], height[kept], rcond=None)[0], dtype=np.float64)
         kept = height - columns @ plane < _GROUND_M
     return plane
