@@ -160,8 +160,7 @@ class Solution(SolutionViews):
         Raises:
             GraphError: no pose, landmark or variable has this key, or the graph is too ill-conditioned for covariances.
         """
-        variable, M = reported(self._data, self._result.values, key)
-        return _symmetric(M @ self._marginal(variable) @ M.T)
+        return self.joint_covariance([key])
 
     def relative_covariance(self, i: Key, j: Key) -> Array:
         """Return the covariance of ``T_i_j = T_i⁻¹ T_j``, the pose of j in the frame of i; shape as :meth:`covariance`.
@@ -193,11 +192,8 @@ class Solution(SolutionViews):
         Each block is as in :meth:`covariance`, which also lists what is raised.
         """
         found = [reported(self._data, self._result.values, key) for key in keys]
-        if len(found) == 1:
-            return self.covariance(keys[0])
-        variables = [variable for variable, _ in found]
         M = block_diag(*(M for _, M in found))
-        return _symmetric(M @ self._joint(variables) @ M.T)
+        return _symmetric(M @ self._joint([variable for variable, _ in found]) @ M.T)
 
     def residual(self, factor_id: int) -> Array:
         """Return the difference of a factor's measurement and the solution, not whitened; of rejected factors too.

@@ -15,10 +15,9 @@ from scipy.spatial.transform import Rotation
 from hybridlio.core import se3_single
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError, shown
+from hybridlio.core.se3_single import ROTATION_TOLERANCE, SMALL_ANGLE_RAD
 
 _EYE, _LAST = np.eye(3), [0.0, 0.0, 0.0, 1.0]  # the identity rotation; the last row of every pose
-_ROTATION_TOLERANCE = 1e-9  # of a quaternion's squared length, up to which a matrix is a rotation within rounding
-_SMALL_ANGLE_RAD = 1e-4  # below it the closed forms lose digits, while the series' next terms are below 1e-17
 
 
 def hat(v: ArrayLike) -> Array:
@@ -56,7 +55,7 @@ def _rotation_vectors(R: Array) -> Array:
     factor = np.where(sine > 0, 2 * np.arctan2(sine, w) / np.where(sine > 0, sine, 1.0), 2 / np.maximum(w, 1.0))
     rotvec = np.asarray(factor[:, None] * axis)
     # the quaternion of a rotation has a length of 2√w here; another matrix is left to SciPy, which orthonormalises
-    other = ~((w > 2) & (np.abs(w**2 + squared - 4 * w) < _ROTATION_TOLERANCE))
+    other = ~((w > 2) & (np.abs(w**2 + squared - 4 * w) < ROTATION_TOLERANCE))
     if other.any():
         rotvec[other] = Rotation.from_matrix(R[other]).as_rotvec()
     return rotvec
@@ -66,7 +65,7 @@ def so3_left_jacobian(rotvec: ArrayLike) -> Array:
     """Return the left Jacobians ``(..., 3, 3)`` of SO(3) at rotation vectors ``(..., 3)`` (Solà et al., eq. 145)."""
     rotvec = np.asarray(rotvec, dtype=np.float64)
     angle = np.linalg.norm(rotvec, axis=-1)[..., None, None]
-    small = angle < _SMALL_ANGLE_RAD
+    small = angle < SMALL_ANGLE_RAD
     safe = np.where(small, 1.0, angle)
     a = np.where(small, 0.5 - angle**2 / 24, 2 * np.sin(safe / 2) ** 2 / safe**2)
     b = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
@@ -103,7 +102,7 @@ def log(T: ArrayLike) -> Array:
 def _left_jacobian_solved(rotvec: Array, t: Array) -> Array:
     """Return ``J⁻¹·t`` ``(..., 3)`` for the left Jacobians ``J`` of rotation vectors of at most π (Solà, eq. 146)."""
     angle = np.linalg.norm(rotvec, axis=-1)[..., None]
-    small = angle < _SMALL_ANGLE_RAD
+    small = angle < SMALL_ANGLE_RAD
     half = np.where(small, 1.0, angle) / 2
     c = np.where(small, 1 / 12 + angle**2 / 720, (1 - half / np.tan(half)) / (4 * half**2))
     turned = np.cross(rotvec, t)

@@ -10,9 +10,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-_SMALL_ANGLE_RAD = 1e-4  # below it the closed forms lose digits, while the series' next terms are below 1e-17
+SMALL_ANGLE_RAD = 1e-4  # below it the closed forms lose digits, while the series' next terms are below 1e-17
 # A matrix whose quaternion has a squared length off by more than this is no rotation within rounding.
-_ROTATION_TOLERANCE = 1e-9
+ROTATION_TOLERANCE = 1e-9
 _NEAR_ROTATION = 0.1  # largest entry of RᵀR − 1 from which steps converge, to 1e-16 within the number below
 _MOST_STEPS = 5
 _SQUARED_IS_ROUNDING = 1e-9
@@ -27,7 +27,7 @@ def exp(xi: Array) -> Array:
     x, y, z, vx, vy, vz = xi.tolist()
     squared = x * x + y * y + z * z
     angle = math.sqrt(squared)
-    if angle < _SMALL_ANGLE_RAD:
+    if angle < SMALL_ANGLE_RAD:
         a, b, c = 1 - squared / 6, 0.5 - squared / 24, 1 / 6 - squared / 120
     else:
         sine = math.sin(angle)
@@ -68,10 +68,7 @@ def log(T: Array) -> Array | None:
     vx, vy, vz = T[:3, 3].tolist()
     squared = x * x + y * y + z * z
     half = math.sqrt(squared) / 2
-    if half < _SMALL_ANGLE_RAD / 2:
-        d = 1 / 12 + squared / 720
-    else:
-        d = (1 - half * math.cos(half) / math.sin(half)) / squared
+    d = 1 / 12 + squared / 720 if half < SMALL_ANGLE_RAD / 2 else (1 - half * math.cos(half) / math.sin(half)) / squared
     # V⁻¹·v = (1 − d·θ²)·v − (ω × v)/2 + d·ω·(ω·v)
     keep, along = 1 - d * squared, d * (x * vx + y * vy + z * vz)
     return np.array(
@@ -124,7 +121,7 @@ def rotation_vector(T: Array) -> Vector | None:
         w, x, y, z = d - b, c + g, f + h, 1 + i - a - e
     squared = x * x + y * y + z * z
     # the quaternion of a rotation has four times the length of its component that divides
-    if not abs(w * w + squared - 4 * (1 + 2 * largest - trace)) < _ROTATION_TOLERANCE:
+    if not abs(w * w + squared - 4 * (1 + 2 * largest - trace)) < ROTATION_TOLERANCE:
         return None
     sine = math.sqrt(squared)
     if w < 0:

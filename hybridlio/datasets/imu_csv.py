@@ -89,7 +89,7 @@ def in_si_units(source: str, values: Array, notes: Notes, stated: tuple[bool, bo
     if not stated[0] and rate > _NO_RATE_RAD_S:
         factors[:3] = np.pi / 180
         notes.corrected(
-            f"{source}: angular velocities reach {rate:.0f}: read in °/s, as so many rad/s exceed any gyroscope's range"
+            f"{source}: angular velocities reach {rate:.0f}: read in °/s, as no gyroscope measures that many rad/s"
         )
     return values * factors
 

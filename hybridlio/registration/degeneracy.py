@@ -177,8 +177,7 @@ class _Probe:
         covariance = covariance_of(
             found.hessian, found.sigma_m, 1.0, found.lever_arms_m, noise, np.zeros(6), fixed=fixed
         )
-        to_weak = (self.basis / self.to_tangent[:, None]).T
-        return found, np.sqrt(np.einsum("ij,jk,ik->i", to_weak, covariance, to_weak))
+        return found, self._deviations(covariance)
 
     def weigh_costs(
         self, found: Registration, tangents: Array, sigmas_m: Array, is_observed: NDArray[np.bool_]
@@ -195,9 +194,16 @@ class _Probe:
     def may_match_itself(self, pose: Array) -> bool:
         """Whether a scan at this pose is so near the only other scan that the lidar's pattern matches itself."""
         only = self.problem.only_scan_pose
-        if only is None:
-            return False
-        return bool(np.linalg.norm(pose[:3, 3] - only[:3, 3]) < _SELF_MATCH_M * self.problem.probe_scale)
+        return only is not None and bool(np.linalg.norm(pose[:3, 3] - only[:3, 3]) < _SELF_MATCH_M)
+
+    @property
+    def to_weak(self) -> Array:
+        """``(D, 6)``: of a tangent vector, metres along each weak direction."""
+        return (self.basis / self.to_tangent[:, None]).T
+
+    def _deviations(self, covariance: Array) -> Array:
+        """Return the standard deviations ``(D,)`` along the weak directions, m, of a covariance ``(6, 6)``."""
+        return np.asarray(np.sqrt(np.einsum("ij,jk,ik->i", self.to_weak, covariance, self.to_weak)))
 
     def refine_by_points(
         self, found: Registration, sigmas_m: Array, is_observed: NDArray[np.bool_]
@@ -214,13 +220,12 @@ class _Probe:
             return of_parabola
         narrow_m = _POINT_KERNEL_RATIO * self.problem.settings.kernel_m
         near, other = (self._register_by_points(found.pose, way, narrow_m) for way in (1.0, -1.0))
-        to_weak = (self.basis / self.to_tangent[:, None]).T
-        apart_m, moved_m = (to_weak @ se3.log(se3.between(near.pose, pose)) for pose in (other.pose, found.pose))
+        apart_m, moved_m = (self.to_weak @ se3.log(se3.between(near.pose, pose)) for pose in (other.pose, found.pose))
         if np.abs(apart_m).max() > narrow_m or np.abs(moved_m).max() > PROBE_STEP_M * self.problem.probe_scale:
             return of_parabola
         noise = self.problem.surface.normal_noise.mean
         covariance = covariance_of(near.hessian, near.sigma_m, _POINT_VARIANCE_SCALE, found.lever_arms_m, noise)
-        return replace(found, pose=near.pose), np.sqrt(np.einsum("ij,jk,ik->i", to_weak, covariance, to_weak))
+        return replace(found, pose=near.pose), self._deviations(covariance)
 
     def _register_by_points(self, pose: Array, side: float, kernel_m: float) -> Registration:
         """Register in all directions from beside a pose, on the side +1 or −1 of all weak directions."""
