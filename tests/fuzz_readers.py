@@ -38,6 +38,7 @@ from fuzz_inputs import INPUTS, chosen  # noqa: E402
 
 FORK = multiprocessing.get_context("fork")  # workers need not import everything again
 START_S = 120  # until the first message: a busy machine may write the files for long
+LEAST_S = 1.0  # for each reader, where the starts of those before took the time of all
 LOST_S = 6 * HANG_S  # without a message: the worker hangs where Python's alarm does not reach, or waits
 
 
@@ -83,10 +84,14 @@ class Result:
             self.failures.append(f"{'seed' if isinstance(which, int) else 'case'} {which}: {text}")
 
 
-def run(name: str, start: int, count: int, until: float | None) -> Result:
-    """Run the mutations of a reader in workers, a new one behind each crash."""
+def run(name: str, start: int, count: int, seconds: float | None) -> Result:
+    """Run the mutations of a reader in workers, a new one behind each crash; all cases and one mutation at least.
+
+    The time begins with the first mutation: a slow reader's start and cases would take all of it.
+    """
     result, seed, end = Result(), start, start + count
     done: set[str] = set()  # of the cases
+    until: float | None = None
     while seed < end and (until is None or time.monotonic() < until):
         receive, send = FORK.Pipe(duplex=False)
         worker = FORK.Process(target=work, args=(name, seed, end - seed, done, send), daemon=True)
@@ -95,20 +100,19 @@ def run(name: str, start: int, count: int, until: float | None) -> Result:
         which: int | str | None = None
         is_over = False
         while not is_over:
-            left = START_S if which is None else LOST_S
-            has_come = receive.poll(left if until is None else max(min(left, until - time.monotonic()), 0))
-            message = _received(receive) if has_come else None
+            message = _received(receive) if receive.poll(START_S if which is None else LOST_S) else None
             if message is None:
                 break
             which, text = message
+            if until is None and seconds is not None and isinstance(which, int):
+                until = time.monotonic() + seconds
             if text is not None:
                 result.add(which, text)
+                is_over = until is not None and time.monotonic() >= until
                 seed = which + 1 if isinstance(which, int) else seed
                 if isinstance(which, str):
                     done.add(which)
                     which = None
-            is_over = until is not None and time.monotonic() >= until
-        is_over = is_over or (until is not None and time.monotonic() >= until)
         is_unfinished = isinstance(which, str) or which == seed
         is_alive = worker.is_alive() and not receive.poll(0)
         worker.kill()
@@ -137,17 +141,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("readers", nargs="*", metavar="READER", help=f"of {', '.join(INPUTS)} (default: all)")
     parser.add_argument("--count", type=int, default=2000, help="mutations of each (default: %(default)s)")
-    parser.add_argument("--seconds", type=float, help="stop after this time, shared by the readers")
+    parser.add_argument("--seconds", type=float, help="stop after about this time, shared by the readers")
     parser.add_argument("--seed", type=int, default=0, help="of the first mutation; -1 for fresh ones")
     options = parser.parse_args()
     seed = options.seed if options.seed >= 0 else time.time_ns() // 10**9 % 10**9
     names, began, failed = chosen(parser, options.readers), time.monotonic(), 0
     for number, name in enumerate(names):
-        until = None
+        seconds = None
         if options.seconds is not None:
             left = options.seconds - (time.monotonic() - began)
-            until = time.monotonic() + left / (len(names) - number)
-        result = run(name, seed, options.count, until)
+            seconds = max(left / (len(names) - number), LEAST_S)
+        result = run(name, seed, options.count, seconds)
         counts = ", ".join(f"{result.counts[kind]} {kind}" for kind in ("ok", "error", "failed"))
         print(f"{name}: {sum(result.counts.values())} mutations from seed {seed}: {counts}", flush=True)
         for failure in result.failures:
