@@ -27,7 +27,7 @@ from hybridlio.odometry.start_search import StartEstimate, StartSearch
 from hybridlio.record import plain_values
 from hybridlio.registration.cost_profile import PROBE_STEP_M
 from hybridlio.sources.late_start import LateStart, less_certain, starts_late
-from hybridlio.sources.recent_points import repeats_pattern
+from hybridlio.sources.recent_points import repeats_directions, repeats_pattern
 from hybridlio.sources.scan_matching import LOST_COST, ScanMatching
 from hybridlio.sources.thinned_scan import thin
 
@@ -107,9 +107,10 @@ def _measured(
     pipeline: Pipeline, frame: Frame, initial: RelativePose, before: State, seconds: dict[str, float]
 ) -> tuple[Frame, RelativePose]:
     residual, is_first_step = pipeline.residual, pipeline.state is None
-    repeats = not is_first_step or repeats_pattern(pipeline.first.scan, frame.scan)
-    if not repeats and isinstance(residual, ScanMatching):
-        pipeline.start_search = _search(pipeline, residual, leads=True)
+    if is_first_step and isinstance(residual, ScanMatching):
+        residual.recent.tell(repeats_directions(pipeline.first.scan, frame.scan))
+        if not repeats_pattern(pipeline.first.scan, frame.scan):
+            pipeline.start_search = _search(pipeline, residual, leads=True)
     search = pipeline.start_search
     if search is not None and search.leads:
         found = _searched(pipeline, search, frame, seconds)

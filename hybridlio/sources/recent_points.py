@@ -16,9 +16,13 @@ from hybridlio.core.arrays import Array, Floats, Index
 from hybridlio.core.sensors import Scan
 
 # A lidar repeats its pattern if more than this share of a scan's points lie in directions, in cells of this size, that
-# occur in the scan before. On simulated recordings spinning lidars have 0.95 or more, and 0.55 where half of the points
-# are anywhere; those that do not repeat have 0.33 or less.
-_REPEATED_SHARE, _CELL_DEG = 0.45, 1.0
+# occur in the scan before. Real spinning lidars have 0.76 (KITTI's, whose scans are compensated) to 0.99, simulated
+# ones 0.9 or more, and about half of that where half of the points are anywhere; those that do not repeat have 0.1 to
+# 0.3. In cells of a degree 20,000 points within 360° × 59°, or within 70°, share half or all of them by chance. Finer
+# cells are too fine for lidars whose turns start anywhere: their columns are 0.2° to 0.4° apart.
+_REPEATED_SHARE, _CELL_DEG = 0.45, 0.25
+# Of compensated scans: while the lidar turns, their directions repeat less well.
+_COARSE_CELL_DEG = 1.0
 # Rows of a spinning lidar are fixed, so scans that were thinned at random share elevations where they share no
 # directions. Cells much finer than the rows' spacing, 0.35° with 128 rows over 45°, leave most elevations empty, while
 # a lidar without rows fills them as evenly as chance does.
@@ -27,11 +31,15 @@ _SCANS = 10  # one second at 10 Hz, in which patterns cover most of their field 
 
 
 class RecentPoints:
-    """Collects the points of the last scans; starts empty."""
+    """Collects the points of the last scans; starts empty.
 
-    def __init__(self) -> None:
+    Args:
+        repeats: whether the lidar repeats its pattern; None to learn it from the first two scans.
+    """
+
+    def __init__(self, repeats: bool | None = None) -> None:
         self._directions: Index | None = None  # of the first scan, until the second has come
-        self._repeats: bool | None = None
+        self._repeats = self._told = repeats
         self._recent: list[tuple[Array, Array]] = []
 
     @property
@@ -45,14 +53,22 @@ class RecentPoints:
         return self._repeats is False and len(self._recent) < _SCANS
 
     def observe(self, scan: Scan) -> None:
-        """Learn from the first two scans whether the lidar repeats its pattern."""
+        """Learn from the first two scans, compensated as they are, whether the lidar repeats its pattern."""
         if self._repeats is not None:
             return
-        directions, before = _directions(scan.points), self._directions
+        directions, before = _directions(scan.points, _COARSE_CELL_DEG), self._directions
         self._directions = np.unique(directions)
         if before is not None:
             self._repeats = _repeats(before, directions)
             self._directions = None
+
+    def tell(self, repeats: bool) -> None:
+        """Set whether the lidar repeats its pattern, as is known from scans as they were recorded."""
+        self._repeats = self._told = repeats
+
+    def emptied(self) -> RecentPoints:
+        """Return a collection without points, which knows what this one was told."""
+        return RecentPoints(self._told)
 
     def add(self, points: Array, T_map_lidar: Array) -> None:
         """Add the points ``(N, 3)`` of a scan that was matched at a pose ``(4, 4)``."""
@@ -74,11 +90,18 @@ class RecentPoints:
 
 def repeats_pattern(earlier: Scan, later: Scan) -> bool:
     """Return whether a lidar measures in about the same directions, or rows, in two consecutive scans."""
-    if _repeats(np.unique(_directions(earlier.points)), _directions(later.points)):
+    if repeats_directions(earlier, later):
         return True
     rows = np.unique(_rows(earlier.points))
     by_chance = len(rows) / (np.ptp(rows) + 1) if len(rows) else 1.0
     return by_chance < _MOST_FILLED and _repeats(rows, _rows(later.points), by_chance)
+
+
+def repeats_directions(earlier: Scan, later: Scan) -> bool:
+    """Return whether a lidar measures in about the same directions in two consecutive scans."""
+    has_times = earlier.time_offsets_ns is not None and later.time_offsets_ns is not None
+    cell_deg = _CELL_DEG if has_times else _COARSE_CELL_DEG
+    return _repeats(np.unique(_directions(earlier.points, cell_deg)), _directions(later.points, cell_deg))
 
 
 def _repeats(before: Index, cells: Index, by_chance: float = 0.0) -> bool:
@@ -96,11 +119,11 @@ def _rows(points: Floats) -> Index:
     return np.asarray(np.rint(np.degrees(np.arctan2(z, np.hypot(x, y))) / _ROW_CELL_DEG).astype(np.int64))
 
 
-def _directions(points: Array | Floats) -> Index:
+def _directions(points: Array | Floats, cell_deg: float) -> Index:
     """Return the cell ``(N,)`` of each point's direction.
 
     Beams at whole degrees lie in the middle of their cells.
     """
     x, y, z = points.T.astype(np.float64)
-    cells = np.rint(np.degrees([np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)]) / _CELL_DEG).astype(np.int64)
-    return np.asarray(cells[0] * 1000 + cells[1])
+    cells = np.rint(np.degrees([np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)]) / cell_deg).astype(np.int64)
+    return np.asarray(cells[0] * 10_000 + cells[1])

@@ -55,7 +55,7 @@ class ScanMatching:
         self._state = MatchingState(PathPoint(np.eye(4)), PathPoint(np.eye(4)))
         self._stamp_ns = 0
         self._before = self._state, self._stamp_ns  # when the last scan came
-        self._recent = RecentPoints()
+        self.recent = RecentPoints()
         self.current_scan: ThinnedScan | None = None
 
     def start(self, frame: Frame) -> None:
@@ -74,9 +74,9 @@ class ScanMatching:
             )
         self._map = LocalMap(self.settings.local_map)
         self._state = MatchingState.started(scan.points)
-        self._recent = RecentPoints()
-        self._recent.observe(frame.scan)
-        self._recent.add(scan.points, np.eye(4))
+        self.recent = self.recent.emptied()
+        self.recent.observe(frame.scan)
+        self.recent.add(scan.points, np.eye(4))
         self.current_scan = scan
         self._stamp_ns = frame.scan.stamp_ns
 
@@ -88,18 +88,18 @@ class ScanMatching:
         """
         self.start(frames[0])
         for frame, pose in zip(frames[1:], poses[1:], strict=True):
-            self._recent.observe(frame.scan)
+            self.recent.observe(frame.scan)
             self.current_scan = scan = self._thin(frame.scan)
-            self._recent.add(scan.points, pose)
+            self.recent.add(scan.points, pose)
         dt_s = (frames[-1].scan.stamp_ns - frames[-2].scan.stamp_ns) / NS_PER_S
-        together = self._recent.together(scan.points, poses[-1], self.settings.map_voxel_m)
+        together = self.recent.together(scan.points, poses[-1], self.settings.map_voxel_m)
         self._state = MatchingState.placed(poses[-2], poses[-1], dt_s, together)
         self._stamp_ns = frames[-1].scan.stamp_ns
 
     def refine(self, frame: Frame, initial: RelativePose) -> RelativePose:
         """Register the scan; where that fails, return the initial pose with ``ok`` False."""
         self._insert_pending_keyframe()
-        self._recent.observe(frame.scan)
+        self.recent.observe(frame.scan)
         self._before = self._state, self._stamp_ns
         self.current_scan = scan = self._thin(frame.scan)
         dt_s, self._stamp_ns = (frame.scan.stamp_ns - self._stamp_ns) / NS_PER_S, frame.scan.stamp_ns
@@ -113,7 +113,7 @@ class ScanMatching:
     def refine_again(self, frame: Frame, initial: RelativePose) -> RelativePose:
         """Register the last scan, which matched, once more as it is compensated now, in place of that match."""
         self._state, self._stamp_ns = self._before
-        self._recent.discard_last()
+        self.recent.discard_last()
         return self.refine(frame, initial)
 
     @property
@@ -137,7 +137,7 @@ class ScanMatching:
 
     def take_back(self, initial: RelativePose) -> None:
         """Discard the last match: the path continues by ``initial``, and the scan does not enter the map."""
-        self._recent.discard_last()
+        self.recent.discard_last()
         self._state = self._state.taken_back(initial)
 
     def pair(self, earlier: ThinnedScan, current: ThinnedScan, initial: RelativePose) -> RelativePose:
@@ -163,15 +163,15 @@ class ScanMatching:
         """Move the state on to the pose found and return the step to it."""
         pose, before, weak = observed.registration.pose, self._state.current, np.zeros((6, 6))
         # A spinning lidar's minima err alike, on the same few trunks: weighed so, drift in a field is a third larger.
-        if initial.from_imu and not self._recent.repeats:
+        if initial.from_imu and not self.recent.repeats:
             predicted = before.predicted_covariance(initial)
             pose, weak = observed.weighed_with(before.T_map_lidar @ initial.pose, predicted)
         self._state = self._state.matched(pose, dt_s, bool(len(observed.degenerate)), has_vague_start(initial), weak)
-        self._recent.add(scan.points, pose)
+        self.recent.add(scan.points, pose)
         if self.settings.target == "last-scan" or self._state.adrift:
             self._state = self._state.keyframe_pending(scan.points)
-        elif self._map.needs_keyframe(pose) or self._recent.is_filling:
-            filled = self._recent.together(scan.points, pose, self.settings.map_voxel_m)
+        elif self._map.needs_keyframe(pose) or self.recent.is_filling:
+            filled = self.recent.together(scan.points, pose, self.settings.map_voxel_m)
             self._state = self._state.keyframe_pending(filled)
         covariance = self._covariance(observed, self._keyframes)
         drift = self._drift(covariance, before.map_changed)
@@ -296,5 +296,5 @@ class ScanMatching:
         surface = self._map.surface
         assert surface is not None
         only = self._map.only_keyframe_pose
-        has_planes = surface.one_sided and self._recent.repeats and only is None and not is_start_vague
+        has_planes = surface.one_sided and self.recent.repeats and only is None and not is_start_vague
         return RegistrationProblem(surface, scan.source, self.settings.registration, scan.points, only, has_planes)

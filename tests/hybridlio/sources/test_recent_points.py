@@ -3,7 +3,7 @@ import pytest
 
 from hybridlio.core import se3
 from hybridlio.core.sensors import Scan
-from hybridlio.sources.recent_points import RecentPoints, repeats_pattern
+from hybridlio.sources.recent_points import RecentPoints, repeats_directions, repeats_pattern
 
 HERE = se3.exp(np.array([0.0, 0.1, 0.3, 1.0, -2.0, 0.5]))
 
@@ -76,3 +76,45 @@ def test_a_spinning_lidar_repeats_its_pattern_among_points_that_are_anywhere(rng
     wrong = rng.random(len(second)) < share
     second[wrong] = scattered(rng, int(wrong.sum()))
     assert repeats_pattern(Scan(0, first.astype(np.float32)), Scan(1, second.astype(np.float32)))
+
+
+@pytest.mark.parametrize(("count", "azimuth_deg", "elevations_deg"), [(24_000, 70, (-35, 35)), (20_000, 360, (-7, 52))])
+def test_scans_that_have_a_point_in_every_degree_by_chance_repeat_nothing(
+    rng: np.random.Generator, count: int, azimuth_deg: float, elevations_deg: tuple[float, float]
+):
+    """By data sheets: the Avia measures 24,000 points a scan within 70°, the Mid-360 20,000 within 360° × 59°."""
+    first, second = (
+        along(
+            np.radians(rng.uniform(-azimuth_deg / 2, azimuth_deg / 2, count)),
+            np.radians(rng.uniform(*elevations_deg, count)),
+        )
+        for _ in range(2)
+    )
+    assert not repeats_directions(first, second)
+    assert not repeats_pattern(first, second)
+
+
+@pytest.mark.parametrize("columns", [1024, 1800])
+def test_a_spinning_lidar_repeats_its_directions_though_its_turns_start_anywhere(
+    rng: np.random.Generator, columns: int
+):
+    azimuth, elevation = np.meshgrid(2 * np.pi * np.arange(columns) / columns, np.radians(np.arange(-15, 16, 2.0)))
+    first, second = (along(azimuth.ravel() + rng.uniform(0, 2 * np.pi / columns), elevation.ravel()) for _ in range(2))
+    assert repeats_directions(first, second)
+
+
+@pytest.mark.parametrize("repeats", [True, False])
+def test_what_is_told_of_the_pattern_holds_whatever_scans_come(rng: np.random.Generator, repeats: bool):
+    told = RecentPoints()
+    told.tell(repeats)
+    told = told.emptied()
+    for k in range(2):
+        told.observe(Scan(k, (scattered(rng) if repeats else rings(rng)).astype(np.float32)))
+    assert told.repeats == repeats
+
+
+def along(azimuth: np.ndarray, elevation: np.ndarray) -> Scan:
+    """A scan in directions, radians."""
+    level = np.cos(elevation)
+    points = 5 * np.c_[level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
+    return Scan(0, points.astype(np.float32), time_offsets_ns=np.zeros(len(points), np.int64))
