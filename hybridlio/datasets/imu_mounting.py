@@ -42,6 +42,6 @@ def note_mounting(imu: ImuSamples, T_imu_lidar: Array, notes: Notes) -> None:
     force = T_imu_lidar[:3, :3].T @ np.median(imu.accel_m_s2, axis=0)
     if force[2] < _MAX_UPSIDE_DOWN * np.linalg.norm(force):
         notes.add(
-            "the specific force points down in the lidar's frame, whose z axis must be up; check T_imu_lidar, and that "
-            "the accelerometer at rest reads +9.81 on the axis that points up"
+            "the specific force points down in the lidar's frame. If the lidar is mounted upside down, that is right; "
+            "if not, check T_imu_lidar, and that the accelerometer at rest reads +9.81 on the axis that points up"
         )

@@ -46,8 +46,9 @@ _DOUBTED = (
     "failed; positions from here on may be off by %.1f m (standard deviation per axis), relative to those before"
 )
 _NOISY = (
-    "frame %d: the IMU's %s differ from the scans' motion %.0f times as much as their stated noise explains; they are "
-    "believed that much less. State their noise (imu_noise), or check T_imu_lidar, units and clock"
+    "frame %d: the IMU's %s differ from the scans' motion %.0f times as much as their noise explains; they are "
+    "believed that much less. That is usual where the body shakes, or where scans fit the map poorly, as among leaves; "
+    "if neither is so, state the noise (imu_noise), or check T_imu_lidar, units and clock"
 )
 # Noise of an IMU on a platform that shakes is a few times that of its data sheet; wrong units or axes make more of it.
 _NOISE_FACTOR_WARNED = 5.0

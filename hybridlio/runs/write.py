@@ -121,7 +121,7 @@ def imu_conflicts(run: Run) -> list[str]:
     actions = {
         "rejected": "rejected: they conflict with the IMU, which bridges them",
         "relocated": "used to relocate in the map after repeated rejections; the jump is not in the trajectory",
-        "down-weighted": "down-weighted: they differ from the IMU by more than their covariances",
+        "down-weighted": "down-weighted, as the difference from the IMU is more than the covariances explain",
         "undecided": "left out, with the IMU, as either may be wrong; the next scan decides",
         "IMU left out": "used without the IMU, which contradicted the smooth motion that scans show",
     }
