@@ -187,14 +187,14 @@ class ImuSamples:
 
 @dataclass(frozen=True)
 class ImuNoise:
-    """Continuous-time noise densities of an IMU; the defaults fit an industrial MEMS unit.
+    """Continuous-time noise densities of an IMU; the defaults fit MEMS units.
 
     Names follow the units: ``*_sqrt_hz`` of the measurements is white noise, ``*_walk`` the random walk of the biases,
-    and ``*_bias_sigma`` the standard deviation of the biases at power-up. ``gyro_scale_sigma`` is the relative standard
-    deviation of the gyroscope's sensitivity and of what an axis measures of the others: data sheets of consumer MEMS
-    units state tolerances of 0.5 to 1.5 % for the one (ICM-20948, BMI088, LSM6DSO, IAM-20680) and 2 % for the other. A
-    simulated IMU may have values of 0; odometry needs all above 0 but this one, which is 0 for a gyroscope without
-    errors of scale.
+    and ``*_bias_sigma`` their standard deviation at power-up: 20 to 25 mg and 1 °/s are stated for consumer MEMS units
+    (BMI088, LSM6DSO; ICM-20948: 5 °/s), and where it is too small gravity leans by the rest of a bias.
+    ``gyro_scale_sigma`` is the relative standard deviation of the gyroscope's sensitivity and of what an axis measures
+    of the others: stated tolerances are 0.5 to 1.5 % (ICM-20948, BMI088, LSM6DSO, IAM-20680) and 2 %. A simulated IMU
+    may have values of 0; odometry needs all above 0 but this one, 0 for a gyroscope without errors of scale.
 
     Raises:
         SettingError: a value is negative or not finite.
@@ -206,8 +206,8 @@ class ImuNoise:
     accel_m_s2_sqrt_hz: float = 1.0e-2
     gyro_walk_rad_s2_sqrt_hz: float = 2.0e-5
     accel_walk_m_s3_sqrt_hz: float = 3.0e-4
-    gyro_bias_sigma_rad_s: float = 1.0e-2
-    accel_bias_sigma_m_s2: float = 1.0e-1
+    gyro_bias_sigma_rad_s: float = 1.7e-2
+    accel_bias_sigma_m_s2: float = 2.5e-1
     gyro_scale_sigma: float = 1.0e-2
 
     def __post_init__(self) -> None:

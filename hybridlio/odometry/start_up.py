@@ -136,7 +136,9 @@ def _measured(
         answer = _with_late_imu(pipeline, frame, answer, before)
     if pipeline.start_search is not None:
         own = None if pipeline.start_search.leads else pipeline.pose_after(before, answer[1])
-        return _searched(pipeline, pipeline.start_search, frame, seconds, own) or answer
+        search = pipeline.start_search
+        searched = _searched(pipeline, search, frame, seconds, own)
+        return searched or (answer[0], search.less_sure(answer[1], own, frame.scan.stamp_ns))
     return answer
 
 

@@ -12,6 +12,9 @@ from hybridlio.core.lidar_models import LIDAR_MODELS, LidarModel
 from hybridlio.core.sensors import ImuNoise
 from hybridlio.simulation.choices import Driving, Scene
 
+SIMULATED_IMU = ImuNoise(gyro_bias_sigma_rad_s=1.0e-2, accel_bias_sigma_m_s2=1.0e-1)
+"""The IMU of simulated road vehicles: an industrial MEMS unit."""
+
 
 class SimulationConfig(BaseModel):
     """Settings of a simulated drive; the same settings give the same bytes.
@@ -64,7 +67,7 @@ class SimulationConfig(BaseModel):
     gps: bool = False
     gps_rate_hz: float = Field(default=1.0, gt=0.0, le=10.0)
     gps_sigma_m: float = Field(default=1.0, ge=0.0)
-    imu_noise: ImuNoise = ImuNoise()
+    imu_noise: ImuNoise = SIMULATED_IMU
     poses: Path | None = None
     poses_frame: Literal["camera", "lidar"] = "camera"
 

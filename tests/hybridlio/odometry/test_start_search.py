@@ -10,7 +10,7 @@ from resumed import check_resumed_at
 from walks import errors_of, estimated, squared_position_errors, walk
 
 from hybridlio.core.estimates import RelativePose
-from hybridlio.core.sensors import Frame, Scan
+from hybridlio.core.sensors import NS_PER_S, Frame, Scan
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.odometry import start_up
 from hybridlio.odometry.config import Config
@@ -60,6 +60,25 @@ def test_the_decision_corrects_the_steps_before(estimates: list[Estimate]) -> No
     assert np.trace(estimates[deciding].covariance[3:, 3:]) < np.trace(estimates[deciding - 1].covariance[3:, 3:]) / 100
 
 
+def test_the_decided_poses_together_weigh_as_the_one_motion_that_they_show(estimates: list[Estimate]) -> None:
+    deciding = next(one for one in estimates if one.relative is not None and one.relative.earlier_scans)
+    relative = deciding.relative
+    assert relative is not None
+    since_s = [(deciding.stamp_ns - one.stamp_ns) / NS_PER_S for one in relative.earlier_scans]
+    # of the speed, by the direction that they know least
+    variances = [np.linalg.eigvalsh(one.covariance[3:, 3:])[-1] for one in relative.earlier_scans]
+    together = 1 / sum(time_s**2 / variance for time_s, variance in zip(since_s, variances, strict=True))
+    longest = variances[0] / len(estimates[: deciding.index]) / since_s[0] ** 2  # of the search's own motion
+    assert 0.5 < together / longest < 3
+
+
+def test_steps_before_the_decision_weigh_little_beside_it(estimates: list[Estimate]) -> None:
+    deciding = next(one for one in estimates if one.relative is not None and one.relative.earlier_scans)
+    assert deciding.relative is not None
+    undecided = [one.relative for one in estimates[1 : deciding.index] if one.relative is not None]
+    assert all(one.translation_sigma_m > deciding.relative.translation_sigma_m for one in undecided)
+
+
 def test_an_undecided_start_is_resumed_to_the_last_bit(frames: list[Frame]) -> None:
     check_resumed_at(2, frames[:6], Config())
 
@@ -76,8 +95,10 @@ def test_a_scan_without_points_ends_the_search_and_is_bridged(frames: list[Frame
 def test_a_false_fit_of_two_scans_is_not_believed() -> None:
     recording = walk(OPEN_ABOVE, OPEN_ABOVE_FROM, 7)
     estimates = estimated(list(recording))
-    errors_m = [np.linalg.norm(error[3:]) for error in errors_of(estimates, recording.reference)]
-    assert max(errors_m) < 0.05
+    errors = errors_of(estimates, recording.reference)
+    assert squared_position_errors(estimates, errors)[1:].max() < 4
+    assert max(np.linalg.norm(error[3:]) for error in errors[3:]) < 0.05
+    assert max(np.sqrt(np.diag(one.covariance)[3:].max()) for one in estimates[3:]) < 0.05
 
 
 def test_a_start_in_a_flat_valley_waits_for_scans_that_settle_it() -> None:
