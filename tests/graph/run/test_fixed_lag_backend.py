@@ -78,10 +78,16 @@ def test_a_lag_shorter_than_the_warm_up_is_an_error() -> None:
         FixedLagBackend(InertialSteps(Calibration(), ImuNoise()), lag_scans=5)
 
 
+@pytest.mark.parametrize(("bias_sigma_m_s2", "most_changed"), [(0.1, 0.0), (ImuNoise().accel_bias_sigma_m_s2, 0.05)])
 def test_a_step_far_from_the_start_updates_only_recent_variables(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+    bias_sigma_m_s2: float, most_changed: float, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """There, rotating the whole path by a milliradian moves all recent scans by the same metre."""
+    """There, rotating the whole path by a milliradian moves all recent scans by the same metre.
+
+    A larger bias is not told from gravity's direction on a path without turns, and both wander: all variables are
+    linearised anew now and then.
+    """
+    noise = ImuNoise(accel_bias_sigma_m_s2=bias_sigma_m_s2)
     touched: list[int] = []
     make = online.incremental_solver
 
@@ -99,17 +105,17 @@ def test_a_step_far_from_the_start_updates_only_recent_variables(
             return getattr(self._solver, name)
 
     monkeypatch.setattr(online, "incremental_solver", Counting)
-    backend = FixedLagBackend(InertialSteps(Calibration(), ImuNoise()))
+    backend = FixedLagBackend(InertialSteps(Calibration(), noise))
     sigmas = np.r_[np.full(3, 1e-3), np.full(3, 0.02)]
     for k in range(1000):
         stamps = k * 10**8 + np.arange(11) * 10**7
         accel = np.array([0.0, 0.0, 9.81]) + 0.1 * rng.standard_normal((11, 3))
         imu = ImuSamples(stamps, 0.01 * rng.standard_normal((11, 3)), accel)
         if not k:
-            backend.start(start_state(0, imu, ImuNoise()))
+            backend.start(start_state(0, imu, noise))
         step = se3.exp(np.array([0, 0, 0, 1.0, 0, 0]) + sigmas * rng.standard_normal(6))
         scan = Scan(int(stamps[-1]), np.empty((0, 3), np.float32))
         covariance = np.diag(sigmas**2)
         relative = RelativePose(step, covariance, "test", drift=0.1 * covariance)
         backend.update(Frame(k + 1, scan, imu, calibration=Calibration()), relative)
-    assert max(touched[-600:]) < 100
+    assert (np.array(touched[-600:]) >= 100).mean() <= most_changed
