@@ -30,7 +30,7 @@ class Config(BaseModel):
         initial_pose: a name in :data:`hybridlio.odometry.registry.INITIAL_POSE_SOURCES`.
         residual: a name in :data:`hybridlio.odometry.registry.RESIDUAL_SOURCES`.
         backend: a name in :data:`hybridlio.odometry.registry.BACKENDS`.
-        imu_noise: the IMU's noise densities. By default the recording's, or those of an industrial MEMS unit if the
+        imu_noise: the IMU's noise densities. By default the recording's, or those of a MEMS unit if the
             recording does not state any.
         scan_matching: settings of the classical residual source.
         recent_scans: which recent scans each scan is compared with, by ``network``, and by ``scan-matching`` with the

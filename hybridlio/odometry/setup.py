@@ -33,8 +33,7 @@ class Setup:
     def from_frame(cls, config: Config, frame: Frame) -> Setup:
         """Return the setup for a run that starts at ``frame``.
 
-        The IMU's noise is the configuration's if it gives one, else the recording's, else that of an industrial MEMS
-        unit.
+        The IMU's noise is the configuration's if it gives one, else the recording's, else that of a MEMS unit.
 
         Raises:
             SettingError: a noise density is 0. A simulator may have such an IMU, but the graph cannot weigh it. Only

@@ -46,8 +46,8 @@ class OdometryStream:
         odometry: a new one, to choose sources and settings or to keep a record for smoothing; by default
             ``Odometry(keep_record=False)``.
         on_estimate: called with each estimate by the stream's thread.
-        imu_noise: the IMU's noise densities, unless the odometry's configuration gives them; by default those of an
-            industrial MEMS unit.
+        imu_noise: the IMU's noise densities, unless the odometry's configuration gives them; by default those of a
+            MEMS unit.
         lag_s: how long a scan waits for IMU samples, on the clock of the stamps. Then it is estimated with those that
             have come, and counted (``without_imu``).
         reorder_s: by how much stamps of one sensor may step back. Every scan waits so much longer.

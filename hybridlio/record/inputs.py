@@ -44,7 +44,7 @@ class OdometryInputs(TypedDict, total=False):
         fixes: GPS: a ``gps.csv``, fixes, or rows ``t_s, east, north, up, sigma_m``.
         calibration: a ``calibration.yaml``, or extrinsics; by default the IMU frame is that of the poses.
         covariances: of the steps, ``(N-1, 6, 6)`` or ``(6, 6)``; by default found from the IMU.
-        imu_noise: noise densities; by default those of ``calibration``, else of an industrial MEMS unit.
+        imu_noise: noise densities; by default those of ``calibration``, else of a MEMS unit.
         imu_time_offset_s: to add to the IMU's stamps; by default as ``calibration`` states it, else found.
         wheels: speeds of wheels or velocities of the body, or their CSV file; beside a record too.
         stamps: of poses without any, such as KITTI's: a file with a stamp in seconds a line, or ``(N,)`` int64 ns.

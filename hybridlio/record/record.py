@@ -89,7 +89,7 @@ class Record:
             imu: the samples.
             gps: fixes; their clock may differ by a constant.
             calibration: the extrinsics; by default the IMU frame is the lidar frame.
-            imu_noise: the IMU's noise densities; by default those of an industrial MEMS unit.
+            imu_noise: the IMU's noise densities; by default those of a MEMS unit.
             covariances: ``(N-1, 6, 6)`` of the steps between consecutive poses, or one ``(6, 6)`` for all, rad² and m²,
                 rotation first. Errors of different steps must be independent. By default they are estimated from the
                 differences between poses and IMU (:func:`hybridlio.record.odometry_noise.odometry_noise`).
