@@ -10,11 +10,12 @@ from resumed import check_resumed_at
 from walks import errors_of, estimated, squared_position_errors, walk
 
 from hybridlio.core.estimates import RelativePose
-from hybridlio.core.sensors import NS_PER_S, Frame, Scan
+from hybridlio.core.sensors import NS_PER_S, Frame, ImuNoise, Scan
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.odometry import start_up
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.estimate import Estimate
+from hybridlio.odometry.odometry import Odometry
 from hybridlio.simulation.platforms.config import PlatformConfig
 
 # Two scans of this recording fit each other better 0.8 m and more away from where they were.
@@ -24,6 +25,8 @@ OPEN_ABOVE = PlatformConfig(scene="office", platform="handheld", lidar="vlp-16",
 OPEN_ABOVE_FROM = 60
 # Here the first two scans do not fit each other, and four leave a flat valley of costs: heights with rotations.
 VALLEY = PlatformConfig(scene="office", platform="handheld", lidar="vlp-16", seconds=1.2, seed=8101)
+# Starts before one wall, along which nothing shows the motion from the second second on.
+WALL = PlatformConfig(scene="office", platform="handheld", lidar="rosette", seconds=12.0, seed=8501)
 
 
 @pytest.fixture(scope="module")
@@ -119,3 +122,17 @@ def test_a_false_start_that_the_imu_contradicts_is_not_claimed_to_be_sure(
     errors = errors_of(estimates, recording.reference)
     assert np.linalg.norm(errors[-1][3:]) > 1
     assert squared_position_errors(estimates, errors)[-1] < 3
+
+
+@pytest.mark.parametrize(("bias_sigma_m_s2", "lowest_m", "highest_m"), [(None, 0.0, 1.0), (0.05, 3.0, 10.0)])
+def test_the_bias_of_a_consumer_imu_is_not_taken_for_gravity(
+    bias_sigma_m_s2: float | None, lowest_m: float, highest_m: float
+) -> None:
+    """Its accelerometer is 0.35 m/s² off. Where 0.05 is assumed, the vertical leans and the path runs off."""
+    recording = walk(WALL, count=30)
+    assumed = None if bias_sigma_m_s2 is None else ImuNoise(accel_bias_sigma_m_s2=bias_sigma_m_s2)
+    odometry = Odometry(config=Config(imu_noise=assumed))
+    estimates = [odometry.step(frame) for frame in recording]
+    errors = errors_of(estimates, recording.reference)
+    assert lowest_m <= np.linalg.norm(errors[-1][3:]) <= highest_m
+    assert (squared_position_errors(estimates, errors)[1:].max() < 3) == (bias_sigma_m_s2 is None)
