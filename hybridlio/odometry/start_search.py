@@ -143,19 +143,6 @@ class StartSearch:
         )
         return self.last
 
-    def less_sure(self, own: RelativePose, pose: Array | None, stamp_ns: int) -> RelativePose:
-        """Return the run's own step to the last scan, as uncertain as the undecided search is far from it.
-
-        Args:
-            own: the step; it is returned as it is where the search has not taken part, or has decided.
-            pose: ``(4, 4)`` to which it leads, in the frame of the first scan; None where the search leads.
-            stamp_ns: of the scan.
-        """
-        found = self.last
-        if pose is None or found is None or found.is_decided or self._frames[-1].scan.stamp_ns != stamp_ns:
-            return own
-        return own.wider(added=_two_blocks(se3.log(se3.between(pose, found.poses[-1]))))
-
     def _has_points_in_time(self, frame: Frame) -> bool:
         since_s = (frame.scan.stamp_ns - self._frames[0].scan.stamp_ns) / NS_PER_S
         return len(frame.scan) >= self._settings.min_points and since_s < _LONGEST_S

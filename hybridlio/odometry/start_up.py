@@ -120,10 +120,10 @@ def _measured(
         _restart_at(pipeline, frame, initial.pose, before)
     answer = pipeline.refine(frame, initial, before, seconds)
     if is_first_step:
-        answer = repeat_first_step(pipeline, frame, initial, answer, before)
-        fits_poorly = answer[1].details.get("cost", 0.0) > LOST_COST
-        # Ghosts and few rings make a right match poor, too, but it converges; false ones in rooms do not.
-        is_lost = not answer[1].ok or (fits_poorly and not answer[1].details.get("converged", 1.0))
+        fitted, answer = not _fits_poorly(answer[1]), repeat_first_step(pipeline, frame, initial, answer, before)
+        fits_poorly = _fits_poorly(answer[1])
+        # Ghosts and few rings make a right match poor, too, but it converges, and was poor before it was repeated.
+        is_lost = not answer[1].ok or (fits_poorly and (fitted or not answer[1].details.get("converged", 1.0)))
         if isinstance(residual, ScanMatching) and (is_lost or fits_poorly or len(answer[1].degenerate)):
             pipeline.start_search = _search(pipeline, residual, leads=is_lost)
     elif isinstance(residual, RefinesAgain):
@@ -136,10 +136,12 @@ def _measured(
         answer = _with_late_imu(pipeline, frame, answer, before)
     if pipeline.start_search is not None:
         own = None if pipeline.start_search.leads else pipeline.pose_after(before, answer[1])
-        search = pipeline.start_search
-        searched = _searched(pipeline, search, frame, seconds, own)
-        return searched or (answer[0], search.less_sure(answer[1], own, frame.scan.stamp_ns))
+        return _searched(pipeline, pipeline.start_search, frame, seconds, own) or answer
     return answer
+
+
+def _fits_poorly(step: RelativePose) -> bool:
+    return step.details.get("cost", 0.0) > LOST_COST
 
 
 def _search(pipeline: Pipeline, residual: ScanMatching, leads: bool) -> StartSearch:
@@ -259,13 +261,11 @@ def _with_late_imu(
     samples, is_covered = late.first_samples(frame), before.has_imu and _is_covered(frame)
     if is_covered or frame.scan.stamp_ns - late.frame.scan.stamp_ns > _LONGEST_NS:
         pipeline.late_start = None
-    if not answer[1].ok:
-        return answer
-    placed = _placed(pipeline, late, frame, answer, before) if is_covered else None
-    if placed is not None or pipeline.state is not None:
+    placed = _placed(pipeline, late, frame, answer, before) if is_covered and answer[1].ok else None
+    if placed is not None or pipeline.state is not None or not answer[1].ok:
         return placed or answer
-    is_known = before.has_imu and len(samples)
-    return answer[0], less_certain(answer[1], late.noise(samples) if is_known else late.noise_without_samples())
+    noise = late.noise(samples) if before.has_imu and len(samples) else late.noise_without_samples()
+    return answer[0], less_certain(answer[1], noise)
 
 
 def _placed(

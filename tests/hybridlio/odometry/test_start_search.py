@@ -98,10 +98,8 @@ def test_a_scan_without_points_ends_the_search_and_is_bridged(frames: list[Frame
 def test_a_false_fit_of_two_scans_is_not_believed() -> None:
     recording = walk(OPEN_ABOVE, OPEN_ABOVE_FROM, 7)
     estimates = estimated(list(recording))
-    errors = errors_of(estimates, recording.reference)
-    assert squared_position_errors(estimates, errors)[1:].max() < 4
-    assert max(np.linalg.norm(error[3:]) for error in errors[3:]) < 0.05
-    assert max(np.sqrt(np.diag(one.covariance)[3:].max()) for one in estimates[3:]) < 0.05
+    errors_m = [np.linalg.norm(error[3:]) for error in errors_of(estimates, recording.reference)]
+    assert max(errors_m) < 0.05
 
 
 def test_a_start_in_a_flat_valley_waits_for_scans_that_settle_it() -> None:
