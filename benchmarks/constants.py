@@ -168,7 +168,7 @@ TABLE = [
         _MIN_OTHER_RINGS=("0", "8"),
     ),
     *_in(
-        "hybridlio/sources/innovation_gate.py",
+        "hybridlio/sources/gate/innovation_gate.py",
         GATE,
         GATE_NIS=("5.0", "300.0"),
         GROSS_NIS=("30.0", "1e6"),

@@ -12,7 +12,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples
 from hybridlio.odometry.inertial_motion import inertial_motion
-from hybridlio.sources.motion_change import UsualChange
+from hybridlio.sources.gate.motion_change import UsualChange
 
 
 class MotionCompensation:

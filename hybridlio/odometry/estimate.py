@@ -12,7 +12,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.evaluation.evaluate import Steps
-from hybridlio.sources.innovation_gate import UNTESTED, GateResult
+from hybridlio.sources.gate.gate_result import UNTESTED, GateResult
 
 
 @dataclass(frozen=True, eq=False)

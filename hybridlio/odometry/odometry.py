@@ -12,16 +12,17 @@ from hybridlio.core.estimates import Backend, InitialPoseSource, ResidualSource,
 from hybridlio.core.sensors import Frame, ImuNoise, Scan
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.estimate import Estimate
-from hybridlio.odometry.late_imu import take_up_imu
+from hybridlio.odometry.measured_step import measure_step, restore_search
 from hybridlio.odometry.pipeline import Pipeline, timed
 from hybridlio.odometry.registry import check_names, make_implementations
 from hybridlio.odometry.setup import Setup
-from hybridlio.odometry.start_up import measure_step, restore_search, start_backend, start_residual
+from hybridlio.odometry.start.late_imu import take_up_imu
+from hybridlio.odometry.start.start_up import start_backend, start_residual
 from hybridlio.record import plain_values
 from hybridlio.record.loop_keyframes import LoopKeyframeSelector
 from hybridlio.record.record import Record
 from hybridlio.record.recorder import Recorder
-from hybridlio.sources.imu_trust import without_imu
+from hybridlio.sources.gate.imu_trust import without_imu
 
 # The first pose defines the frame, so it is exact. GTSAM and the file formats need a positive definite covariance;
 # 1e-6 rad and m are far below any sensor's noise.

@@ -27,9 +27,10 @@ from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise
 from hybridlio.odometry.compensation import MotionCompensation
 from hybridlio.odometry.estimate import InertialState
 from hybridlio.odometry.second_pass import SecondCompensation
-from hybridlio.odometry.start_search import StartSearch
-from hybridlio.sources.imu_trust import ImuTrust, without_imu
-from hybridlio.sources.innovation_gate import GateResult, InnovationGate
+from hybridlio.odometry.start.start_search import StartSearch
+from hybridlio.sources.gate.gate_result import GateResult
+from hybridlio.sources.gate.imu_trust import ImuTrust, without_imu
+from hybridlio.sources.gate.innovation_gate import InnovationGate
 from hybridlio.sources.late_start import LateStart
 
 if TYPE_CHECKING:

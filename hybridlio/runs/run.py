@@ -23,7 +23,7 @@ from hybridlio.odometry.config import Config
 from hybridlio.odometry.estimate import Estimate, steps_of, trajectory_of
 from hybridlio.record.packed_arrays import PackedList
 from hybridlio.record.record import Record
-from hybridlio.sources.innovation_gate import GATE_NIS, Verdict
+from hybridlio.sources.gate.gate_result import GATE_NIS, Verdict
 
 _log = logging.getLogger(__name__)
 

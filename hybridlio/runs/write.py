@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from hybridlio.smoothing.gps_options import GpsFit
     from hybridlio.smoothing.loops import ClosedLoops, Loop
     from hybridlio.smoothing.smoothed import Smoothed
-    from hybridlio.sources.innovation_gate import Verdict
+    from hybridlio.sources.gate.gate_result import Verdict
 
 _MAX_SCANS_NOTED = 20  # unreadable scans listed in the report; metrics.json has them all
 _LARGE_SHARE = 0.1  # of all scans; more conflicts with the IMU than single bad scans explain

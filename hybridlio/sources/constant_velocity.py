@@ -9,7 +9,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.motion_limits import PREDICTION_FLOOR_SIGMAS, unknown_motion_covariance
 from hybridlio.core.sensors import NS_PER_S, Frame
-from hybridlio.sources.motion_change import UsualChange
+from hybridlio.sources.gate.motion_change import UsualChange
 
 
 class Identity:

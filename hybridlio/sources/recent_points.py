@@ -88,20 +88,18 @@ class RecentPoints:
         return np.asarray(voxel_average(np.concatenate(everything), None, voxel_m)[0], np.float64)
 
 
-def repeats_pattern(earlier: Scan, later: Scan) -> bool:
-    """Return whether a lidar measures in about the same directions, or rows, in two consecutive scans."""
-    if repeats_directions(earlier, later):
-        return True
-    rows = np.unique(_rows(earlier.points))
-    by_chance = len(rows) / (np.ptp(rows) + 1) if len(rows) else 1.0
-    return by_chance < _MOST_FILLED and _repeats(rows, _rows(later.points), by_chance)
-
-
 def repeats_directions(earlier: Scan, later: Scan) -> bool:
     """Return whether a lidar measures in about the same directions in two consecutive scans."""
     has_times = earlier.time_offsets_ns is not None and later.time_offsets_ns is not None
     cell_deg = _CELL_DEG if has_times else _COARSE_CELL_DEG
     return _repeats(np.unique(_directions(earlier.points, cell_deg)), _directions(later.points, cell_deg))
+
+
+def repeats_rows(earlier: Scan, later: Scan) -> bool:
+    """Return whether a lidar measures in about the same rows, whatever the directions in them, in two scans."""
+    rows = np.unique(_rows(earlier.points))
+    by_chance = len(rows) / (np.ptp(rows) + 1) if len(rows) else 1.0
+    return by_chance < _MOST_FILLED and _repeats(rows, _rows(later.points), by_chance)
 
 
 def _repeats(before: Index, cells: Index, by_chance: float = 0.0) -> bool:

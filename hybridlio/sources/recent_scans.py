@@ -17,7 +17,8 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import EarlierScanPose, RelativePose, ResidualSource, TakesBack
 from hybridlio.core.motion_limits import PREDICTION_FLOOR_SIGMAS
 from hybridlio.core.sensors import Frame
-from hybridlio.sources.innovation_gate import GATE_NIS, normalised_innovation_squared
+from hybridlio.sources.gate.gate_result import GATE_NIS
+from hybridlio.sources.gate.innovation_gate import normalised_innovation_squared
 from hybridlio.sources.settings import RecentScansSettings
 
 _FLOOR = np.diag(PREDICTION_FLOOR_SIGMAS**2)  # of a scan relative to itself: exact, but to be positive definite

@@ -18,8 +18,8 @@ from hybridlio.registration.local_map import LocalMap
 from hybridlio.registration.motion_search import best_start, coarse_kernel_m, fits_better, motions, rotated
 from hybridlio.registration.results import ObservedRegistration
 from hybridlio.sources import map_errors
+from hybridlio.sources.gate.position_doubt import NEW_MAP
 from hybridlio.sources.matching_state import MatchingState, PathPoint
-from hybridlio.sources.position_doubt import NEW_MAP
 from hybridlio.sources.recent_points import RecentPoints
 from hybridlio.sources.refinding import REFOUND_COST, has_vague_start, starts_within
 from hybridlio.sources.scene_scale import SceneScale

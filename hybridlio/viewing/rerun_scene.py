@@ -11,7 +11,7 @@ import numpy as np
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array, Floats
 from hybridlio.core.trajectory import Trajectory
-from hybridlio.sources.innovation_gate import GATE_NIS
+from hybridlio.sources.gate.gate_result import GATE_NIS
 from hybridlio.viewing import colours
 from hybridlio.viewing import rerun_layout as names
 from hybridlio.viewing.scene import SUPPORTED, PlacedFixes, ViewedScan

@@ -22,7 +22,7 @@ from hybridlio.runs.folder import KEYFRAMES, StoredRun
 from hybridlio.runs.results.states import States
 from hybridlio.runs.run import Run
 from hybridlio.smoothing.gps_alignment import fix_stamps
-from hybridlio.sources.innovation_gate import Verdict
+from hybridlio.sources.gate.gate_result import Verdict
 
 if TYPE_CHECKING:
     from hybridlio.smoothing.gps_options import GpsFit

@@ -9,7 +9,7 @@ from walks import errors_of, estimated, walk
 from hybridlio.core import se3, start_state
 from hybridlio.core.sensors import Frame
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.odometry import start_up
+from hybridlio.odometry import measured_step
 from hybridlio.odometry.estimate import Estimate
 from hybridlio.simulation.faults import imu_scale_error
 from hybridlio.simulation.platforms.config import PlatformConfig
@@ -49,14 +49,14 @@ def test_the_first_scans_lie_as_later_ones_and_steps_do_not_swing_although_bias_
     assert yaw_error_rad(estimates, recording) < 5e-4
     assert largest_step_error_m(estimates, recording) < 0.02
 
-    monkeypatch.setattr(start_up, "_with_turn_rate", lambda *given: given[-1])  # the bias of the first scans stays
+    monkeypatch.setattr(measured_step, "_with_turn_rate", lambda *given: given[-1])  # the bias of the first scans stays
     turned = estimated(frames)
     assert yaw_error_rad(turned, recording) > 8e-4
 
-    monkeypatch.setattr(start_up, "_MOST_REPETITIONS", 1)  # the speed and the vertical at the start stay wrong
+    monkeypatch.setattr(measured_step, "_MOST_REPETITIONS", 1)  # the speed and the vertical at the start stay wrong
     monkeypatch.setattr(start_state, "_force_at", lambda _, imu: imu.accel_m_s2)
     assert largest_step_error_m(estimated(frames), recording) < 0.02
-    monkeypatch.setattr(start_up, "second_compensation", lambda *_: None)
+    monkeypatch.setattr(measured_step, "second_compensation", lambda *_: None)
     assert largest_step_error_m(estimated(frames), recording) > 0.03
 
 
@@ -70,5 +70,5 @@ def test_a_gyroscope_of_a_wrong_scale_distorts_fast_turns_less(monkeypatch: pyte
         return float(np.degrees(np.mean([np.linalg.norm(error[:3]) for error in errors[7:]])))
 
     twice = turn_error_deg()
-    monkeypatch.setattr(start_up, "second_compensation", lambda *_: None)
+    monkeypatch.setattr(measured_step, "second_compensation", lambda *_: None)
     assert twice < 0.7 * turn_error_deg()

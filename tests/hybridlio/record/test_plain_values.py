@@ -15,7 +15,7 @@ from hybridlio.core.errors import HybridLioError
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.sensors import ImuSamples
 from hybridlio.record.plain_values import decode, encode, restore, state_of
-from hybridlio.sources.innovation_gate import GateResult
+from hybridlio.sources.gate.gate_result import GateResult
 from hybridlio.sources.scan_matching import ScanMatching
 
 MALFORMED = (ValueError, TypeError, KeyError, IndexError, AttributeError, ImportError, struct.error, HybridLioError)

@@ -19,7 +19,7 @@ from hybridlio.record.record import Record
 from hybridlio.record.recorder import Recorder
 from hybridlio.runs.run import Run, run_odometry
 from hybridlio.runs.write import notes, write_run
-from hybridlio.sources.innovation_gate import GateResult
+from hybridlio.sources.gate.gate_result import GateResult
 from hybridlio.sources.residual_chain import NoResidual
 
 

@@ -17,7 +17,7 @@ from hybridlio.graph.run.inertial_initial_pose import Preintegration
 from hybridlio.graph.run.inertial_steps import InertialSteps
 from hybridlio.odometry.odometry import Odometry
 from hybridlio.sources.dead_reckoning import DeadReckoning
-from hybridlio.sources.innovation_gate import WARM_UP_STEPS
+from hybridlio.sources.gate.innovation_gate import WARM_UP_STEPS
 
 T_IMU_LIDAR = se3.exp(np.array([0.02, -0.01, 0.03, -0.8, 0.3, 0.8]))
 T_LIDAR_IMU = se3.inverse(T_IMU_LIDAR)

@@ -3,7 +3,7 @@ import pytest
 
 from hybridlio.core import se3
 from hybridlio.core.sensors import Scan
-from hybridlio.sources.recent_points import RecentPoints, repeats_directions, repeats_pattern
+from hybridlio.sources.recent_points import RecentPoints, repeats_directions, repeats_rows
 
 HERE = se3.exp(np.array([0.0, 0.1, 0.3, 1.0, -2.0, 0.5]))
 
@@ -61,21 +61,22 @@ def test_earlier_scans_are_moved_to_the_lidar_at_the_last_one(rng: np.random.Gen
 @pytest.mark.parametrize("count", [100, 300, 1000, 14000])
 def test_a_spinning_lidar_repeats_its_rows_however_few_of_its_points_are_left(rng: np.random.Generator, count: int):
     first, second = (Scan(k, rng.choice(rings(rng), count, replace=False).astype(np.float32)) for k in range(2))
-    assert repeats_pattern(first, second)
+    assert repeats_rows(first, second)
 
 
 @pytest.mark.parametrize("count", [1, 100, 300, 1000, 20000])
 def test_scattered_scans_repeat_nothing_however_many_points_they_have(rng: np.random.Generator, count: int):
     first, second = (Scan(k, scattered(rng, count).astype(np.float32)) for k in range(2))
-    assert not repeats_pattern(first, second)
+    assert not repeats_directions(first, second)
+    assert not repeats_rows(first, second)
 
 
 @pytest.mark.parametrize("share", [0.3, 0.5])
-def test_a_spinning_lidar_repeats_its_pattern_among_points_that_are_anywhere(rng: np.random.Generator, share: float):
+def test_a_spinning_lidar_repeats_its_rows_among_points_that_are_anywhere(rng: np.random.Generator, share: float):
     first, second = rings(rng), rings(rng)
     wrong = rng.random(len(second)) < share
     second[wrong] = scattered(rng, int(wrong.sum()))
-    assert repeats_pattern(Scan(0, first.astype(np.float32)), Scan(1, second.astype(np.float32)))
+    assert repeats_rows(Scan(0, first.astype(np.float32)), Scan(1, second.astype(np.float32)))
 
 
 @pytest.mark.parametrize(("count", "azimuth_deg", "elevations_deg"), [(24_000, 70, (-35, 35)), (20_000, 360, (-7, 52))])
@@ -91,7 +92,7 @@ def test_scans_that_have_a_point_in_every_degree_by_chance_repeat_nothing(
         for _ in range(2)
     )
     assert not repeats_directions(first, second)
-    assert not repeats_pattern(first, second)
+    assert not repeats_rows(first, second)
 
 
 @pytest.mark.parametrize("columns", [1024, 1800])

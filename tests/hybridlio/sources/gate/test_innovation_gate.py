@@ -14,8 +14,8 @@ from hybridlio.datasets.sequence import Sequence
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.estimate import Estimate
 from hybridlio.odometry.odometry import Odometry
-from hybridlio.sources.innovation_gate import (
-    GATE_NIS,
+from hybridlio.sources.gate.gate_result import GATE_NIS
+from hybridlio.sources.gate.innovation_gate import (
     GROSS_NIS,
     MAX_REJECTIONS,
     WARM_UP_STEPS,

@@ -12,7 +12,7 @@ from walks import errors_of, estimated, squared_position_errors, walk
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.sensors import NS_PER_S, Frame, ImuNoise, Scan
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.odometry import start_up
+from hybridlio.odometry import measured_step
 from hybridlio.odometry.config import Config
 from hybridlio.odometry.estimate import Estimate
 from hybridlio.odometry.odometry import Odometry
@@ -114,8 +114,8 @@ def test_a_start_in_a_flat_valley_waits_for_scans_that_settle_it() -> None:
 def test_a_false_start_that_the_imu_contradicts_is_not_claimed_to_be_sure(
     frames: list[Frame], recording: Sequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(start_up, "repeats_pattern", lambda *_: True)  # so that two scans decide, falsely
-    monkeypatch.setattr(start_up, "LOST_COST", 1.0)
+    monkeypatch.setattr(measured_step, "repeats_rows", lambda *_: True)  # so that two scans decide, falsely
+    monkeypatch.setattr(measured_step, "LOST_COST", 1.0)
     estimates = estimated(frames)
     errors = errors_of(estimates, recording.reference)
     assert np.linalg.norm(errors[-1][3:]) > 1

@@ -1,7 +1,7 @@
 """How far the IMU is believed: its noise as the innovations show it, and times in which its samples are left out.
 
-An IMU is left out when the scans contradict it (:mod:`hybridlio.sources.innovation_gate`). It comes back when it has
-agreed with the scans for a while. With each relapse that while doubles, so that a faulty IMU does harm a few times
+An IMU is left out when the scans contradict it (:mod:`~hybridlio.sources.gate.innovation_gate`). It comes back when it
+has agreed with the scans for a while. With each relapse that while doubles, so that a faulty IMU does harm a few times
 only, however long the run; with time in agreement it shrinks again.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from hybridlio.core.arrays import Array
 from hybridlio.core.sensors import NS_PER_S, Frame, ImuNoise, ImuSamples
-from hybridlio.sources.innovation_gate import GATE_NIS, GateResult
+from hybridlio.sources.gate.gate_result import GATE_NIS, GateResult
 
 _FIRST_WAIT_NS, _LONGEST_WAIT_NS = NS_PER_S, 64 * NS_PER_S  # one second shows a bend or braking; a minute, a street
 _FORGIVEN_AFTER = 10  # waits in agreement, after which the wait halves

@@ -12,7 +12,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.chi_square import chi_square_quantile
 from hybridlio.core.sensors import ImuSamples, Scan
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.odometry import start_up
+from hybridlio.odometry import measured_step
 from hybridlio.odometry.estimate import Estimate
 from hybridlio.odometry.odometry import Odometry
 from hybridlio.record import plain_values
@@ -88,7 +88,7 @@ def test_without_placing_the_first_scan_anew_it_would_be_degrees_off(
         return float(np.degrees(np.linalg.norm(errors[1:, :3], axis=1).min()))
 
     placed = turn_deg()
-    monkeypatch.setattr(start_up, "_placed", lambda *_: None)
+    monkeypatch.setattr(measured_step, "_placed", lambda *_: None)
     assert turn_deg() > 2 * placed
 
 

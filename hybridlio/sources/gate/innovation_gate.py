@@ -9,13 +9,12 @@ if the path that they found is smooth while the IMU contradicts two steps of it 
 jumps, or moves on beside its jump as the IMU predicts, the scan is. Scans that leave a direction unconstrained, as
 those of a narrow lidar on open ground do, drift smoothly and are no judges of the IMU.
 
-Where neither is shown to be right, the position is doubted (:mod:`hybridlio.sources.position_doubt`).
+Where neither is shown to be right, the position is doubted (:mod:`hybridlio.sources.gate.position_doubt`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,57 +22,16 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.motion_limits import UNKNOWN_TRANSLATION_SIGMA_M
-from hybridlio.sources.motion_change import MotionChange
-from hybridlio.sources.position_doubt import PositionDoubt
+from hybridlio.sources.gate.gate_result import GATE_NIS, UNTESTED, GateResult
+from hybridlio.sources.gate.motion_change import MotionChange
+from hybridlio.sources.gate.position_doubt import PositionDoubt
 
-Verdict = Literal["untested", "accepted", "undecided", "IMU left out", "down-weighted", "rejected", "relocated"]
-
-GATE_NIS = 27.86  # 99.99 % quantile of χ² with six degrees of freedom: one right measurement in 10,000 is above
 GROSS_NIS = 10 * GATE_NIS  # a right pose stays below even with covariances 10 times too small; above, the pose is wrong
 MAX_REJECTIONS = 5  # in a row: half a second at 10 Hz; the IMU bridges so long to a few decimetres
 WARM_UP_STEPS = 10  # one second at 10 Hz, in which speed, tilt and biases are still being found from the scans
 _BISECTIONS = 40  # halves the bracket to 1e-12 of its width, below any effect on a covariance
-
-
-@dataclass(frozen=True)
-class GateResult:
-    """Outcome of the gate at one step.
-
-    Attributes:
-        verdict: what was done with the relative pose:
-
-            * ``untested``: passed on; there is no usable prediction, or the run is in its first steps.
-            * ``accepted``: passed on; the innovation is within the gate.
-            * ``undecided``: a gross contradiction on a smooth path; replaced by the bridge, whose covariance spans
-              both; the IMU's samples are left out too. The residual source is asked to take the scan back; the next
-              scan decides.
-            * ``IMU left out``: passed on without the IMU's samples, which contradict the scans or did so lately.
-            * ``down-weighted``: passed on with a covariance inflated until the innovation is at the gate.
-            * ``rejected``: replaced by the bridge; the residual source is asked to take the scan back.
-            * ``relocated``: replaced by the bridge after too many rejections in a row, but the residual source
-              continues from where it found the scan.
-        nis: normalised innovation squared; None where untested.
-        parts: of rotation and translation alone, each divided by its three degrees of freedom.
-    """
-
-    verdict: Verdict
-    nis: float | None = None
-    parts: tuple[float, float] | None = None
-
-    @property
-    def uses_imu(self) -> bool:
-        """Whether the step's samples may go into the graph."""
-        return self.verdict not in ("undecided", "IMU left out")
-
-    @property
-    def takes_back(self) -> bool:
-        """Whether the residual source is to continue as if the scan had failed."""
-        return self.verdict in ("undecided", "rejected")
-
-
 # Verdicts after which the next scan is expected to continue this scan's motion; after others, that of the scan before
 _MOVES_ON = ("untested", "accepted", "undecided", "IMU left out")
-UNTESTED = GateResult("untested")
 
 
 def normalised_innovation_squared(measured: RelativePose, predicted: RelativePose) -> float:

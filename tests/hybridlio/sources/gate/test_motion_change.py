@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hybridlio.core import se3
-from hybridlio.sources.motion_change import MotionChange
+from hybridlio.sources.gate.motion_change import MotionChange
 
 DT_S = 0.1
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from hybridlio.core.sensors import ImuNoise
-from hybridlio.sources.imu_trust import ImuTrust
-from hybridlio.sources.innovation_gate import GateResult
+from hybridlio.sources.gate.gate_result import GateResult
+from hybridlio.sources.gate.imu_trust import ImuTrust
 
 STEP_NS = 100_000_000
 AGREES, OUT = GateResult("accepted", 6.0, (1.0, 1.0)), GateResult("IMU left out", 100.0)

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from hybridlio.core.estimates import RelativePose
-from hybridlio.sources.usual_fit import UsualFit
+from hybridlio.sources.gate.usual_fit import UsualFit
 
 NEW_MAP = "new_map"  # in the details of a failed relative pose: the residual source has begun a new map at its scan
 

@@ -7,7 +7,7 @@ import pytest
 
 from hybridlio.core import se3
 from hybridlio.core.estimates import RelativePose
-from hybridlio.sources.innovation_gate import InnovationGate
+from hybridlio.sources.gate.innovation_gate import InnovationGate
 
 COVARIANCE = np.diag(np.r_[np.full(3, 1e-3), np.full(3, 0.01)] ** 2)
 IMU = RelativePose(np.eye(4), COVARIANCE, "preintegration", from_imu=True)

@@ -8,7 +8,7 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.estimates import RelativePose
-from hybridlio.sources.innovation_gate import MAX_REJECTIONS, WARM_UP_STEPS, InnovationGate
+from hybridlio.sources.gate.innovation_gate import MAX_REJECTIONS, WARM_UP_STEPS, InnovationGate
 
 DT_S = 0.1
 COVARIANCE = np.diag(np.r_[np.full(3, 1e-3), np.full(3, 0.01)] ** 2)
