@@ -60,6 +60,7 @@ POINTS = tuple(f"{REGISTRATION}{name}.py" for name in ("point_to_point", "degene
 SEARCH = (f"{REGISTRATION}motion_search.py",)
 GATE = tuple(f"{SOURCES}{name}.py" for name in ("innovation_gate_constants", "innovation_gate"))
 MATCHING = tuple(f"{SOURCES}{name}.py" for name in ("scan_matching_constants", "scan_matching"))
+VISIBILITY = (f"{SOURCES}visibility.py",)
 
 TABLE = [
     *_in(
@@ -180,17 +181,20 @@ TABLE = [
         "hybridlio/sources/scan_matching.py",
         MATCHING,
         _UNKNOWN_ROTATION_SIGMA_RAD=("1e-5", "10.0"),
-        _LOST_COST=("0.01", "1.0"),
+        LOST_COST=("0.01", "1.0"),
         _LOST_SCANS=("1", "50"),
-        _YOUNG_MAP_INFLATION=("0.0", "100.0"),
-        _YOUNG_MAP_DRIFT_SHARE=("0.0", "50.0"),
-        _UNCHANGED_MAP_DRIFT_SHARE=("0.5", "0.0"),
     ),
+    *_in("hybridlio/sources/map_errors.py", MATCHING, _YOUNG_MAP_INFLATION=("0.0", "100.0")),
+    *_in("hybridlio/sources/map_errors.py", MATCHING, _YOUNG_MAP_DRIFT_SHARE=("0.0", "50.0")),
+    *_in("hybridlio/sources/map_errors.py", MATCHING, _UNCHANGED_MAP_DRIFT_SHARE=("0.5", "0.0")),
     *_in("hybridlio/sources/thinned_scan.py", MATCHING, _VOXEL_SHRINKAGE=("0.1",), _AMPLE=("0.1",)),
+    *_in("hybridlio/sources/visibility.py", VISIBILITY, _LOST=("np.log([0.3, 0.6])", "np.log([0.9, 0.9])")),
+    *_in("hybridlio/sources/visibility.py", VISIBILITY, _WIDE_VIEW_M=("1.0", "30.0"), _LONGEST_S=("0.3", "30.0")),
+    *_in("hybridlio/sources/visibility.py", VISIBILITY, _MEMORY_SCANS=("1", "1000")),
     *_in(
         "hybridlio/sources/scene_scale.py",
         (f"{SOURCES}scene_scale.py",),
-        _STREET_VIEW_M=("3.0", "40.0"),
+        STREET_VIEW_M=("3.0", "40.0"),
         _STEPS=("1", "20"),
         _HYSTERESIS=("0.5", "4.0"),
         _NEW_SHARE=("0.01", "1.0"),

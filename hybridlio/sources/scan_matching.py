@@ -25,6 +25,7 @@ from hybridlio.sources.refinding import REFOUND_COST, has_vague_start, starts_wi
 from hybridlio.sources.scene_scale import SceneScale
 from hybridlio.sources.settings import ScanMatchingSettings
 from hybridlio.sources.thinned_scan import ThinnedScan, thin
+from hybridlio.sources.visibility import Visibility
 
 # An initial rotation less certain than this (all axes together) is searched for as well: 1.1°, which displaces points
 # 10 m away by 0.2 m, two of the default kernels.
@@ -50,7 +51,7 @@ class ScanMatching:
     NOT_STATE = ("_before",)
 
     def __init__(self, settings: ScanMatchingSettings | None = None) -> None:
-        self._scale = SceneScale(settings or ScanMatchingSettings())
+        self._scale, self._visibility = SceneScale(settings or ScanMatchingSettings()), Visibility()
         self._map, self._covered = LocalMap(self.settings.local_map), np.inf
         self._state = MatchingState(PathPoint(np.eye(4)), PathPoint(np.eye(4)))
         self._stamp_ns = 0
@@ -101,7 +102,7 @@ class ScanMatching:
         self._insert_pending_keyframe()
         self.recent.observe(frame.scan)
         self._before = self._state, self._stamp_ns
-        self.current_scan = scan = self._thin(frame.scan)
+        self.current_scan = scan = self._thin(frame.scan, initial.from_imu)
         dt_s, self._stamp_ns = (frame.scan.stamp_ns - self._stamp_ns) / NS_PER_S, frame.scan.stamp_ns
         usable = len(scan.points) >= self.settings.min_points and self._map.surface is not None
         coverage = self._covered / max(len(scan.points), 1)
@@ -121,17 +122,17 @@ class ScanMatching:
         """The settings at the scene's scale."""
         return self._scale.settings
 
-    def _thin(self, scan: Scan) -> ThinnedScan:
+    def _thin(self, scan: Scan, has_imu: bool = False) -> ThinnedScan:
         """Thin a scan at the scene's scale, which it may change; the map then goes on at the new one."""
         thinned = thin(scan, self.settings)
+        if self._visibility.is_lost(scan, thinned.view_m) and has_imu:
+            return thinned.emptied()
         return thin(scan, self.settings) if self._rescale(scan, thinned) else thinned
 
     def _rescale(self, scan: Scan, thinned: ThinnedScan) -> bool:
         """Let the scale of the scene follow the scan; return whether it has changed."""
-        if len(scan) < self.settings.min_points:
-            return False
-        changed = self._scale.observe(thinned.view_m, len(thinned.points), len(scan))
-        if changed:
+        enough = len(scan) >= self.settings.min_points
+        if changed := enough and self._scale.observe(thinned.view_m, len(thinned.points), len(scan)):
             self._map.rescale(self.settings.local_map)
         return changed
 
@@ -207,8 +208,7 @@ class ScanMatching:
     @property
     def _keyframes(self) -> int:
         """Number of keyframes in the map, with the pending one."""
-        is_single = self.settings.target == "last-scan"
-        return 1 if is_single else self._map.keyframes + (self._state.keyframe is not None)
+        return 1 if self.settings.target == "last-scan" else self._map.keyframes + (self._state.keyframe is not None)
 
     def _covariance(self, observed: ObservedRegistration, keyframes: int) -> Array:
         return observed.covariance(self.settings.covariance_scale * map_errors.inflation(keyframes))

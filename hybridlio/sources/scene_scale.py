@@ -31,7 +31,7 @@ from hybridlio.registration.settings import LocalMapSettings, RegistrationSettin
 from hybridlio.sources.settings import ScanMatchingSettings
 
 # View of the smallest scene with scale 1: two thirds of the shortest of six simulated road drives, 18 m.
-_STREET_VIEW_M = 12.0
+STREET_VIEW_M = 12.0
 # Smallest scale: a factor of 8, for a view of 1.5 m, that of a narrow stairwell. Voxels of 7.5 cm are still several
 # times the noise of a range.
 _STEPS = 6
@@ -99,7 +99,7 @@ class SceneScale:
 
     def _move_scale(self, view_m: float) -> bool:
         is_first = self._view.value is None
-        smoothed = min(max(self._view.add(math.log(_STREET_VIEW_M / view_m, _STEP)), 0.0), float(_STEPS))
+        smoothed = min(max(self._view.add(math.log(STREET_VIEW_M / view_m, _STEP)), 0.0), float(_STEPS))
         if abs(smoothed - self._step) < (_ROUNDING if is_first else _HYSTERESIS):
             return False
         self._step = round(smoothed)
@@ -123,7 +123,7 @@ def scale_of(view_m: float) -> float:
     """Return the scale, at most 1, of the scene of one scan by its view, rounded to a step; 1 without a view."""
     if not view_m > 0:
         return 1.0
-    return float(_STEP ** -min(max(round(math.log(_STREET_VIEW_M / view_m, _STEP)), 0), _STEPS))
+    return float(_STEP ** -min(max(round(math.log(STREET_VIEW_M / view_m, _STEP)), 0), _STEPS))
 
 
 class _Smoothed:

@@ -38,6 +38,10 @@ class ThinnedScan:
     view_m: float
     settings: LocalMapSettings
 
+    def emptied(self) -> ThinnedScan:
+        """Return the scan without its points."""
+        return ThinnedScan(self.points[:0], self.source[:0], self.view_m, self.settings)
+
     @cached_property
     def surface(self) -> Surface | None:
         """The scan alone as a surface to register others to, in its own frame; None where it makes no planes."""
