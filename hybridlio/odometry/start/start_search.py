@@ -11,31 +11,30 @@ corrects the steps before.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from hybridlio.cloud.deskew import deskew
 from hybridlio.cloud.voxel import voxel_pick
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.chi_square import chi_square_quantile
-from hybridlio.core.estimates import EarlierScanPose, RelativePose, State
+from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.motion_limits import (
     MEAN_ACCELERATION_SIGMA_M_S2,
-    MEASUREMENT_FLOOR_SIGMAS,
     POINT_LEVER_M,
     UNKNOWN_SPEED_SIGMA_M_S,
 )
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples
 from hybridlio.odometry.inertial_motion import inertial_motion
+from hybridlio.odometry.start.motion_spread import MOST_SCANS, MotionSpread
 from hybridlio.registration.base_motion import BaseMotion
 from hybridlio.registration.cost_profile import PROBE_STEP_M
 from hybridlio.registration.joint_motion import SIZE, JointMotion, JointPoints, JointProblem
 from hybridlio.sources.settings import ScanMatchingSettings
 
-_LEAST_SCANS, _MOST_SCANS = 4, 10  # with four, all of 54 starts in six recordings were right to 7 cm; ten are a second
+_LEAST_SCANS = 4  # with four, all of 54 starts in six recordings were right to 7 cm
 _LONGEST_S = 2.0  # over which one acceleration and one rate of turn describe what the IMU does not
 # Rise of the cost over its scatter at which a motion is dropped: that of an observed direction
 # (hybridlio/registration/cost_profile.py). From three scans on: the minima of two are where they like.
@@ -44,19 +43,13 @@ _DROPPING_SCANS = 3
 # Of the squared normalised change of the scan before by a new one, and scans in a row below it. The first scans of a
 # lidar of few rings have a flat valley of costs, in which the minimum still moves by ten standard deviations.
 _SETTLED, _SETTLED_SCANS = chi_square_quantile(0.99, 6), 2
-_TEMPERATURE = 1.5  # of the weights of motions that are left, as there
+_MOST_LEVEL = 0.5  # sine of the angle between a direction that counts as level and the horizontal
 _FEW_JUDGED, _JUDGED = 500, 2000  # points to compare starts, some hundreds of a scan; and to find each minimum
 _COARSE_STEPS, _FINE_STEPS = 6, 5  # the kernel is halved from 1 m to 0.1 m in four
 _MOST_MOTIONS = 6
 # On the variance of independent residuals: that of scan matching, doubled. In the 54 starts above the squared
 # normalised error per axis was 1.6 with scan matching's.
 _SHARED_ERROR_SCALE = 2.0
-# On the variance of steps before the decision, as all of these scans may repeat one false motion. Their points count
-# again in the decided poses. In 46 starts of a rosette, a tenth at most of what they claim counts: with all of it the
-# squared normalised error of positions is 2.3 over the first 1.6 s, so it is 0.8, and with a hundredth the steps of
-# slow starts are lost (0.035 instead of 0.031 m).
-_UNDECIDED_SCALE = float(_MOST_SCANS)
-_FLOOR = np.diag(MEASUREMENT_FLOOR_SIGMAS**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,15 +84,22 @@ class StartSearch:
         settings: of scan matching, at the scale of its scene.
         calibration: the extrinsics.
         noise: the IMU's.
+        repeats: whether the lidar repeats its pattern from scan to scan.
         leads: whether its steps are those of the run until it has decided.
     """
 
-    NOT_STATE = ("_settings", "_calibration", "_noise")
+    NOT_STATE = ("_settings", "_calibration", "_noise", "_repeats")
 
     def __init__(
-        self, first: Frame, settings: ScanMatchingSettings, calibration: Calibration, noise: ImuNoise, leads: bool
+        self,
+        first: Frame,
+        settings: ScanMatchingSettings,
+        calibration: Calibration,
+        noise: ImuNoise,
+        repeats: bool,
+        leads: bool,
     ) -> None:
-        self.leads = leads
+        self.leads, self._repeats = leads, repeats
         self._settings, self._calibration, self._noise = settings, calibration, noise
         self._frames = [first]
         self._motions: list[JointMotion] = []
@@ -120,15 +120,16 @@ class StartSearch:
         self._frames.append(frame)
         problem = self._problem(base)
         self._motions = self._minima(problem)
-        is_last = len(self._frames) >= _MOST_SCANS
+        is_last = len(self._frames) >= MOST_SCANS
         is_unique = len(self._motions) == 1 and len(self._frames) >= _LEAST_SCANS
         slowest = min(range(len(self._motions)), key=lambda i: float(np.linalg.norm(self._motions[i].motion[3:6])))
         chosen = 0 if is_last else slowest
         poses = [base.poses_beside(one.motion) for one in self._motions]
         unsettled = self._unsettled(poses[chosen])
         self._settled = 0 if self.last is None or unsettled.any() else self._settled + 1
-        is_decided = is_unique and self._settled >= _SETTLED_SCANS and self._is_observed(problem, self._motions[0])
-        spread = _Spread(base, self._motions, poses, chosen)
+        is_decided = is_unique and self._settled >= _SETTLED_SCANS
+        is_decided = is_decided and self._is_observed(problem, self._motions[0], poses[0], start)
+        spread = MotionSpread(base, self._motions, poses, chosen)
         motion = self._motions[chosen]
         self.last = StartEstimate(
             replace(
@@ -205,14 +206,27 @@ class StartSearch:
         is_allowed = moved @ np.linalg.solve(self.last.covariance, moved) < _SETTLED
         return np.zeros(6) if is_allowed else moved / since_s
 
-    def _is_observed(self, problem: JointProblem, found: JointMotion) -> bool:
+    def _is_observed(self, problem: JointProblem, found: JointMotion, poses: Array, start: State) -> bool:
         """Return whether costs rise on both sides of the motion, along the direction that constrains it least."""
         last_s = float(problem.points.times_s.max())
         weakest = np.linalg.eigh(found.covariance[3:6, 3:6])[1][:, -1]
+        if self._may_match_itself(weakest, poses, start):
+            return False
         aside = np.r_[np.zeros(3), weakest * PROBE_STEP_M / last_s, np.zeros(3)]
         stride = max(1, len(problem.points.times_s) // _JUDGED)
         there = (problem.with_stride(stride).solve(found.motion + side * aside, 0.0, 0) for side in (-1, 1))
         return all(one.rise_over_scatter(found) > _DROPPED_RATIO for one in there)
+
+    def _may_match_itself(self, direction: Array, poses: Array, start: State) -> bool:
+        """Return whether a lidar's own pattern, which fits best where it has not moved, may hold it along a direction.
+
+        As in registration to a single scan (:mod:`hybridlio.registration.degeneracy`), by less than half a metre a
+        scan. Upwards it does not: speeds there are small, and walls show the turns that go with heights.
+        """
+        up = (start.T_world_imu[:3, :3] @ self._calibration.T_imu_lidar[:3, :3]).T @ start.gravity_m_s2
+        is_level = abs(direction @ up) < _MOST_LEVEL * np.linalg.norm(up)
+        steps_m = np.abs(np.diff(poses[:, :3, 3], axis=0) @ direction)
+        return bool(self._repeats and is_level and steps_m.max() < PROBE_STEP_M)
 
     def _distinct(self, found: list[JointMotion]) -> list[JointMotion]:
         """Return minima that put the last scan at different places, the lowest cost first."""
@@ -228,60 +242,3 @@ class StartSearch:
 def _displacement_m(motion: Array, time_s: float) -> float:
     shift = time_s * motion[3:6] + time_s**2 / 2 * motion[6:]
     return float(np.linalg.norm(shift) + POINT_LEVER_M * time_s * np.linalg.norm(motion[:3]))
-
-
-@dataclass(frozen=True, eq=False)
-class _Spread:
-    """The uncertainty of relative poses: of the chosen motion, its distance from the others, and what it still moves.
-
-    ``unsettled`` ``(6,)`` is by how much the last scan has moved the motion, per second since the first.
-    """
-
-    base: BaseMotion
-    motions: list[JointMotion]
-    poses: list[Array]
-    chosen: int
-    unsettled: Array = field(default_factory=lambda: np.zeros(6))
-
-    def step(self, source: str, is_decided: bool) -> RelativePose:
-        """Return the step to the last scan; once decided, with its poses relative to all scans before."""
-        poses, stamps_ns, last = self.poses[self.chosen], self.base.stamps_ns, len(self.base.stamps_ns) - 1
-        step = se3.between(poses[last - 1], poses[last])
-        if not is_decided:  # the errors of all these steps are one and the same, and do not cancel
-            return RelativePose(step, _UNDECIDED_SCALE * self.covariance(0, last), source)
-        # As many poses as scans before show one motion, and count as independent: together they weigh as it does.
-        earlier = (
-            EarlierScanPose(stamps_ns[j], se3.between(poses[j], poses[last]), last * self.covariance(j, last))
-            for j in range(last - 1)
-        )
-        return RelativePose(step, last * self.covariance(last - 1, last), source, earlier_scans=tuple(earlier))
-
-    def covariance(self, j: int, k: int) -> Array:
-        """Return the covariance ``(6, 6)`` of scan ``k``'s pose in scan ``j``'s frame.
-
-        Rotation and translation of one motion against another are taken as independent: between motions that lie metres
-        apart there is nothing in between, and a rotation that the gyroscope corrects slightly must not move the lidar.
-        """
-        rises = np.array([motion.rise_over_scatter(self.motions[0]) for motion in self.motions])
-        weights = np.exp(-rises / _TEMPERATURE)
-        weights /= weights.sum()
-        step = se3.between(self.poses[self.chosen][j], self.poses[self.chosen][k])
-        time_s = self.base.times_s[k] - self.base.times_s[j]
-        total = _FLOOR + self._of_motion(j, k) + _two_blocks(time_s * self.unsettled)
-        for weight, poses in zip(weights, self.poses, strict=True):
-            total = total + weight * _two_blocks(se3.log(se3.between(step, se3.between(poses[j], poses[k]))))
-        return np.asarray(total)
-
-    def _of_motion(self, j: int, k: int) -> Array:
-        """Return the part by the chosen motion's own covariance."""
-        t, R = self.base.times_s, self.poses[self.chosen][k][:3, :3]
-        to_step = np.zeros((6, SIZE))
-        to_step[:3, :3] = (t[k] - t[j]) * R.T
-        to_step[3:, 3:6] = (t[k] - t[j]) * R.T
-        to_step[3:, 6:] = (t[k] ** 2 - t[j] ** 2) / 2 * R.T
-        return np.asarray(to_step @ self.motions[self.chosen].covariance @ to_step.T)
-
-
-def _two_blocks(apart: Array) -> Array:
-    """Return the covariance ``(6, 6)`` of a displacement ``(6,)`` with its rotation and translation independent."""
-    return np.asarray(block_diag(*(np.outer(part, part) for part in (apart[:3], apart[3:]))))

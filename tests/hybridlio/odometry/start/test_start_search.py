@@ -9,6 +9,7 @@ import pytest
 from resumed import check_resumed_at
 from walks import errors_of, estimated, squared_position_errors, walk
 
+from hybridlio.core import se3
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.sensors import NS_PER_S, Frame, ImuNoise, Scan
 from hybridlio.datasets.sequence import Sequence
@@ -25,6 +26,7 @@ OPEN_ABOVE = PlatformConfig(scene="office", platform="handheld", lidar="vlp-16",
 OPEN_ABOVE_FROM = 60
 # Here the first two scans do not fit each other, and four leave a flat valley of costs: heights with rotations.
 VALLEY = PlatformConfig(scene="office", platform="handheld", lidar="vlp-16", seconds=1.2, seed=8101)
+OFFICE = PlatformConfig(scene="office", platform="handheld", lidar="os0", seconds=1.6, seed=8522)
 # Starts before one wall, along which nothing shows the motion from the second second on.
 WALL = PlatformConfig(scene="office", platform="handheld", lidar="rosette", seconds=12.0, seed=8501)
 
@@ -109,6 +111,28 @@ def test_a_start_in_a_flat_valley_waits_for_scans_that_settle_it() -> None:
     assert squared_position_errors(estimates, errors).max() < 9
     assert max(np.linalg.norm(error[3:]) for error in errors) < 0.05
     assert max(np.linalg.norm(error[:3]) for error in errors[8:]) < 0.006
+
+
+def test_two_scans_that_turn_otherwise_than_the_gyroscope_do_not_decide_a_start(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    recording = walk(OFFICE, 0, 6)
+    frames = list(recording)
+    R = se3.so3_exp(np.array([0.0, 0.0, np.radians(10.0)]))
+    frames[1] = replace(frames[1], scan=replace(frames[1].scan, points=frames[1].scan.points @ R.T.astype(np.float32)))
+
+    def errors() -> tuple[float, float]:
+        estimates = estimated(frames)
+        found = errors_of(estimates, recording.reference)
+        return float(np.linalg.norm(found[-1][:3])), float(squared_position_errors(estimates, found)[1:].max())
+
+    turn_rad, squared = errors()
+    assert turn_rad < np.radians(2)
+    assert squared < 3
+    monkeypatch.setattr(measured_step, "_TURN_SIGMA_RAD", 1.0)  # so that every turn is believed
+    turn_rad, squared = errors()
+    assert turn_rad > np.radians(10)
+    assert squared > 15
 
 
 def test_a_false_start_that_the_imu_contradicts_is_not_claimed_to_be_sure(
