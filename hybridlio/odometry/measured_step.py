@@ -38,7 +38,7 @@ _EXCLUDED_TURN = chi_square_quantile(0.999, 3)
 # Of a first turn by two scans that fit each other: 1.1°, which displaces points 10 m away by two default kernels. In 44
 # recordings of rooms, roads and woods it is at most 0.7° off, and 16° where the scans fit each other wrongly.
 _TURN_SIGMA_RAD = 0.02
-# Beside where several scans place a scan, its own match is another minimum: its points are off the surfaces. With half a
+# Beside where several scans place a scan, its own match is another minimum, with points off the surfaces. With half a
 # metre an office (16 beams) starts 0.3 m too high with σ 3 cm; otherwise 131 starts of all scenes hardly change.
 _ELSEWHERE_KERNELS = 2.0
 _LONGEST_WITHOUT_IMU_NS = 2 * NS_PER_S  # after which the first scan is given up: later ones no longer see what it saw
