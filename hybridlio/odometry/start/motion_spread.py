@@ -11,7 +11,6 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import EarlierScanPose, RelativePose
 from hybridlio.core.motion_limits import MEASUREMENT_FLOOR_SIGMAS
-from hybridlio.registration.base_motion import BaseMotion
 from hybridlio.registration.joint_motion import SIZE, JointMotion
 
 _TEMPERATURE = 1.5  # of the weights of motions that are left, as in hybridlio/registration/cost_profile.py
@@ -28,10 +27,16 @@ _FLOOR = np.diag(MEASUREMENT_FLOOR_SIGMAS**2)
 class MotionSpread:
     """The uncertainty of relative poses: of the chosen motion, its distance from the others, and what it still moves.
 
-    ``unsettled`` ``(6,)`` is by how much the last scan has moved the motion, per second since the first.
+    Attributes:
+        stamps_ns, times_s: of the scans, and their times since the first ``(K,)``.
+        motions: those that are left, the best first.
+        poses: of each, the ``(K, 4, 4)`` poses of the scans.
+        chosen: number of the motion whose poses are given.
+        unsettled: ``(6,)`` by how much the last scan has moved the motion, per second since the first.
     """
 
-    base: BaseMotion
+    stamps_ns: list[int]
+    times_s: Array
     motions: list[JointMotion]
     poses: list[Array]
     chosen: int
@@ -39,7 +44,7 @@ class MotionSpread:
 
     def step(self, source: str, is_decided: bool) -> RelativePose:
         """Return the step to the last scan; once decided, with its poses relative to all scans before."""
-        poses, stamps_ns, last = self.poses[self.chosen], self.base.stamps_ns, len(self.base.stamps_ns) - 1
+        poses, stamps_ns, last = self.poses[self.chosen], self.stamps_ns, len(self.stamps_ns) - 1
         step = se3.between(poses[last - 1], poses[last])
         if not is_decided:  # the errors of all these steps are one and the same, and do not cancel
             return RelativePose(step, _UNDECIDED_SCALE * self.covariance(0, last), source)
@@ -60,7 +65,7 @@ class MotionSpread:
         weights = np.exp(-rises / _TEMPERATURE)
         weights /= weights.sum()
         step = se3.between(self.poses[self.chosen][j], self.poses[self.chosen][k])
-        time_s = self.base.times_s[k] - self.base.times_s[j]
+        time_s = self.times_s[k] - self.times_s[j]
         total = _FLOOR + self._of_motion(j, k) + _two_blocks(time_s * self.unsettled)
         for weight, poses in zip(weights, self.poses, strict=True):
             total = total + weight * _two_blocks(se3.log(se3.between(step, se3.between(poses[j], poses[k]))))
@@ -68,7 +73,7 @@ class MotionSpread:
 
     def _of_motion(self, j: int, k: int) -> Array:
         """Return the part by the chosen motion's own covariance."""
-        t, R = self.base.times_s, self.poses[self.chosen][k][:3, :3]
+        t, R = self.times_s, self.poses[self.chosen][k][:3, :3]
         to_step = np.zeros((6, SIZE))
         to_step[:3, :3] = (t[k] - t[j]) * R.T
         to_step[3:, 3:6] = (t[k] - t[j]) * R.T

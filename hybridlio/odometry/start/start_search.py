@@ -129,7 +129,7 @@ class StartSearch:
         self._settled = 0 if self.last is None or unsettled.any() else self._settled + 1
         is_decided = is_unique and self._settled >= _SETTLED_SCANS
         is_decided = is_decided and self._is_observed(problem, self._motions[0], poses[0], start)
-        spread = MotionSpread(base, self._motions, poses, chosen)
+        spread = MotionSpread(base.stamps_ns, base.times_s, self._motions, poses, chosen)
         motion = self._motions[chosen]
         self.last = StartEstimate(
             replace(
