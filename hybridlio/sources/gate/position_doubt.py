@@ -33,6 +33,7 @@ class PositionDoubt:
         self._stays_m2 = 0.0
         self._unconfirmed_m = 0.0  # length of the path since the IMU last confirmed it
         self._accepted_in_a_row = 0
+        self._contradicted = False  # a scan has contradicted the IMU grossly; the IMU has not agreed since
         self._misfit = False  # scans that fit poorly have contradicted the IMU, or failed; the IMU has not agreed since
 
     @property
@@ -69,12 +70,18 @@ class PositionDoubt:
             self._unconfirmed_m = 0.0
 
     def _note_fit(self, measured: RelativePose, verdict: str, is_gross: bool) -> None:
-        """Note whether scans fit the map poorly that contradict the IMU grossly, or match nowhere; the IMU ends it."""
-        if verdict == "accepted":
-            self._misfit = self._misfit and self._accepted_in_a_row < self._confirmed_after
-            self._fit.learn(measured.details)
-        elif not measured.ok or (is_gross and verdict in ("undecided", "rejected", "relocated")):
+        """Note whether scans fit the map poorly since one contradicted the IMU grossly, or match nowhere.
+
+        The scan that contradicts may itself fit well, on the few points that it shares with the map.
+        """
+        is_refused = is_gross and verdict in ("undecided", "rejected", "relocated")
+        is_confirmed = self._accepted_in_a_row >= self._confirmed_after
+        self._contradicted = (self._contradicted or is_refused) and not is_confirmed
+        self._misfit = self._misfit and not is_confirmed
+        if self._contradicted or not measured.ok:
             self._misfit = self._misfit or self._fit.is_poor(measured.details)
+        elif verdict == "accepted":
+            self._fit.learn(measured.details)
 
     def _goes_on_from_misfit(self, measured: RelativePose, verdict: str) -> bool:
         """Whether the path goes on from a scan that does not fit the map, and by more than the IMU's bridge."""

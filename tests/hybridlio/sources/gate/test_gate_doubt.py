@@ -133,3 +133,16 @@ def test_a_contradiction_by_scans_that_fit_as_usual_is_no_jump() -> None:
     gate = gate_after(2 * WARM_UP_STEPS + 1)
     contradicted(gate, 5.0, matched=0.85)
     assert gate.doubt.m2 == 0
+
+
+def test_a_contradiction_is_doubted_once_scans_after_it_fit_poorly_until_the_imu_has_confirmed_the_path() -> None:
+    gate = gate_after(2 * WARM_UP_STEPS + 1)
+    contradicted(gate, 5.0, matched=0.85)
+    contradicted(gate, 1.0, matched=0.4)
+    assert gate.doubt.m2 == (5.0 + 3.0) ** 2
+    gate = gate_after(2 * WARM_UP_STEPS + 1)
+    contradicted(gate, 5.0, matched=0.85)
+    for _ in range(2 * WARM_UP_STEPS):
+        contradicted(gate, 1.0)
+    contradicted(gate, 1.0, matched=0.4)
+    assert gate.doubt.m2 == 0
