@@ -6,8 +6,11 @@ from __future__ import annotations
 # between them are guesses. Its covariance is inflated by 1 + 5/keyframes, and at least half of it, divided by
 # the number of keyframes, is drift, because the map is as wrong as the few scans that it consists of.
 _YOUNG_MAP_INFLATION, _YOUNG_MAP_DRIFT_SHARE = 5.0, 0.5
-# Steps along an unchanged map do not drift against it. The share is above 0 because a covariance has to be definite.
-_UNCHANGED_MAP_DRIFT_SHARE = 1e-3
+# Steps along an unchanged map do not drift against it; a share above 0 keeps the covariance definite. But a map
+# of few scans has planes between their rings that lean, and poses against it err more and more as the rings move on: a
+# tenth for one keyframe, less with their square. Over 40 first seconds with 16 beams (rooms, roads, woods) the mean
+# squared normalised errors of positions and rotations are 1.7 and 2.3 without that, and 1.2 and 1.6 with it.
+_UNCHANGED_MAP_DRIFT_SHARE, _UNCHANGED_YOUNG_MAP_DRIFT_SHARE = 1e-3, 0.1
 
 
 def inflation(keyframes: int) -> float:
@@ -18,11 +21,14 @@ def inflation(keyframes: int) -> float:
 def drift_share(map_changed: bool, keyframes: int, least: float) -> float:
     """Return the share of a step's covariance that adds up over steps.
 
-    Errors against one map cancel from step to step. What adds up is the error of each keyframe that joins it.
+    Errors against one map of many scans cancel from step to step. What adds up is the error of each keyframe that joins
+    it, and errors against a map of few scans.
 
     Args:
         map_changed: whether the map has got a keyframe since the last step.
         keyframes: number of keyframes in the map.
         least: share at a keyframe that joins an old map.
     """
-    return max(least, _YOUNG_MAP_DRIFT_SHARE / keyframes) if map_changed else _UNCHANGED_MAP_DRIFT_SHARE
+    if map_changed:
+        return max(least, _YOUNG_MAP_DRIFT_SHARE / keyframes)
+    return max(_UNCHANGED_MAP_DRIFT_SHARE, _UNCHANGED_YOUNG_MAP_DRIFT_SHARE / keyframes**2)
