@@ -203,7 +203,9 @@ class _Probe:
 
     def _deviations(self, covariance: Array) -> Array:
         """Return the standard deviations ``(D,)`` along the weak directions, m, of a covariance ``(6, 6)``."""
-        return np.asarray(np.sqrt(np.einsum("ij,jk,ik->i", self.to_weak, covariance, self.to_weak)))
+        variances = np.einsum("ij,jk,ik->i", self.to_weak, covariance, self.to_weak)
+        # rounding leaves less than 0 along directions that are fixed
+        return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
     def refine_by_points(
         self, found: Registration, sigmas_m: Array, is_observed: NDArray[np.bool_]
