@@ -58,8 +58,11 @@ MAP = tuple(f"{REGISTRATION}{name}.py" for name in ("local_map_limits", "local_m
 PLANES = ("tests/hybridlio/cloud/test_plane_fitting.py", "tests/hybridlio/cloud/test_normals.py", *MAP)
 POINTS = tuple(f"{REGISTRATION}{name}.py" for name in ("point_to_point", "degeneracy"))
 SEARCH = (f"{REGISTRATION}motion_search.py",)
-GATE = tuple(f"{SOURCES}{name}.py" for name in ("innovation_gate_constants", "innovation_gate"))
+GATE = tuple(
+    f"tests/hybridlio/sources/gate/test_{name}.py" for name in ("innovation_gate_constants", "innovation_gate")
+)
 MATCHING = tuple(f"{SOURCES}{name}.py" for name in ("scan_matching_constants", "scan_matching"))
+START = ("tests/hybridlio/odometry/start/test_start_search.py",)
 VISIBILITY = (f"{SOURCES}visibility.py",)
 
 TABLE = [
@@ -168,10 +171,10 @@ TABLE = [
         _SAME_RING_RAD=("np.deg2rad(0.001)", "np.deg2rad(3.0)"),
         _MIN_OTHER_RINGS=("0", "8"),
     ),
+    *_in("hybridlio/sources/gate/gate_result.py", GATE, GATE_NIS=("5.0", "300.0")),
     *_in(
         "hybridlio/sources/gate/innovation_gate.py",
         GATE,
-        GATE_NIS=("5.0", "300.0"),
         GROSS_NIS=("30.0", "1e6"),
         MAX_REJECTIONS=("1", "50"),
         WARM_UP_STEPS=("0", "100"),
@@ -187,6 +190,8 @@ TABLE = [
     *_in("hybridlio/sources/map_errors.py", MATCHING, _YOUNG_MAP_INFLATION=("0.0", "100.0")),
     *_in("hybridlio/sources/map_errors.py", MATCHING, _YOUNG_MAP_DRIFT_SHARE=("0.0", "50.0")),
     *_in("hybridlio/sources/map_errors.py", MATCHING, _UNCHANGED_MAP_DRIFT_SHARE=("0.5", "0.0")),
+    *_in("hybridlio/sources/map_errors.py", MATCHING, _UNCHANGED_YOUNG_MAP_DRIFT_SHARE=("0.0", "1.0")),
+    *_in("hybridlio/odometry/measured_step.py", START, _TURN_SIGMA_RAD=("1.0",)),
     *_in("hybridlio/sources/thinned_scan.py", MATCHING, _VOXEL_SHRINKAGE=("0.1",), _AMPLE=("0.1",)),
     *_in("hybridlio/sources/visibility.py", VISIBILITY, _LOST=("np.log([0.3, 0.6])", "np.log([0.9, 0.9])")),
     *_in("hybridlio/sources/visibility.py", VISIBILITY, _WIDE_VIEW_M=("1.0", "30.0"), _LONGEST_S=("0.3", "30.0")),

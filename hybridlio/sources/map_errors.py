@@ -6,11 +6,12 @@ from __future__ import annotations
 # between them are guesses. Its covariance is inflated by 1 + 5/keyframes, and at least half of it, divided by
 # the number of keyframes, is drift, because the map is as wrong as the few scans that it consists of.
 _YOUNG_MAP_INFLATION, _YOUNG_MAP_DRIFT_SHARE = 5.0, 0.5
-# Steps along an unchanged map do not drift against it; a share above 0 keeps the covariance definite. But a map
-# of few scans has planes between their rings that lean, and poses against it err more and more as the rings move on: a
-# tenth for one keyframe, less with their square. Over 40 first seconds with 16 beams (rooms, roads, woods) the mean
-# squared normalised errors of positions and rotations are 1.7 and 2.3 without that, and 1.2 and 1.6 with it.
-_UNCHANGED_MAP_DRIFT_SHARE, _UNCHANGED_YOUNG_MAP_DRIFT_SHARE = 1e-3, 0.1
+# Steps along an unchanged map do not drift against it; a share above 0 keeps the covariance definite. But a map of few
+# scans has planes between their rings that lean, and poses against it err more and more as the rings move on: a tenth
+# for one keyframe, less with their cube. Over 40 first seconds with 16 beams (rooms, roads, woods) the mean squared
+# normalised errors of positions and rotations are 1.7 and 2.3 without that, and 1.2 and 1.6 with it.
+_UNCHANGED_MAP_DRIFT_SHARE = 1e-3
+_UNCHANGED_YOUNG_MAP_DRIFT_SHARE = 0.1
 
 
 def inflation(keyframes: int) -> float:
@@ -18,7 +19,7 @@ def inflation(keyframes: int) -> float:
     return 1 + _YOUNG_MAP_INFLATION / keyframes
 
 
-def drift_share(map_changed: bool, keyframes: int, least: float) -> float:
+def drift_share(map_changed: bool, keyframes: int, least: float, has_rings: bool = True) -> float:
     """Return the share of a step's covariance that adds up over steps.
 
     Errors against one map of many scans cancel from step to step. What adds up is the error of each keyframe that joins
@@ -28,7 +29,8 @@ def drift_share(map_changed: bool, keyframes: int, least: float) -> float:
         map_changed: whether the map has got a keyframe since the last step.
         keyframes: number of keyframes in the map.
         least: share at a keyframe that joins an old map.
+        has_rings: whether a keyframe is one scan of a lidar that repeats its pattern, with gaps between its rings.
     """
     if map_changed:
         return max(least, _YOUNG_MAP_DRIFT_SHARE / keyframes)
-    return max(_UNCHANGED_MAP_DRIFT_SHARE, _UNCHANGED_YOUNG_MAP_DRIFT_SHARE / keyframes**2)
+    return max(_UNCHANGED_MAP_DRIFT_SHARE, has_rings * _UNCHANGED_YOUNG_MAP_DRIFT_SHARE / keyframes**3)

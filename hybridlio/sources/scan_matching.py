@@ -215,9 +215,9 @@ class ScanMatching:
 
     def _drift(self, covariance: Array, map_changed: bool) -> Array | None:
         """Return the part of a step's covariance that adds up over steps; None if all of it does."""
-        if self.settings.target == "last-scan":
-            return None
-        return map_errors.drift_share(map_changed, self._keyframes, self.settings.drift_share) * covariance
+        least, repeats = self.settings.drift_share, self.recent.repeats
+        is_all = self.settings.target == "last-scan"
+        return None if is_all else map_errors.drift_share(map_changed, self._keyframes, least, repeats) * covariance
 
     def _insert_pending_keyframe(self) -> None:
         """Insert the last scan into the map if it is a keyframe; otherwise use the time to rebuild the map if due."""
