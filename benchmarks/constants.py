@@ -190,10 +190,10 @@ TABLE = [
     *_in("hybridlio/sources/visibility.py", VISIBILITY, _LOST=("np.log([0.3, 0.6])", "np.log([0.9, 0.9])")),
     *_in("hybridlio/sources/visibility.py", VISIBILITY, _WIDE_VIEW_M=("1.0", "30.0"), _LONGEST_S=("0.3", "30.0")),
     *_in("hybridlio/sources/visibility.py", VISIBILITY, _MEMORY_SCANS=("1", "1000")),
+    *_in("hybridlio/sources/settings.py", (f"{SOURCES}scene_scale.py",), STREET_VIEW_M=("3.0", "40.0")),
     *_in(
         "hybridlio/sources/scene_scale.py",
         (f"{SOURCES}scene_scale.py",),
-        STREET_VIEW_M=("3.0", "40.0"),
         _STEPS=("1", "20"),
         _HYSTERESIS=("0.5", "4.0"),
         _NEW_SHARE=("0.01", "1.0"),

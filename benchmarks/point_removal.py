@@ -89,7 +89,7 @@ def variants(drive: Drive) -> Iterator[tuple[Scan, ...]]:
         standing = np.abs(measured_m - exact_m) <= MOVING_SIGMAS * drive.model.range_sigma_m
         smooth = standing.copy()
         smooth[standing] = roughness_m(drive.directions[ray[standing]] * exact_m[standing, None]) <= ROUGH_M
-        yield scan, part_of(scan, standing), part_of(scan, smooth)
+        yield scan, scan.part(standing), scan.part(smooth)
 
 
 def roughness_m(points: Array) -> Array:
@@ -97,13 +97,6 @@ def roughness_m(points: Array) -> Array:
     neighbours, _ = build_tree(points, 1).batch_knn_search(points, NEIGHBOURS)
     mean_squares, _ = principal_axes(points[neighbours])
     return np.asarray(np.sqrt(np.maximum(mean_squares[:, 0], 0.0)))
-
-
-def part_of(scan: Scan, keep: Array) -> Scan:
-    """Return the scan with some of its points."""
-    intensity = None if scan.intensity is None else scan.intensity[keep]
-    offsets_ns = None if scan.time_offsets_ns is None else scan.time_offsets_ns[keep]
-    return Scan(scan.stamp_ns, scan.points[keep], intensity, offsets_ns)
 
 
 def figures(sequence: Sequence, scans: tuple[Scan, ...]) -> Figures:

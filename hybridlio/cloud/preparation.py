@@ -147,8 +147,4 @@ def prepare(scan: Scan, options: PreparationOptions | None = None, motion: Traje
 def _crop(scan: Scan, min_range_m: float, max_range_m: float) -> Scan:
     squared = np.einsum("ij,ij->i", scan.points, scan.points)
     keep = (squared >= np.float32(min_range_m) ** 2) & (squared <= np.float32(max_range_m) ** 2)
-    if keep.all():
-        return scan
-    intensity = None if scan.intensity is None else scan.intensity[keep]
-    offsets = None if scan.time_offsets_ns is None else scan.time_offsets_ns[keep]
-    return Scan(scan.stamp_ns, scan.points[keep], intensity, offsets)
+    return scan if keep.all() else scan.part(keep)

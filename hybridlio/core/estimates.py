@@ -26,7 +26,7 @@ import numpy as np
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.covariance import check_covariance
-from hybridlio.core.sensors import Frame
+from hybridlio.core.sensors import Calibration, Frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +149,11 @@ class State:
     covariance: Array
     gravity_covariance: Array
     has_imu: bool = True
+
+    def up_in_lidar(self, calibration: Calibration) -> Array:
+        """Return the direction ``(3,)`` of up in the frame of the lidar at the state's stamp, of length 1."""
+        R_world_lidar = self.T_world_imu[:3, :3] @ calibration.T_imu_lidar[:3, :3]
+        return np.asarray(R_world_lidar.T @ -self.gravity_m_s2 / np.linalg.norm(self.gravity_m_s2))
 
 
 class InitialPoseSource(Protocol):

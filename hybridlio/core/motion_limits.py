@@ -1,9 +1,9 @@
-"""How a vehicle moves between measurements: accelerations, rates and speeds that all rooms assume.
+"""What is assumed of motion that no sensor has measured yet: accelerations, rates and speeds, for every platform alike.
 
-These numbers describe a road vehicle; another kind of vehicle changes this one file. Each is one standard deviation
-unless its name says ``LARGEST``. Where they come from: full braking on a dry road reaches 7 to 9 m/s²; braking and
-cornering in ordinary traffic stay below 3 m/s² nine times in ten; a yaw rate of 0.6 rad/s is a right-angle bend in
-three seconds.
+Each is one standard deviation. With an IMU they hold until its samples do, and where these have gaps. Without one,
+predictions are as uncertain as the last steps have changed (:mod:`hybridlio.sources.gate.motion_change`), and at least
+as uncertain as these numbers: those of calm motion, such as a car in traffic, whose braking and cornering stay below
+3 m/s² nine times in ten (full braking on a dry road reaches 7 to 9 m/s²).
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ ANGULAR_ACCELERATION_SIGMA_RAD_S2 = 0.5  # change of angular velocity between tw
 JERK_SIGMA_M_S3 = 5.0  # change of acceleration between two samples; builds up full braking in 1.6 s
 MEAN_ACCELERATION_SIGMA_M_S2 = 1.5  # mean over the first samples; tilts the vertical measured from them by 0.15 rad
 BRIDGED_ACCELERATION_SIGMA_M_S2 = 3.0  # acceleration over a step without samples; hard braking reaches twice that
-LARGEST_ACCELERATION_M_S2 = 4.0  # harder braking is an emergency
-LARGEST_RATE_RAD_S = 0.6  # a right-angle bend in three seconds
+LARGEST_ACCELERATION_M_S2 = 4.0  # of a step or its part without samples, taken as one σ; harder braking is an emergency
+LARGEST_RATE_RAD_S = 0.6  # likewise; a right-angle bend in three seconds
 
 UNKNOWN_SPEED_SIGMA_M_S = 20.0  # 72 km/h: one σ covers towns, two a motorway
-UNKNOWN_RATE_SIGMA_RAD_S = 0.3  # half the largest rate
+UNKNOWN_RATE_SIGMA_RAD_S = 0.3  # two σ are a right-angle bend in three seconds; faster ones are searched for
+LEVEL_SINE = 0.5  # a direction within 30° of the horizontal counts as level, and one within 30° of the vertical as up
 SWEEP_RATE_SIGMA_RAD_S = 0.02  # pitch and roll of a car on its springs about the mean rate over a step
 
 # Floors of a predicted step's standard deviations (rad, m). No prediction is better, and GTSAM needs a positive
@@ -45,7 +46,7 @@ VAGUE_TRANSLATION_SIGMA_M = 0.1
 
 
 def unknown_motion_covariance(dt_s: float) -> Array:
-    """Return the covariance ``(6, 6)`` of a step of ``dt_s`` seconds of which only the vehicle's limits are known."""
+    """Return the covariance ``(6, 6)`` of a step of ``dt_s`` seconds of a motion that nothing is known of."""
     sigmas = np.r_[np.full(3, UNKNOWN_RATE_SIGMA_RAD_S), np.full(3, UNKNOWN_SPEED_SIGMA_M_S)] * dt_s
     return np.diag(sigmas**2 + PREDICTION_FLOOR_SIGMAS**2)
 

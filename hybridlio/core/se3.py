@@ -73,6 +73,14 @@ def so3_left_jacobian(rotvec: ArrayLike) -> Array:
     return np.asarray(np.eye(3) + a * K + b * (K @ K))
 
 
+def so3_chain(turns: Array) -> Array:
+    """Return rotations ``(N + 1, 3, 3)`` to the first frame, by rotations ``(N, 3, 3)`` from each frame to the next."""
+    out = [np.eye(3)]
+    for turn in turns:
+        out.append(out[-1] @ turn)
+    return np.array(out)
+
+
 def make(R: ArrayLike, t: ArrayLike) -> Array:
     """Return poses ``(..., 4, 4)`` with rotations ``(..., 3, 3)`` and translations ``(..., 3)`` in metres."""
     R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
@@ -182,6 +190,18 @@ def as_floats(values: ArrayLike, name: str) -> Array:
 
 def _not_numbers(values: ArrayLike, name: str) -> DataError:
     return DataError(f"{name}: expected numbers, got {type(values).__name__} {shown(values)}")
+
+
+def check_position(values: ArrayLike, name: str) -> Array:
+    """Return a position as float64 ``(3,)``.
+
+    Raises:
+        DataError: it is not three finite numbers.
+    """
+    position = as_floats(values, name)
+    if position.shape != (3,) or not np.isfinite(position).all():
+        raise DataError(f"{name}: expected three finite coordinates in metres, got {position.tolist()}")
+    return position
 
 
 def check_pose(T: ArrayLike, name: str) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import NS_PER_S as NS_PER_S
-from hybridlio.core.arrays import Array, Floats, Stamps
+from hybridlio.core.arrays import Array, Floats, Index, Mask, Stamps
 from hybridlio.core.covariance import check_covariance
 from hybridlio.core.errors import DataError
 from hybridlio.core.geodesy import GeodeticPoint
@@ -66,6 +66,12 @@ class Scan:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def part(self, rows: Mask | Index) -> Scan:
+        """Return the scan with some of its points, by a mask or by their rows."""
+        intensity = None if self.intensity is None else self.intensity[rows]
+        offsets_ns = None if self.time_offsets_ns is None else self.time_offsets_ns[rows]
+        return Scan(self.stamp_ns, self.points[rows], intensity, offsets_ns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,10 +162,7 @@ class ImuSamples:
 
     def orientations(self, bias_rad_s: Array) -> Array:
         """Return rotations ``(S, 3, 3)`` from each sample's frame to the first's, by rates without a bias ``(3,)``."""
-        out = [np.eye(3)]
-        for turn in se3.so3_exp(self.turns(bias_rad_s)):
-            out.append(out[-1] @ turn)
-        return np.array(out)
+        return se3.so3_chain(se3.so3_exp(self.turns(bias_rad_s)))
 
     def largest_turn_rad(self, bias_rad_s: Array) -> float:
         """Return the largest turn from the first sample to any other: the length of the rates' integral."""
@@ -240,10 +243,7 @@ class GpsFix:
 
     def __post_init__(self) -> None:
         name = f"GPS fix at {self.stamp_ns} ns"
-        position = np.asarray(self.position_m, dtype=np.float64)
-        if position.shape != (3,) or not np.isfinite(position).all():
-            raise DataError(f"{name}: expected three finite coordinates, got {position.tolist()}")
-        object.__setattr__(self, "position_m", position)
+        object.__setattr__(self, "position_m", se3.check_position(self.position_m, name))
         object.__setattr__(self, "covariance_m2", check_covariance(self.covariance_m2, name, 3))
 
 
@@ -269,10 +269,7 @@ class Calibration:
         if self.T_camera_lidar is not None:
             object.__setattr__(self, "T_camera_lidar", se3.check_pose(self.T_camera_lidar, "T_camera_lidar"))
         if self.antenna_imu_m is not None:
-            antenna = np.asarray(self.antenna_imu_m, dtype=np.float64)
-            if antenna.shape != (3,) or not np.isfinite(antenna).all():
-                raise DataError(f"antenna_imu_m: expected three finite numbers, got {antenna.tolist()}")
-            object.__setattr__(self, "antenna_imu_m", antenna)
+            object.__setattr__(self, "antenna_imu_m", se3.check_position(self.antenna_imu_m, "antenna_imu_m"))
 
 
 @dataclass(frozen=True, eq=False)

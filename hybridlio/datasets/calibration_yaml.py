@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.errors import DataError
 from hybridlio.core.files import read_yaml
@@ -131,7 +132,7 @@ def _stated(content: dict[str, Any]) -> StatedCalibration:
     T_camera_lidar = read("T_camera_lidar", parse_transform, None)
     lidar, limits_m = _lidar("lidar", content["lidar"]) if content.get("lidar") is not None else (None, None)
     return StatedCalibration(
-        calibration=Calibration(T_imu_lidar, T_camera_lidar, read("antenna_imu_m", _three_numbers, None)),
+        calibration=Calibration(T_imu_lidar, T_camera_lidar, read("antenna_imu_m", _position, None)),
         lidar=lidar,
         imu_noise=_stated_noise(content),
         imu_time_offset_s=read("imu_time_offset_s", _time_offset_s, None),
@@ -161,19 +162,13 @@ def _mapping(key: str, value: Any, keys: tuple[str, ...]) -> dict[str, Any]:
     return value
 
 
-def _three_numbers(key: str, value: Any) -> Array:
-    try:
-        numbers = np.array(value, dtype=np.float64)
-    except (ValueError, TypeError):
-        numbers = np.empty(0)
-    if numbers.shape != (3,) or not np.isfinite(numbers).all():
-        raise DataError(f"{key} must be three finite numbers in metres")
-    return numbers
+def _position(key: str, value: Any) -> Array:
+    return se3.check_position(value, key)
 
 
 def _vehicle(key: str, value: Any) -> Box:
     parts = _mapping(key, value, _VEHICLE_KEYS)
-    low, high = (_three_numbers(f"{key}: {name}", parts.get(name)) for name in _VEHICLE_KEYS)
+    low, high = (_position(f"{key}: {name}", parts.get(name)) for name in _VEHICLE_KEYS)
     if not (low < high).all():
         raise DataError(f"{key}: each number of min must be below that of max, got {low.tolist()} and {high.tolist()}")
     return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -78,10 +78,8 @@ class MergedScans:
 
     def _moved(self, scan: Scan, T_first_other: Array) -> Scan:
         points = se3.transform(T_first_other, scan.points).astype(np.float32)
-        keep = np.ones(len(points), bool) if self.vehicle is None else ~self.vehicle.holds(points)
-        intensity = None if scan.intensity is None else scan.intensity[keep]
-        offsets = None if scan.time_offsets_ns is None else scan.time_offsets_ns[keep]
-        return Scan(scan.stamp_ns, points[keep], intensity, offsets)
+        moved = replace(scan, points=points)
+        return moved if self.vehicle is None else moved.part(~self.vehicle.holds(points))
 
 
 def _joined(stamp_ns: int, parts: list[Scan], shifts_ns: list[int]) -> Scan:

@@ -216,7 +216,7 @@ class _PosedScans:
             scan = deskew(scan, motion)
         square = np.einsum("ij,ij->i", scan.points, scan.points)
         kept = (square > self._settings.min_range_m**2) & (square < self._settings.max_range_m**2)
-        return Scan(scan.stamp_ns, scan.points[kept], None if scan.intensity is None else scan.intensity[kept])
+        return scan.part(kept)
 
     def compared(self) -> list[int]:
         """Return the rows of the scans to compare for moving objects, apart in distance or time."""

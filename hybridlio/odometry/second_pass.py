@@ -15,7 +15,7 @@ import numpy as np
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RefinesAgain, RelativePose, State, TakesBack
-from hybridlio.core.motion_limits import POINT_LEVER_M, UNKNOWN_TRANSLATION_SIGMA_M
+from hybridlio.core.motion_limits import LEVEL_SINE, POINT_LEVER_M, UNKNOWN_TRANSLATION_SIGMA_M
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples
 from hybridlio.odometry.inertial_motion import lidar_turn
 
@@ -27,7 +27,6 @@ _SIGMAS = 3.0  # of the gyroscope's scale
 # 0.03 m/s² at 200 Hz) and a standing person's tremor, and below those of a walk (from 0.3 m/s²) or of motors.
 _QUIET_RAD_S, _QUIET_M_S2, _FEWEST_QUIET, _BIAS_SIGMAS = 0.02, 0.15, 5, 3.0
 _REST_M_S = 0.1  # 1 cm at 10 Hz, the error of a step; a standing person sways by less
-_MOST_LEVEL = 0.5  # sine of the angle between an open direction and the vertical
 _ANY_TURN_RAD = 10.0
 
 
@@ -112,12 +111,12 @@ def held_at_rest(calibration: Calibration, frame: Frame, step: RelativePose, bef
     """
     if not (step.ok and len(step.degenerate) and _is_quiet(frame.imu, before)):
         return step
-    up = (before.T_world_imu[:3, :3] @ calibration.T_imu_lidar[:3, :3]).T @ before.gravity_m_s2
-    level = np.eye(3) - np.outer(up, up) / (up @ up)
+    up = before.up_in_lidar(calibration)
+    level = np.eye(3) - np.outer(up, up)
     rest_m = _REST_M_S * (frame.scan.stamp_ns - before.stamp_ns) / NS_PER_S
     if (
         np.linalg.norm(level @ step.pose[:3, 3]) > rest_m
-        or np.linalg.norm(step.degenerate[:, 3:] @ level, axis=1).max() > _MOST_LEVEL
+        or np.linalg.norm(step.degenerate[:, 3:] @ level, axis=1).max() > LEVEL_SINE
     ):
         return step
     moved, rest = se3.log(step.pose), np.diag(np.r_[np.full(3, _ANY_TURN_RAD), np.full(3, rest_m)] ** 2)

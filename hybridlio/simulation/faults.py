@@ -10,7 +10,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from hybridlio.core.arrays import Mask
 from hybridlio.core.errors import ConfigError
 from hybridlio.core.sensors import NS_PER_S, ImuNoise, ImuSamples, Scan
 from hybridlio.datasets.sequence import Sequence
@@ -69,10 +68,7 @@ def block_sector(
 def _without_sector(scan: Scan, middle_deg: float, width_deg: float) -> Scan:
     azimuth = np.degrees(np.arctan2(scan.points[:, 1], scan.points[:, 0]))
     off_middle = np.abs((azimuth - middle_deg + 180.0) % 360.0 - 180.0)
-    keep: Mask = off_middle > width_deg / 2
-    intensity = None if scan.intensity is None else scan.intensity[keep]
-    offsets = None if scan.time_offsets_ns is None else scan.time_offsets_ns[keep]
-    return Scan(scan.stamp_ns, scan.points[keep], intensity, offsets)
+    return scan.part(off_middle > width_deg / 2)
 
 
 def lidar_errors(

@@ -144,7 +144,7 @@ def up_of(record: Record) -> Array:
     """Return up ``(3,)`` in the first scan's frame; the lidar's z axis without inertial data."""
     if not record.start.has_imu:
         return np.array([0.0, 0.0, 1.0])
-    return np.asarray(record.calibration.T_imu_lidar[:3, :3].T @ -record.start.gravity_m_s2)
+    return record.start.up_in_lidar(record.calibration)
 
 
 def _by_verdict(found: list[tuple[Candidate, Verdict]], rows: Index) -> tuple[list[Loop], list[RejectedLoop]]:

@@ -22,10 +22,8 @@ from hybridlio.sources.gate.position_doubt import NEW_MAP
 from hybridlio.sources.matching_state import MatchingState, PathPoint
 from hybridlio.sources.recent_points import RecentPoints
 from hybridlio.sources.refinding import REFOUND_COST, has_vague_start, starts_within
-from hybridlio.sources.scene_scale import SceneScale
 from hybridlio.sources.settings import ScanMatchingSettings
-from hybridlio.sources.thinned_scan import ThinnedScan, thin
-from hybridlio.sources.visibility import Visibility
+from hybridlio.sources.thinned_scan import SceneThinning, ThinnedScan, thin
 
 # An initial rotation less certain than this (all axes together) is searched for as well: 1.1°, which displaces points
 # 10 m away by 0.2 m, two of the default kernels.
@@ -51,7 +49,7 @@ class ScanMatching:
     NOT_STATE = ("_before",)
 
     def __init__(self, settings: ScanMatchingSettings | None = None) -> None:
-        self._scale, self._visibility = SceneScale(settings or ScanMatchingSettings()), Visibility()
+        self._scene = SceneThinning(settings or ScanMatchingSettings())
         self._map, self._covered = LocalMap(self.settings.local_map), np.inf
         self._state = MatchingState(PathPoint(np.eye(4)), PathPoint(np.eye(4)))
         self._stamp_ns = 0
@@ -65,9 +63,7 @@ class ScanMatching:
         Raises:
             DataError: it has too few points.
         """
-        scan = self._thin(frame.scan)
-        while self._rescale(frame.scan, scan):  # until its settings are its own; later ones follow scan by scan
-            scan = thin(frame.scan, self.settings)
+        scan = self._scene.thin_first(frame.scan)
         if len(scan.points) < self.settings.min_points:
             raise DataError(
                 f"frame {frame.index}: only {len(scan.points)} points between {self.settings.min_range_m:.2g} "
@@ -78,8 +74,7 @@ class ScanMatching:
         self.recent = self.recent.emptied()
         self.recent.observe(frame.scan)
         self.recent.add(scan.points, np.eye(4))
-        self.current_scan = scan
-        self._stamp_ns = frame.scan.stamp_ns
+        self.current_scan, self._stamp_ns = scan, frame.scan.stamp_ns
 
     def start_from(self, frames: Sequence[Frame], poses: Array) -> None:
         """Start at the last of two or more scans with known poses ``(K, 4, 4)``; the map is made of all of them.
@@ -102,7 +97,17 @@ class ScanMatching:
         self._insert_pending_keyframe()
         self.recent.observe(frame.scan)
         self._before = self._state, self._stamp_ns
-        self.current_scan = scan = self._thin(frame.scan, initial.from_imu)
+        return self._match(frame, self._thin(frame.scan, initial.from_imu), initial)
+
+    def refine_again(self, frame: Frame, initial: RelativePose) -> RelativePose:
+        """Register the last scan, which matched, once more as it is compensated now, in place of that match."""
+        self._state, self._stamp_ns = self._before
+        self.recent.discard_last()
+        return self._match(frame, thin(frame.scan, self.settings), initial)
+
+    def _match(self, frame: Frame, scan: ThinnedScan, initial: RelativePose) -> RelativePose:
+        """Register a thinned scan, or bridge it where that fails."""
+        self.current_scan = scan
         dt_s, self._stamp_ns = (frame.scan.stamp_ns - self._stamp_ns) / NS_PER_S, frame.scan.stamp_ns
         usable = len(scan.points) >= self.settings.min_points and self._map.surface is not None
         coverage = self._covered / max(len(scan.points), 1)
@@ -111,30 +116,18 @@ class ScanMatching:
             return self._bridge(scan, initial, observed)
         return self._accept(scan, initial, observed, dt_s)
 
-    def refine_again(self, frame: Frame, initial: RelativePose) -> RelativePose:
-        """Register the last scan, which matched, once more as it is compensated now, in place of that match."""
-        self._state, self._stamp_ns = self._before
-        self.recent.discard_last()
-        return self.refine(frame, initial)
-
     @property
     def settings(self) -> ScanMatchingSettings:
         """The settings at the scene's scale."""
-        return self._scale.settings
+        return self._scene.settings
 
     def _thin(self, scan: Scan, has_imu: bool = False) -> ThinnedScan:
         """Thin a scan at the scene's scale, which it may change; the map then goes on at the new one."""
-        thinned = thin(scan, self.settings)
-        if self._visibility.is_lost(scan, thinned.view_m) and has_imu:
-            return thinned.emptied()
-        return thin(scan, self.settings) if self._rescale(scan, thinned) else thinned
-
-    def _rescale(self, scan: Scan, thinned: ThinnedScan) -> bool:
-        """Let the scale of the scene follow the scan; return whether it has changed."""
-        enough = len(scan) >= self.settings.min_points
-        if changed := enough and self._scale.observe(thinned.view_m, len(thinned.points), len(scan)):
+        before = self.settings
+        thinned = self._scene.thin(scan, has_imu)
+        if self.settings is not before:
             self._map.rescale(self.settings.local_map)
-        return changed
+        return thinned
 
     def take_back(self, initial: RelativePose) -> None:
         """Discard the last match: the path continues by ``initial``, and the scan does not enter the map."""

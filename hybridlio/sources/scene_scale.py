@@ -28,10 +28,8 @@ from dataclasses import replace
 from typing import TypeVar
 
 from hybridlio.registration.settings import LocalMapSettings, RegistrationSettings
-from hybridlio.sources.settings import ScanMatchingSettings
+from hybridlio.sources.settings import STREET_VIEW_M, ScanMatchingSettings
 
-# View of the smallest scene with scale 1: two thirds of the shortest of six simulated road drives, 18 m.
-STREET_VIEW_M = 12.0
 # Smallest scale: a factor of 8, for a view of 1.5 m, that of a narrow stairwell. Voxels of 7.5 cm are still several
 # times the noise of a range.
 _STEPS = 6

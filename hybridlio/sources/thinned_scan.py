@@ -13,7 +13,9 @@ from hybridlio.core.sensors import Scan
 from hybridlio.registration.local_map import LocalMap
 from hybridlio.registration.settings import LocalMapSettings
 from hybridlio.registration.surface import Surface
+from hybridlio.sources.scene_scale import SceneScale
 from hybridlio.sources.settings import ScanMatchingSettings
+from hybridlio.sources.visibility import Visibility
 
 _VOXEL_SHRINKAGE = 0.7  # halves a voxel's area, so about doubles its points, at each try to use more of a sparse scan
 # A scan of this many times `least_measured` points is never too sparse: a quarter of them at least is registered with
@@ -48,6 +50,46 @@ class ThinnedScan:
         alone = LocalMap(self.settings)
         alone.insert(self.points, np.eye(4))
         return alone.surface
+
+
+class SceneThinning:
+    """Thins scans at the scale of the scene, which follows them; each scan is to be shown once.
+
+    Args:
+        given: the settings at scale 1.
+    """
+
+    def __init__(self, given: ScanMatchingSettings) -> None:
+        self._scale, self._visibility = SceneScale(given), Visibility()
+
+    @property
+    def settings(self) -> ScanMatchingSettings:
+        """The settings at the scene's scale."""
+        return self._scale.settings
+
+    def thin_first(self, scan: Scan) -> ThinnedScan:
+        """Return the first scan at the scale that is its own; that of later ones follows scan by scan."""
+        thinned = self.thin(scan)
+        while self._rescale(scan, thinned):
+            thinned = thin(scan, self.settings)
+        return thinned
+
+    def thin(self, scan: Scan, has_imu: bool = False) -> ThinnedScan:
+        """Return the next scan at the scene's scale, which it may change.
+
+        Args:
+            scan: compensated.
+            has_imu: whether an IMU can do without this scan; it then has no points if the air hides the scene.
+        """
+        thinned = thin(scan, self.settings)
+        if self._visibility.is_lost(scan, thinned.view_m) and has_imu:
+            return thinned.emptied()
+        return thin(scan, self.settings) if self._rescale(scan, thinned) else thinned
+
+    def _rescale(self, scan: Scan, thinned: ThinnedScan) -> bool:
+        """Let the scale follow the scan; return whether it has changed."""
+        enough = len(scan) >= self.settings.min_points
+        return enough and self._scale.observe(thinned.view_m, len(thinned.points), len(scan))
 
 
 def thin(scan: Scan, settings: ScanMatchingSettings) -> ThinnedScan:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from hybridlio.core.sensors import NS_PER_S, Scan
-from hybridlio.sources.scene_scale import STREET_VIEW_M
+from hybridlio.sources.settings import STREET_VIEW_M
 
 # Of the usual number of returns, and of the usual view. Inside simulated clouds they are 0.13 to 0.47 and 0.23 to 0.54
 # (benchmarks/point_removal.py, dust, seeds 8191 and 8192). In 34 recordings of other platforms one of both is 1.2 times

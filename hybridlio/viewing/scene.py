@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -156,5 +156,4 @@ def thinned(scan: Scan, count: int = SHOWN_POINTS) -> Scan:
     if len(scan) <= count:
         return scan
     rows = np.linspace(0, len(scan) - 1, count).astype(np.intp)  # a whole number as step could pick one beam of many
-    offsets = None if scan.time_offsets_ns is None else scan.time_offsets_ns[rows]
-    return Scan(scan.stamp_ns, scan.points[rows], None, offsets)
+    return replace(scan, intensity=None).part(rows)

@@ -22,6 +22,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.chi_square import chi_square_quantile
 from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.motion_limits import (
+    LEVEL_SINE,
     MEAN_ACCELERATION_SIGMA_M_S2,
     POINT_LEVER_M,
     UNKNOWN_SPEED_SIGMA_M_S,
@@ -43,7 +44,6 @@ _DROPPING_SCANS = 3
 # Of the squared normalised change of the scan before by a new one, and scans in a row below it. The first scans of a
 # lidar of few rings have a flat valley of costs, in which the minimum still moves by ten standard deviations.
 _SETTLED, _SETTLED_SCANS = chi_square_quantile(0.99, 6), 2
-_MOST_LEVEL = 0.5  # sine of the angle between a direction that counts as level and the horizontal
 _FEW_JUDGED, _JUDGED = 500, 2000  # points to compare starts, some hundreds of a scan; and to find each minimum
 _COARSE_STEPS, _FINE_STEPS = 6, 5  # the kernel is halved from 1 m to 0.1 m in four
 _MOST_MOTIONS = 6
@@ -223,8 +223,7 @@ class StartSearch:
         As in registration to a single scan (:mod:`hybridlio.registration.degeneracy`), by less than half a metre a
         scan. Upwards it does not: speeds there are small, and walls show the turns that go with heights.
         """
-        up = (start.T_world_imu[:3, :3] @ self._calibration.T_imu_lidar[:3, :3]).T @ start.gravity_m_s2
-        is_level = abs(direction @ up) < _MOST_LEVEL * np.linalg.norm(up)
+        is_level = abs(direction @ start.up_in_lidar(self._calibration)) < LEVEL_SINE
         steps_m = np.abs(np.diff(poses[:, :3, 3], axis=0) @ direction)
         return bool(self._repeats and is_level and steps_m.max() < PROBE_STEP_M)
 
