@@ -152,6 +152,19 @@ def test_an_invalid_fix_is_refused_with_its_stamp(position, covariance, says) ->
         GpsFix(7, np.array(position), covariance)
 
 
+@pytest.mark.parametrize("has_columns", [True, False])
+def test_a_part_of_a_scan_keeps_what_belongs_to_its_points(has_columns: bool) -> None:
+    rng, count = np.random.default_rng(5), 40
+    intensity, offsets = (rng.random(count), rng.integers(0, 10**8, count)) if has_columns else (None, None)
+    scan = Scan(7, rng.normal(size=(count, 3)), intensity, offsets)
+    mask = rng.random(count) < 0.5
+    for part in (scan.part(mask), scan.part(np.flatnonzero(mask))):
+        assert part.stamp_ns == 7
+        for name in ("points", "intensity", "time_offsets_ns"):
+            whole, kept = getattr(scan, name), getattr(part, name)
+            assert (kept is None) if whole is None else (kept == whole[mask]).all()
+
+
 @pytest.mark.parametrize("name", list(LIDAR_MODELS))
 def test_beams_of_each_lidar_go_from_the_top_down(name: str) -> None:
     model = LIDAR_MODELS[name]

@@ -11,6 +11,7 @@ from hybridlio.core.estimates import RelativePose
 from hybridlio.core.motion_limits import unknown_motion_covariance
 from hybridlio.core.sensors import Frame, Scan
 from hybridlio.datasets.sequence import Sequence
+from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.sources.scan_matching import ScanMatching
 from hybridlio.sources.settings import ScanMatchingSettings
 
@@ -64,6 +65,22 @@ def test_a_scan_that_is_matched_again_is_matched_as_if_once(sequence: Sequence, 
     for once, twice in zip(steps[:3], steps[3:], strict=True):
         np.testing.assert_array_equal(once.pose, twice.pose)
         np.testing.assert_array_equal(once.covariance, twice.covariance)
+
+
+def test_a_scan_that_is_matched_again_counts_once_for_the_scale_of_the_scene(sequence: Sequence, frames: list[Frame]):
+    """A running mean over scans that shrink to a room's size goes as far with a second match of each as without."""
+    scales = []
+    for again in (False, True):
+        matching = ScanMatching(ScanMatchingSettings(registration=RegistrationSettings(max_distance_m=3.0)))
+        matching.start(frames[0])
+        for k in range(1, 6):
+            smaller = with_points(frames[k], frames[k].scan.points * 0.85**k)
+            matching.refine(smaller, guess(np.eye(4)))
+            if again:
+                matching.refine_again(smaller, guess(np.eye(4)))
+            scales.append(matching.settings.map_voxel_m)
+    assert scales[:5] == scales[5:]
+    assert scales[4] < scales[0]
 
 
 @pytest.mark.parametrize("target", TARGETS)
