@@ -75,6 +75,8 @@ def second_compensation(
     turn = lidar_turn(frame.imu, before, calibration) if by_imu else initial.pose[:3, :3]
     compensated_by = se3.make(turn, initial.pose[:3, 3])
     error = se3.log(se3.between(compensated_by, found.pose)) * step_s / (step_s + mean_s)
+    predicted = initial.covariance[3:, 3:]
+    error[3:] = predicted @ np.linalg.solve(predicted + found.covariance[3:, 3:], error[3:])
     moved_m = np.linalg.norm(error.reshape(2, 3), axis=1) * (POINT_LEVER_M, 1.0) * sweep_s / step_s
     by_scale_rad = _SIGMAS * imu_noise.gyro_scale_sigma * float(np.linalg.norm(se3.so3_log(turn)))
     holds = by_imu and bool(moved_m[0] <= _LEAST_RATIO * noise_m or np.linalg.norm(error[:3]) > by_scale_rad)
