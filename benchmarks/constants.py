@@ -185,6 +185,9 @@ TABLE = [
     *_in("hybridlio/sources/map_errors.py", MATCHING, _YOUNG_MAP_DRIFT_SHARE=("0.0", "50.0")),
     *_in("hybridlio/sources/map_errors.py", MATCHING, _UNCHANGED_MAP_DRIFT_SHARE=("0.5", "0.0")),
     *_in("hybridlio/sources/map_errors.py", MATCHING, _UNCHANGED_YOUNG_MAP_DRIFT_SHARE=("0.0", "1.0")),
+    *_in(
+        "hybridlio/odometry/second_pass.py", ("tests/hybridlio/odometry/test_second_pass.py",), _LEAST_RATIO=("10.0",)
+    ),
     *_in("hybridlio/odometry/measured_step.py", START, _TURN_SIGMA_RAD=("1.0",)),
     *_in("hybridlio/sources/thinned_scan.py", MATCHING, _VOXEL_SHRINKAGE=("0.1",), _AMPLE=("0.1",)),
     *_in("hybridlio/sources/visibility.py", VISIBILITY, _LOST=("np.log([0.3, 0.6])", "np.log([0.9, 0.9])")),

@@ -7,10 +7,13 @@ import pytest
 from walks import errors_of, estimated, walk
 
 from hybridlio.core import se3, start_state
-from hybridlio.core.sensors import Frame
+from hybridlio.core.arrays import Array
+from hybridlio.core.estimates import RelativePose
+from hybridlio.core.sensors import Calibration, Frame, ImuNoise, ImuSamples, Scan
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.odometry import measured_step
 from hybridlio.odometry.estimate import Estimate
+from hybridlio.odometry.second_pass import second_compensation
 from hybridlio.simulation.faults import imu_scale_error
 from hybridlio.simulation.platforms.config import PlatformConfig
 
@@ -58,6 +61,32 @@ def test_the_first_scans_lie_as_later_ones_and_steps_do_not_swing_although_bias_
     assert largest_step_error_m(estimated(frames), recording) < 0.02
     monkeypatch.setattr(measured_step, "second_compensation", lambda *_: None)
     assert largest_step_error_m(estimated(frames), recording) > 0.03
+
+
+@pytest.mark.parametrize(
+    ("predicted_m", "matched_m", "share"), [(1.0, 1e-4, 1.0), (0.01, 0.01, 0.5), (1e-4, 0.01, 0.0)]
+)
+def test_a_scan_is_compensated_again_by_what_its_match_knows_better(
+    predicted_m: float, matched_m: float, share: float
+) -> None:
+    """Stamped at its end, a sweep whose speed is wrong by δ is displaced by -δ/2 of a step, and its match so by δ/2."""
+    step_ns, wrong_m = 100_000_000, np.array([0.2, -0.1, 0.3])
+    scan = Scan(step_ns, np.ones((101, 3), np.float32), time_offsets_ns=np.linspace(-step_ns, 0, 101).astype(np.int64))
+
+    def step(position_m: Array, position_sigma_m: float) -> RelativePose:
+        covariance = np.diag(np.r_[np.full(3, 1e-3), np.full(3, position_sigma_m)] ** 2)
+        return RelativePose(se3.make(np.eye(3), position_m), covariance, "given", details={"sigma_m": 0.01})
+
+    found = second_compensation(
+        Frame(1, scan),
+        step(np.zeros(3), predicted_m),
+        step(wrong_m, matched_m),
+        start_state.start_state(0, ImuSamples.empty(), ImuNoise()),
+        Calibration(),
+        ImuNoise(),
+    )
+    moved_m = np.zeros(3) if found is None else found.T_start_end[:3, 3]
+    np.testing.assert_allclose(moved_m, 2 * share * wrong_m, atol=2e-3)
 
 
 def test_a_gyroscope_of_a_wrong_scale_distorts_fast_turns_less(monkeypatch: pytest.MonkeyPatch) -> None:
