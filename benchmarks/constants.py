@@ -58,12 +58,11 @@ MAP = tuple(f"{REGISTRATION}{name}.py" for name in ("local_map_limits", "local_m
 PLANES = ("tests/hybridlio/cloud/test_plane_fitting.py", "tests/hybridlio/cloud/test_normals.py", *MAP)
 POINTS = tuple(f"{REGISTRATION}{name}.py" for name in ("point_to_point", "degeneracy"))
 SEARCH = (f"{REGISTRATION}motion_search.py",)
-GATE = tuple(
-    f"tests/hybridlio/sources/gate/test_{name}.py" for name in ("innovation_gate_constants", "innovation_gate")
-)
+GATE = tuple(f"tests/hybridlio/sources/gate/test_innovation_gate{end}.py" for end in ("_constants", ""))
 MATCHING = tuple(f"{SOURCES}{name}.py" for name in ("scan_matching_constants", "scan_matching"))
 START = ("tests/hybridlio/odometry/start/test_start_search.py",)
 VISIBILITY = (f"{SOURCES}visibility.py",)
+SECOND_PASS = ("tests/hybridlio/odometry/test_second_pass.py",)
 
 TABLE = [
     *_in(
@@ -185,9 +184,7 @@ TABLE = [
     *_in("hybridlio/sources/map_errors.py", MATCHING, _YOUNG_MAP_DRIFT_SHARE=("0.0", "50.0")),
     *_in("hybridlio/sources/map_errors.py", MATCHING, _UNCHANGED_MAP_DRIFT_SHARE=("0.5", "0.0")),
     *_in("hybridlio/sources/map_errors.py", MATCHING, _UNCHANGED_YOUNG_MAP_DRIFT_SHARE=("0.0", "1.0")),
-    *_in(
-        "hybridlio/odometry/second_pass.py", ("tests/hybridlio/odometry/test_second_pass.py",), _LEAST_RATIO=("10.0",)
-    ),
+    *_in("hybridlio/odometry/second_pass.py", SECOND_PASS, _LEAST_RATIO=("10.0",)),
     *_in("hybridlio/odometry/measured_step.py", START, _TURN_SIGMA_RAD=("1.0",)),
     *_in("hybridlio/sources/thinned_scan.py", MATCHING, _VOXEL_SHRINKAGE=("0.1",), _AMPLE=("0.1",)),
     *_in("hybridlio/sources/visibility.py", VISIBILITY, _LOST=("np.log([0.3, 0.6])", "np.log([0.9, 0.9])")),
