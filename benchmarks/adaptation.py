@@ -1,6 +1,7 @@
 """Measure what adaptation without labels takes back where a lidar differs from that of the training.
 
     python benchmarks/adaptation.py FOLDER [--weights published] [--seeds 3101,3201] [--differences calibration,all]
+    python benchmarks/adaptation.py FOLDER --minimum
 
 Differences, each alone or all together:
 
@@ -12,28 +13,36 @@ A drive of 100 m is simulated for each seed, and one of 60 s elsewhere, both wit
 adapted on the 60 s (`hybridlio train --weights … `, the recipe of adaptation) and measured on the other drive: error
 left in a step of perturbed initial poses 14.5 cm and 0.41° off, against exact poses. Training and the exact lidar have
 instantaneous scans. FOLDER keeps prepared drives for the next time.
+
+--minimum adapts nothing and measures how far from the exact poses the training loss has its minimum: what a network
+that reached it in each pair would leave.
 """
 
 from __future__ import annotations
 
 import argparse
 import functools
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from front_end import REAL_PERTURBATIONS, adapted, errors_by_step, perturbed
 
 from hybridlio.commands.terminal import progress
 from hybridlio.core import se3, tables
 from hybridlio.core.sensors import Scan
 from hybridlio.datasets.sequence import Sequence
+from hybridlio.learned.data.pairs import Pairs
 from hybridlio.learned.data.shards import Shard
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
-from hybridlio.learned.networks.weights import load_weights, weights_path
+from hybridlio.learned.networks.weights import Weights, load_weights, weights_path
 from hybridlio.learned.settings import Recipe
+from hybridlio.learned.training.objective import clouds_for, descended
+from hybridlio.learned.training.validation import step_errors
 from hybridlio.runs.training.training_data import DataOptions, prepare_once
 from hybridlio.simulation import SimulationConfig
 from hybridlio.simulation.drive.path import SmoothPath
@@ -44,8 +53,11 @@ from hybridlio.simulation.recording import drive_recording
 DIFFERENCES = ("calibration", "rolling-shutter", "height", "all")
 ADAPTED_S, LENGTH_M = 60.0, 100.0
 HIGHER_M = 0.5
+MINIMUM_STEPS, MINIMUM_EVERY = 12, 4  # Gauss-Newton steps from the exact pose, in every fourth pair
 LEAST_COST = 0.1  # of the exact lidar's error; less is chance
 _PATH_STEP_S = 0.05  # of the poses that the raised path goes through
+
+Preparing = Callable[[Sequence], Shard]
 
 
 class Left(NamedTuple):
@@ -105,6 +117,16 @@ def left(network: OdometryNetwork, tested: Shard) -> Left:
     return Left(*errors_by_step(network, tested, reference, perturbed(reference, rotation_deg, translation_m))[-1])
 
 
+def minimum(recipe: Recipe, tested: Shard) -> Left:
+    """Return how far from the exact poses the loss has its minimum, by Gauss-Newton steps from there."""
+    settings = replace(recipe.loss, target_steps=MINIMUM_STEPS)
+    pairs = Pairs([tested], replace(recipe.network, velocity=False))
+    batches = [pairs.batch([i]) for i in range(0, len(pairs), MINIMUM_EVERY)]
+    found = [descended(b.reference, clouds_for(b, settings), settings, recipe.network.geometry) for b in batches]
+    exact = torch.cat([b.reference for b in batches])
+    return Left(*step_errors(torch.cat(found).double().numpy(), exact.double().numpy()))
+
+
 def taken_back(exact: Left, wrong: Left, after: Left) -> str:
     """Return the shares of what a difference costs that adaptation takes back; none where it costs nothing."""
 
@@ -115,30 +137,44 @@ def taken_back(exact: Left, wrong: Left, after: Left) -> str:
     return f"{shifts} / {turns}"
 
 
+def adaptations(weights: Weights, prepared: Preparing, difference: str, seed: int) -> dict[str, str]:
+    """Return a row of errors left before and after adaptation."""
+    tested, other = SimulationConfig(seed=seed, length_m=LENGTH_M), SimulationConfig(seed=seed + 50, seconds=ADAPTED_S)
+    exact = left(weights.network(), prepared(recording(tested, "exact", seed)))
+    differing = prepared(recording(tested, difference, seed))
+    wrong = left(weights.network(), differing)
+    after = left(adapted(weights, prepared(recording(other, difference, seed))), differing)
+    row = {"exact lidar": str(exact), "differing": str(wrong), "adapted": str(after)}
+    return {**row, "taken back": taken_back(exact, wrong, after)}
+
+
+def minima(weights: Weights, prepared: Preparing, difference: str, seed: int) -> dict[str, str]:
+    """Return a row of the distances of the loss's minimum."""
+    tested = SimulationConfig(seed=seed, length_m=LENGTH_M)
+    by_lidar = {"exact lidar": "exact", "differing": difference}
+    return {
+        name: str(minimum(weights.recipe, prepared(recording(tested, kind, seed)))) for name, kind in by_lidar.items()
+    }
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, metavar="FOLDER")
     parser.add_argument("--weights", default="published")
     parser.add_argument("--seeds", default="3101,3201")
     parser.add_argument("--differences", default=",".join(DIFFERENCES), metavar="A,B,…", help="(default: all four)")
+    parser.add_argument("--minimum", action="store_true", help="measure the minimum of the loss instead")
     options = parser.parse_args()
     differences = options.differences.split(",")
     if unknown := [name for name in differences if name not in DIFFERENCES]:
         parser.error(f"unknown difference {unknown[0]!r}; choose among {', '.join(DIFFERENCES)}")
     weights = load_weights(weights_path(options.weights))
-    network = weights.network()
     prepared = partial(shard, recipe=weights.recipe, cache=options.folder / "shards")
+    of = minima if options.minimum else adaptations
     rows: list[dict[str, str]] = []
     for difference in differences:
         for seed in map(int, options.seeds.split(",")):
-            tested = SimulationConfig(seed=seed, length_m=LENGTH_M)
-            other = SimulationConfig(seed=seed + 50, seconds=ADAPTED_S)
-            exact = left(network, prepared(recording(tested, "exact", seed)))
-            differing = prepared(recording(tested, difference, seed))
-            wrong = left(network, differing)
-            after = left(adapted(weights, prepared(recording(other, difference, seed))), differing)
-            row = {"difference": difference, "seed": str(seed), "exact lidar": str(exact), "differing": str(wrong)}
-            rows.append({**row, "adapted": str(after), "taken back": taken_back(exact, wrong, after)})
+            rows.append({"difference": difference, "seed": str(seed), **of(weights, prepared, difference, seed)})
             print(tables.to_markdown(rows, ("difference",)), flush=True)
 
 

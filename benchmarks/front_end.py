@@ -4,9 +4,10 @@
 
 `--simulated` perturbs true relative poses and measures the error that the network leaves. `--real` does the same for
 recordings without an exact reference; small_gicp's registration of full scans takes its place. `--adapt` trains the
-weights on each of two or more real recordings, without labels, and measures on the others. `--long` chains the steps of
-LSTMs and network, without a graph. Each figure is also given for networks that are not trained. `--time` measures the
-first two scans of the first recording given. Prints Markdown; -o writes all figures to front_end.json.
+weights on each of two or more real recordings, without labels, and measures on the others. `--iterations` asks for
+the residual another number of times than in training. `--long` chains the steps of LSTMs and network, without a graph.
+Each figure is also given for networks that are not trained. `--time` measures the first two scans of the first
+recording given. Prints Markdown; -o writes all figures to front_end.json.
 """
 
 from __future__ import annotations
@@ -209,11 +210,17 @@ def main() -> None:
     for name in ("--simulated", "--real", "--long"):
         parser.add_argument(name, type=Path, nargs="*", default=[], metavar="DRIVE")
     parser.add_argument("--adapt", action="store_true", help="train on each real recording, test on the others")
+    parser.add_argument(
+        "--iterations", type=int, metavar="N", help="ask for the residual N times (default: as trained)"
+    )
     parser.add_argument("--time", action="store_true", help="measure the time of each stage")
     parser.add_argument("--cache", type=Path, default=Path("shards"), metavar="DIR", help="for shards")
     parser.add_argument("-o", "--out", type=Path, metavar="DIR", help="for front_end.json")
     options = parser.parse_args()
     weights = load_weights(weights_path(options.weights))
+    if options.iterations:
+        network = replace(weights.recipe.network, iterations=options.iterations)
+        weights = replace(weights, recipe=replace(weights.recipe, network=network))
     networks, found = {"trained": weights.network(), **untrained(weights.recipe.network)}, {}
 
     def shards(paths: list[Path]) -> list[Shard]:
