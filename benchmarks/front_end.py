@@ -211,16 +211,13 @@ def main() -> None:
         parser.add_argument(name, type=Path, nargs="*", default=[], metavar="DRIVE")
     parser.add_argument("--adapt", action="store_true", help="train on each real recording, test on the others")
     parser.add_argument(
-        "--iterations", type=int, metavar="N", help="ask for the residual N times (default: as trained)"
+        "--iterations", type=int, default=0, metavar="N", help="ask for the residual N times (default: as trained)"
     )
     parser.add_argument("--time", action="store_true", help="measure the time of each stage")
     parser.add_argument("--cache", type=Path, default=Path("shards"), metavar="DIR", help="for shards")
     parser.add_argument("-o", "--out", type=Path, metavar="DIR", help="for front_end.json")
     options = parser.parse_args()
-    weights = load_weights(weights_path(options.weights))
-    if options.iterations:
-        network = replace(weights.recipe.network, iterations=options.iterations)
-        weights = replace(weights, recipe=replace(weights.recipe, network=network))
+    weights = load_weights(weights_path(options.weights)).asked(options.iterations)
     networks, found = {"trained": weights.network(), **untrained(weights.recipe.network)}, {}
 
     def shards(paths: list[Path]) -> list[Shard]:

@@ -32,6 +32,8 @@ class NetworkResidualSettings:
     Attributes:
         weights: path of a weights file, or ``shipped``.
         device: PyTorch device name; ``auto`` is a GPU if available, else the CPU.
+        iterations: how often the residual is asked for, each time with the maps moved by the answer before; 0 is as
+            often as in training.
         min_cells: a scan with fewer cells with normals in either map is bridged by the initial pose.
         min_matched: a scan with a smaller share (0 to 1) of matched points is bridged, too.
         covariance_scale: factor on the covariance, because residuals are correlated.
@@ -48,6 +50,7 @@ class NetworkResidualSettings:
 
     weights: str = SHIPPED
     device: str = "auto"
+    iterations: int = 0
     min_cells: int = 500
     min_matched: float = 0.3
     covariance_scale: float = 2.0
@@ -58,6 +61,6 @@ class NetworkResidualSettings:
 
     def __post_init__(self) -> None:
         check_positive(self, "min_cells", "covariance_scale", "kernel_m", "max_distance_m")
-        check_not_negative(self, "refine_steps")
+        check_not_negative(self, "iterations", "refine_steps")
         check_fraction(self, "min_matched")
         check_setting(self, "start_speeds_m_s", len(self.start_speeds_m_s) > 0, "a list of one number or more")

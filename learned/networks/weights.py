@@ -67,6 +67,12 @@ class Weights:
         network = replace(self.recipe.network, geometry=geometry)
         return replace(self, recipe=replace(self.recipe, network=network))
 
+    def asked(self, iterations: int) -> Weights:
+        """Return the weights for a network that is asked for the residual this number of times; 0: as in training."""
+        if not iterations:
+            return self
+        return replace(self, recipe=replace(self.recipe, network=replace(self.recipe.network, iterations=iterations)))
+
     def network(self, device: torch.device | str = "cpu") -> OdometryNetwork:
         """Return the trained network in evaluation mode."""
         with torch.device("meta"):  # a damaged recipe may announce a network of any size

@@ -105,7 +105,7 @@ class NetworkResidual:
     ) -> None:
         self._settings = settings or NetworkResidualSettings()
         self._device = pick_device(self._settings.device)
-        weights = load_weights(weights_path(self._settings.weights))
+        weights = load_weights(weights_path(self._settings.weights)).asked(self._settings.iterations)
         self._fitting = FittedNetwork(
             weights.recipe.network, lambda cells: _fitted(weights.on_cells(cells), prepare_for, self._device)
         )

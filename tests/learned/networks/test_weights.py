@@ -34,6 +34,17 @@ def test_saved_weights_give_the_same_network_again(rooms, tiny_recipe, tmp_path,
     assert torch.equal(found.network()(given).pose, network(given).pose)
 
 
+def test_asking_twice_asks_again_from_the_first_answer(rooms, tiny_recipe, tmp_path):
+    save_weights(tmp_path / "w.safetensors", OdometryNetwork(tiny_recipe.network), tiny_recipe, {})
+    once = load_weights(tmp_path / "w.safetensors").asked(1)
+    given = Pairs(rooms[:1], tiny_recipe.network).batch([0, 1]).network
+    first = once.network().refine(given, torch.eye(4).expand(2, 4, 4)).pose
+    twice = once.asked(2).network().refine(given, torch.eye(4).expand(2, 4, 4))
+    assert torch.equal(twice.poses[0], first)
+    assert torch.equal(twice.pose, once.network().refine(given, first).pose)
+    assert once.asked(0).recipe == once.recipe
+
+
 def test_what_the_weights_are_stands_in_the_files_metadata(tiny_recipe, tmp_path):
     save_weights(tmp_path / "w.safetensors", OdometryNetwork(tiny_recipe.network), tiny_recipe, {"data": "x"})
     with safe_open(str(tmp_path / "w.safetensors"), "pt") as file:

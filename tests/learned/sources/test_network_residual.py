@@ -43,6 +43,11 @@ def test_refinement_finds_the_pose_and_the_covariance_covers_its_error(weights, 
     assert np.mean(normalised) < 2.0
 
 
+def test_the_network_is_asked_as_often_as_the_settings_say(weights, seen):
+    path, scans = weights(iterations=2), [seen(np.eye(4))]
+    assert [source(path, scans, replace(FEW, iterations=n))._network.settings.iterations for n in (0, 3)] == [2, 3]
+
+
 def test_along_a_corridor_the_covariance_is_large_and_the_direction_listed_as_degenerate(weights, seen):
     half = (500.0, 3.0, 2.0)
     scans = [seen(np.eye(4), half, seed=0), seen(STEP, half, seed=1)]
