@@ -14,8 +14,8 @@ adapted on the 60 s (`hybridlio train --weights … `, the recipe of adaptation)
 left in a step of perturbed initial poses 14.5 cm and 0.41° off, against exact poses. Training and the exact lidar have
 instantaneous scans. FOLDER keeps prepared drives for the next time.
 
---minimum adapts nothing and measures how far from the exact poses the training loss has its minimum: what a network
-that reached it in each pair would leave.
+--config changes the recipe of adaptation, as that of `hybridlio train` does. --minimum adapts nothing and measures how
+far from the exact poses the training loss has its minimum: what a network that reached it in each pair would leave.
 """
 
 from __future__ import annotations
@@ -137,13 +137,15 @@ def taken_back(exact: Left, wrong: Left, after: Left) -> str:
     return f"{shifts} / {turns}"
 
 
-def adaptations(weights: Weights, prepared: Preparing, difference: str, seed: int) -> dict[str, str]:
+def adaptations(
+    weights: Weights, prepared: Preparing, difference: str, seed: int, changes: Path | None = None
+) -> dict[str, str]:
     """Return a row of errors left before and after adaptation."""
     tested, other = SimulationConfig(seed=seed, length_m=LENGTH_M), SimulationConfig(seed=seed + 50, seconds=ADAPTED_S)
     exact = left(weights.network(), prepared(recording(tested, "exact", seed)))
     differing = prepared(recording(tested, difference, seed))
     wrong = left(weights.network(), differing)
-    after = left(adapted(weights, prepared(recording(other, difference, seed))), differing)
+    after = left(adapted(weights, prepared(recording(other, difference, seed)), changes), differing)
     row = {"exact lidar": str(exact), "differing": str(wrong), "adapted": str(after)}
     return {**row, "taken back": taken_back(exact, wrong, after)}
 
@@ -163,6 +165,7 @@ def main() -> None:
     parser.add_argument("--weights", default="published")
     parser.add_argument("--seeds", default="3101,3201")
     parser.add_argument("--differences", default=",".join(DIFFERENCES), metavar="A,B,…", help="(default: all four)")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="changes of the recipe")
     parser.add_argument("--minimum", action="store_true", help="measure the minimum of the loss instead")
     options = parser.parse_args()
     differences = options.differences.split(",")
@@ -170,7 +173,7 @@ def main() -> None:
         parser.error(f"unknown difference {unknown[0]!r}; choose among {', '.join(DIFFERENCES)}")
     weights = load_weights(weights_path(options.weights))
     prepared = partial(shard, recipe=weights.recipe, cache=options.folder / "shards")
-    of = minima if options.minimum else adaptations
+    of = minima if options.minimum else partial(adaptations, changes=options.config)
     rows: list[dict[str, str]] = []
     for difference in differences:
         for seed in map(int, options.seeds.split(",")):

@@ -41,7 +41,7 @@ from hybridlio.learned.training.driving import drive
 from hybridlio.learned.training.run_options import RunOptions
 from hybridlio.learned.training.train import train
 from hybridlio.learned.training.validation import step_errors
-from hybridlio.runs.training.recipes import adaptation_recipe
+from hybridlio.runs.training.recipes import choose_recipe
 from hybridlio.runs.training.training_data import DataOptions, prepare_shards
 
 Row = dict[str, str]
@@ -118,9 +118,9 @@ def accuracy_rows(networks: Networks, shard: Shard, reference: Array, perturbati
         }
 
 
-def adapted(weights: Weights, shard: Shard) -> OdometryNetwork:
-    """Return the network trained further on a recording, without labels."""
-    recipe = adaptation_recipe(weights.recipe)
+def adapted(weights: Weights, shard: Shard, changes: Path | None = None) -> OdometryNetwork:
+    """Return the network trained further on a recording, without labels; a file may change the recipe."""
+    recipe = choose_recipe(weights_recipe=weights.recipe, file=changes)
     with tempfile.TemporaryDirectory() as folder:
         start = weights.fitting(recipe.network)
         return train(recipe, Pairs([shard], recipe.network), folder, start=start, options=RunOptions("cpu")).eval()

@@ -1,7 +1,7 @@
 """Train the ``published`` weights on the shards of ``benchmarks/published_data.py``, and measure them.
 
     python benchmarks/published_training.py train DIR RUNS [--drives 150] [--epochs 24]
-    python benchmarks/published_training.py evaluate WEIGHTS SHARDS…
+    python benchmarks/published_training.py evaluate WEIGHTS SHARDS… [--iterations N]
 
 ``train`` may run while drives are still being simulated: until all are there it trains at a constant rate on those that
 are, in phases of half an hour, each from where the last one ended; then the last phase lets the rate fall by a cosine.
@@ -98,9 +98,9 @@ def _say_validation(step: int, found: Validation) -> None:
     )
 
 
-def evaluate(weights: Path, shards: list[Shard]) -> None:
+def evaluate(weights: Path, shards: list[Shard], iterations: int) -> None:
     """Print the drift of the chained steps of each drive."""
-    network = load_weights(weights).network()
+    network = load_weights(weights).asked(iterations).network()
     for shard in shards:
         driven = drive(network, shard)
         length_m = float(np.linalg.norm(driven.reference[:, :3, 3], axis=1).sum())
@@ -124,12 +124,14 @@ def main() -> None:
     three = commands.add_parser("evaluate", help="drift of the chained steps")
     three.add_argument("weights", type=Path)
     three.add_argument("shards", type=Path, nargs="+", help="folders of shards")
+    three.add_argument("--iterations", type=int, default=0, metavar="N", help="ask N times (default: as trained)")
     options = parser.parse_args()
     torch.set_num_threads(1)
     if options.command == "train":
         train_in_phases(options.folder, options.runs, options.drives, options.epochs)
     else:
-        evaluate(options.weights, [shard for folder in options.shards for shard in shards_in(folder)])
+        shards = [shard for folder in options.shards for shard in shards_in(folder)]
+        evaluate(options.weights, shards, options.iterations)
 
 
 if __name__ == "__main__":
