@@ -122,7 +122,8 @@ def _registered(
     compensated, step = pipeline.refine(frame, initial, before, seconds)
     if not isinstance(pipeline.residual, RefinesAgain):
         return compensated, step
-    second = second_compensation(frame, initial, step, before, pipeline.calibration, pipeline.imu_noise)
+    knows_speed = initial.from_imu and not pipeline.gate.is_warming_up
+    second = second_compensation(frame, initial, step, before, pipeline.calibration, pipeline.imu_noise, knows_speed)
     if second is not None:
         again = initial if len(frame.imu) else replace(initial, proposed=step.pose)
         compensated, step = pipeline.refine_again(frame, again, before, second)

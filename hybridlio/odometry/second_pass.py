@@ -20,8 +20,7 @@ from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSa
 from hybridlio.odometry.inertial_motion import lidar_turn
 
 # Displacement of the sweep's last points, over the spread of the residuals, from which a scan is registered again. The
-# mean displacement, which moves the scan, is half of it, and hundreds of points see it below their spread. With 1.0, a
-# walk whose speed and vertical are wrong at the start swings by 4 cm from scan to scan, with 0.7 and 0.5 by 1.6 cm.
+# mean displacement, which moves the scan, is half of it, and hundreds of points see it below their spread.
 _LEAST_RATIO = 0.7
 _SIGMAS = 3.0  # of the gyroscope's scale
 # Of a platform at rest: standard deviations of its samples within a step, over those of consumer IMUs (0.003 rad/s and
@@ -51,16 +50,18 @@ def second_compensation(
     before: State,
     calibration: Calibration,
     imu_noise: ImuNoise,
+    knows_speed: bool,
 ) -> SecondCompensation | None:
     """Return how to compensate a scan once more; None if its points would move by less than their noise.
 
     Registration found the step ``f`` with points compensated for the step ``p``. The error of ``p`` is ``(p − f)·T /
-    (T + τ)`` with the step's duration ``T``, since ``f`` errs by ``−τ/T`` of it. Of a translation that is the share
-    which the covariance of ``p`` has in both: a match may know less than an IMU predicts. Along a stairwell, matches of
-    16 beams at 20 Hz err by 1 to 3 cm, and predictions by 1 mm. Compensated by the whole difference, scans swung ever
-    farther, by 5 cm from one to the next, until the IMU was left out and the path 1.1 m off, not 12 mm. The gyroscope
-    is right within hundredths of a degree, unless its scale is wrong and the step turns by tens of degrees. A turn that
-    no error of scale explains is a wrong match rather.
+    (T + τ)`` with the step's duration ``T``, since ``f`` errs by ``−τ/T`` of it. A ``p`` whose speed is that of the
+    last steps errs as these do, with the opposite sign, and ``f`` is right. Where ``p`` knows its speed, its error in
+    translation is the share that its covariance has in both: a match may know less. Along a stairwell, matches of 16
+    beams at 20 Hz err by 1 to 3 cm, and predictions by 1 mm. Compensated by the whole difference, scans swung ever
+    farther, by 5 cm from one to the next, until the IMU was left out and the path 1.1 m off, not 2 cm. The gyroscope is
+    right within hundredths of a degree, unless its scale is wrong and the step turns by tens of degrees. A turn that no
+    error of scale explains is a wrong match rather.
 
     Args:
         frame: as recorded.
@@ -69,6 +70,7 @@ def second_compensation(
         before: the state at the scan before.
         calibration: the extrinsics.
         imu_noise: with the standard deviation of the gyroscope's scale.
+        knows_speed: whether the initial pose is by an IMU and a speed that many steps have measured.
     """
     offsets_ns, noise_m = frame.scan.time_offsets_ns, found.details.get("sigma_m", np.inf)
     if not found.ok or offsets_ns is None or not len(offsets_ns):
@@ -79,8 +81,8 @@ def second_compensation(
     turn = lidar_turn(frame.imu, before, calibration) if by_imu else initial.pose[:3, :3]
     compensated_by = se3.make(turn, initial.pose[:3, 3])
     error = se3.log(se3.between(compensated_by, found.pose)) * step_s / (step_s + mean_s)
-    predicted = initial.covariance[3:, 3:]
-    error[3:] = predicted @ np.linalg.solve(predicted + found.covariance[3:, 3:], error[3:])
+    if knows_speed:
+        error[3:] = (initial.covariance @ np.linalg.solve(initial.covariance + found.covariance, error))[3:]
     moved_m = np.linalg.norm(error.reshape(2, 3), axis=1) * (POINT_LEVER_M, 1.0) * sweep_s / step_s
     by_scale_rad = _SIGMAS * imu_noise.gyro_scale_sigma * float(np.linalg.norm(se3.so3_log(turn)))
     holds = by_imu and bool(moved_m[0] <= _LEAST_RATIO * noise_m or np.linalg.norm(error[:3]) > by_scale_rad)

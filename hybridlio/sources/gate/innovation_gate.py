@@ -93,6 +93,11 @@ class InnovationGate:
         # the last scan, where it was found, in the pose that the source's path has for it; None if they are the same
         self._found: Array | None = None
 
+    @property
+    def is_warming_up(self) -> bool:
+        """Whether the next step is one in which speed, tilt and biases are still being found from the scans."""
+        return self._steps < WARM_UP_STEPS
+
     def apply(
         self,
         measured: RelativePose,
