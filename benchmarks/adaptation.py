@@ -173,7 +173,7 @@ def main() -> None:
         parser.error(f"unknown difference {unknown[0]!r}; choose among {', '.join(DIFFERENCES)}")
     weights = load_weights(weights_path(options.weights))
     prepared = partial(shard, recipe=weights.recipe, cache=options.folder / "shards")
-    of = minima if options.minimum else partial(adaptations, changes=options.config)
+    of: Callable[..., dict[str, str]] = minima if options.minimum else partial(adaptations, changes=options.config)
     rows: list[dict[str, str]] = []
     for difference in differences:
         for seed in map(int, options.seeds.split(",")):
