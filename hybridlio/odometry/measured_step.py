@@ -16,12 +16,11 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.chi_square import chi_square_quantile
-from hybridlio.core.estimates import EarlierScanPose, RefinesAgain, RelativePose, State, TakesBack
+from hybridlio.core.estimates import EarlierScanPose, RefinesAgain, RelativePose, ResidualSource, State, TakesBack
 from hybridlio.core.motion_limits import POINT_LEVER_M
 from hybridlio.core.sensors import NS_PER_S, Frame, ImuSamples
 from hybridlio.odometry.pipeline import Pipeline, timed
-from hybridlio.odometry.second_pass import held_at_rest, second_compensation, without_misfit
+from hybridlio.odometry.second_pass import held_at_rest, second_compensation, turns_elsewhere, without_misfit
 from hybridlio.odometry.start.start_search import StartEstimate, StartSearch
 from hybridlio.record import plain_values
 from hybridlio.sources.late_start import LateStart, less_certain
@@ -34,7 +33,6 @@ from hybridlio.sources.thinned_scan import thin
 _REPETITIONS_WITHOUT_IMU = 3
 # With an IMU until the answer changes by less than that at the distance of half of a scan's points.
 _MOST_REPETITIONS, _SETTLED_M = 6, 0.01
-_EXCLUDED_TURN = chi_square_quantile(0.999, 3)
 # Of a first turn by two scans that fit each other: 1.1°, which displaces points 10 m away by two default kernels. In 44
 # recordings of rooms, roads and woods it is at most 0.7° off, and 16° where the scans fit each other wrongly.
 _TURN_SIGMA_RAD = 0.02
@@ -109,7 +107,7 @@ def _first(
     fits_poorly = _fits_poorly(step)
     # Ghosts and few rings make a right match poor, too, but it converges, and was poor before it was repeated.
     is_lost = not step.ok or (fits_poorly and (fitted or not step.details.get("converged", 1.0)))
-    is_lost = is_lost or (initial.from_imu and _turns_elsewhere(initial, step, _TURN_SIGMA_RAD))
+    is_lost = is_lost or (initial.from_imu and turns_elsewhere(initial, step, _TURN_SIGMA_RAD))
     if isinstance(residual, ScanMatching) and (is_lost or fits_poorly or len(step.degenerate)):
         pipeline.start_search = _search_of(pipeline, residual, leads=is_lost)
     return answer
@@ -122,12 +120,17 @@ def _registered(
     compensated, step = pipeline.refine(frame, initial, before, seconds)
     if not isinstance(pipeline.residual, RefinesAgain):
         return compensated, step
-    knows_speed = initial.from_imu and not pipeline.gate.is_warming_up
-    second = second_compensation(frame, initial, step, before, pipeline.calibration, pipeline.imu_noise, knows_speed)
+    weighs = initial.from_imu and not pipeline.gate.is_warming_up and not _is_weighed(pipeline.residual)
+    second = second_compensation(frame, initial, step, before, pipeline.calibration, pipeline.imu_noise, weighs)
     if second is not None:
         again = initial if len(frame.imu) else replace(initial, proposed=step.pose)
         compensated, step = pipeline.refine_again(frame, again, before, second)
     return compensated, without_misfit(pipeline.residual, initial, step, LOST_COST)
+
+
+def _is_weighed(residual: ResidualSource) -> bool:
+    """Return whether matches are weighed with predictions already: those of a lidar that repeats no pattern."""
+    return isinstance(residual, ScanMatching) and not residual.recent.repeats
 
 
 def _fits_poorly(step: RelativePose) -> bool:
@@ -160,17 +163,10 @@ def _repeat_first_step(
         moved = np.linalg.norm(se3.log(se3.between(before.pose, relative.pose)).reshape(2, 3), axis=1)
         if start.has_imu and moved @ (POINT_LEVER_M, 1.0) < _SETTLED_M:
             break
-    if is_late and relative.ok and isinstance(pipeline.residual, TakesBack) and _turns_elsewhere(initial, relative):
+    if is_late and relative.ok and isinstance(pipeline.residual, TakesBack) and turns_elsewhere(initial, relative):
         pipeline.residual.take_back(initial)
         relative = replace(initial, details=relative.details)
     return compensated, relative
-
-
-def _turns_elsewhere(initial: RelativePose, found: RelativePose, sigma_rad: float = 0.0) -> bool:
-    """Return whether a step, whose own turn is uncertain by ``sigma_rad``, turns by what its initial pose excludes."""
-    apart = se3.so3_log(initial.pose[:3, :3].T @ found.pose[:3, :3])
-    covariance = initial.covariance[:3, :3] + sigma_rad**2 * np.eye(3)
-    return bool(apart @ np.linalg.solve(covariance, apart) > _EXCLUDED_TURN)
 
 
 def _restart_at(pipeline: Pipeline, second: Frame, step: Array, start: State) -> None:

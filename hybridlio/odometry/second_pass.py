@@ -14,14 +14,14 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
+from hybridlio.core.chi_square import chi_square_quantile
 from hybridlio.core.estimates import RefinesAgain, RelativePose, State, TakesBack
 from hybridlio.core.motion_limits import LEVEL_SINE, POINT_LEVER_M, UNKNOWN_TRANSLATION_SIGMA_M
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples
 from hybridlio.odometry.inertial_motion import lidar_turn
 
 # Displacement of the sweep's last points, over the spread of the residuals, from which a scan is registered again. The
-# mean displacement, which moves the scan, is half of it. With 0.7, nine recordings of rosettes in rooms took 1.2 times
-# as long and had 1.2 times the error.
+# mean displacement, which moves the scan, is half of it.
 _LEAST_RATIO = 1.0
 _SIGMAS = 3.0  # of the gyroscope's scale
 # Of a platform at rest: standard deviations of its samples within a step, over those of consumer IMUs (0.003 rad/s and
@@ -29,6 +29,7 @@ _SIGMAS = 3.0  # of the gyroscope's scale
 _QUIET_RAD_S, _QUIET_M_S2, _FEWEST_QUIET, _BIAS_SIGMAS = 0.02, 0.15, 5, 3.0
 _REST_M_S = 0.1  # 1 cm at 10 Hz, the error of a step; a standing person sways by less
 _ANY_TURN_RAD = 10.0
+_EXCLUDED_TURN = chi_square_quantile(0.999, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +52,7 @@ def second_compensation(
     before: State,
     calibration: Calibration,
     imu_noise: ImuNoise,
-    knows_speed: bool,
+    weighs: bool,
 ) -> SecondCompensation | None:
     """Return how to compensate a scan once more; None if its points would move by less than their noise.
 
@@ -71,7 +72,7 @@ def second_compensation(
         before: the state at the scan before.
         calibration: the extrinsics.
         imu_noise: with the standard deviation of the gyroscope's scale.
-        knows_speed: whether the initial pose is by an IMU and a speed that many steps have measured.
+        weighs: whether the initial pose knows its speed, and the match has not been weighed with it already.
     """
     offsets_ns, noise_m = frame.scan.time_offsets_ns, found.details.get("sigma_m", np.inf)
     if not found.ok or offsets_ns is None or not len(offsets_ns):
@@ -82,7 +83,7 @@ def second_compensation(
     turn = lidar_turn(frame.imu, before, calibration) if by_imu else initial.pose[:3, :3]
     compensated_by = se3.make(turn, initial.pose[:3, 3])
     error = se3.log(se3.between(compensated_by, found.pose)) * step_s / (step_s + mean_s)
-    if knows_speed:
+    if weighs:
         error[3:] = (initial.covariance @ np.linalg.solve(initial.covariance + found.covariance, error))[3:]
     moved_m = np.linalg.norm(error.reshape(2, 3), axis=1) * (POINT_LEVER_M, 1.0) * sweep_s / step_s
     by_scale_rad = _SIGMAS * imu_noise.gyro_scale_sigma * float(np.linalg.norm(se3.so3_log(turn)))
@@ -92,6 +93,13 @@ def second_compensation(
     if moved_m.sum() <= _LEAST_RATIO * noise_m:
         return None
     return SecondCompensation(compensated_by @ se3.exp(error), holds)
+
+
+def turns_elsewhere(initial: RelativePose, found: RelativePose, sigma_rad: float = 0.0) -> bool:
+    """Return whether a step, whose own turn is uncertain by ``sigma_rad``, turns by what its initial pose excludes."""
+    apart = se3.so3_log(initial.pose[:3, :3].T @ found.pose[:3, :3])
+    covariance = initial.covariance[:3, :3] + sigma_rad**2 * np.eye(3)
+    return bool(apart @ np.linalg.solve(covariance, apart) > _EXCLUDED_TURN)
 
 
 def without_misfit(

@@ -64,11 +64,11 @@ def test_the_first_scans_lie_as_later_ones_and_steps_do_not_swing_although_bias_
 
 
 @pytest.mark.parametrize(
-    ("knows_speed", "predicted_m", "matched_m", "share"),
+    ("weighs", "predicted_m", "matched_m", "share"),
     [(True, 1.0, 1e-4, 1.0), (True, 0.01, 0.01, 0.5), (True, 1e-4, 0.01, 0.0), (False, 1e-4, 0.01, 1.0)],
 )
 def test_a_scan_is_compensated_again_by_what_its_match_knows_better(
-    knows_speed: bool, predicted_m: float, matched_m: float, share: float
+    weighs: bool, predicted_m: float, matched_m: float, share: float
 ) -> None:
     """Stamped at its end, a sweep whose speed is wrong by δ is displaced by -δ/2 of a step, and its match so by δ/2."""
     step_ns, wrong_m = 100_000_000, np.array([0.2, -0.1, 0.3])
@@ -85,7 +85,7 @@ def test_a_scan_is_compensated_again_by_what_its_match_knows_better(
         start_state.start_state(0, ImuSamples.empty(), ImuNoise()),
         Calibration(),
         ImuNoise(),
-        knows_speed,
+        weighs,
     )
     moved_m = np.zeros(3) if found is None else found.T_start_end[:3, 3]
     np.testing.assert_allclose(moved_m, 2 * share * wrong_m, atol=2e-3)
