@@ -73,6 +73,11 @@ def so3_left_jacobian(rotvec: ArrayLike) -> Array:
     return np.asarray(np.eye(3) + a * K + b * (K @ K))
 
 
+def turns_by_rates(rates_rad_s: Array, steps_s: Array) -> Array:
+    """Return rotation vectors ``(S - 1, 3)`` between samples of rates ``(S, 3)``, rad, that change linearly between."""
+    return np.asarray((rates_rad_s[1:] + rates_rad_s[:-1]) / 2 * steps_s[:, None])
+
+
 def so3_chain(turns: Array) -> Array:
     """Return rotations ``(N + 1, 3, 3)`` to the first frame, by rotations ``(N, 3, 3)`` from each frame to the next."""
     out = [np.eye(3)]

@@ -157,8 +157,7 @@ class ImuSamples:
 
     def turns(self, bias_rad_s: Array) -> Array:
         """Return rotation vectors ``(S - 1, 3)`` between samples, rad, by rates without a bias ``(3,)``."""
-        rates = (self.gyro_rad_s[1:] + self.gyro_rad_s[:-1]) / 2 - bias_rad_s
-        return np.asarray(rates * (np.diff(self.stamps_ns) / NS_PER_S)[:, None])
+        return se3.turns_by_rates(self.gyro_rad_s - bias_rad_s, np.diff(self.stamps_ns) / NS_PER_S)
 
     def orientations(self, bias_rad_s: Array) -> Array:
         """Return rotations ``(S, 3, 3)`` from each sample's frame to the first's, by rates without a bias ``(3,)``."""

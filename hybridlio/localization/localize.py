@@ -64,19 +64,19 @@ class MapOdometry:
         if odometry.last_scan is None or estimate.step is None or estimate.relative is None:
             self.poses = [None]
             return estimate
-        up = self._up(frame)
+        up = self._up(frame, estimate)
         if self._start is not None:
             self.localizer.start(start_pose(self._prior, odometry.last_scan, up, self._start), estimate.pose)
             self._start = None
         self.poses.append(self.localizer.step(odometry.last_scan, estimate.pose, estimate.relative, up))
         return estimate
 
-    def _up(self, frame: Frame) -> Array:
+    def _up(self, frame: Frame, estimate: Estimate) -> Array:
         """Up ``(3,)`` in the odometry's world, the first scan's frame."""
         state, calibration = self._odometry.last_state, frame.calibration
         if state is None or not state.has_imu or calibration is None:
             return _Z
-        return np.asarray(calibration.T_imu_lidar[:3, :3].T @ -state.gravity_m_s2)
+        return np.asarray(estimate.pose[:3, :3] @ state.up_in_lidar(calibration))
 
     def record(self, scans: int | None = None) -> Record:
         """Return the odometry's record."""

@@ -96,8 +96,7 @@ def _with_sample_at(stamp_ns: int, imu: ImuSamples) -> ImuSamples:
 
 def _rotations(rates: Array, times_s: Array) -> Array:
     """Integrate angular rates ``(S, 3)`` to rotations ``(S, 3, 3)`` relative to the first."""
-    turns = se3.so3_exp((rates[1:] + rates[:-1]) / 2 * np.diff(times_s)[:, None])
-    return se3.so3_chain(turns)
+    return se3.so3_chain(se3.so3_exp(se3.turns_by_rates(rates, np.diff(times_s))))
 
 
 def _bend(acceleration: Array, times_s: Array, at: int) -> Array:

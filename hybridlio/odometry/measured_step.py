@@ -16,11 +16,12 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.estimates import EarlierScanPose, RefinesAgain, RelativePose, ResidualSource, State, TakesBack
+from hybridlio.core.estimates import EarlierScanPose, RefinesAgain, RelativePose, State, TakesBack
 from hybridlio.core.motion_limits import POINT_LEVER_M
 from hybridlio.core.sensors import NS_PER_S, Frame, ImuSamples
 from hybridlio.odometry.pipeline import Pipeline, timed
-from hybridlio.odometry.second_pass import held_at_rest, second_compensation, turns_elsewhere, without_misfit
+from hybridlio.odometry.second_pass import held_at_rest, second_compensation, without_misfit
+from hybridlio.odometry.start.false_start import turns_elsewhere
 from hybridlio.odometry.start.start_search import StartEstimate, StartSearch
 from hybridlio.record import plain_values
 from hybridlio.sources.late_start import LateStart, less_certain
@@ -118,19 +119,15 @@ def _registered(
 ) -> tuple[Frame, RelativePose]:
     """Return a later step, registered a second time where its own motion compensates the scan otherwise."""
     compensated, step = pipeline.refine(frame, initial, before, seconds)
-    if not isinstance(pipeline.residual, RefinesAgain):
+    residual = pipeline.residual
+    if not isinstance(residual, RefinesAgain):
         return compensated, step
-    weighs = initial.from_imu and not pipeline.gate.is_warming_up and not _is_weighed(pipeline.residual)
+    weighs = initial.from_imu and not pipeline.gate.is_warming_up and not residual.weighs_predictions
     second = second_compensation(frame, initial, step, before, pipeline.calibration, pipeline.imu_noise, weighs)
     if second is not None:
         again = initial if len(frame.imu) else replace(initial, proposed=step.pose)
         compensated, step = pipeline.refine_again(frame, again, before, second)
-    return compensated, without_misfit(pipeline.residual, initial, step, LOST_COST)
-
-
-def _is_weighed(residual: ResidualSource) -> bool:
-    """Return whether matches are weighed with predictions already: those of a lidar that repeats no pattern."""
-    return isinstance(residual, ScanMatching) and not residual.recent.repeats
+    return compensated, without_misfit(residual, initial, step, LOST_COST)
 
 
 def _fits_poorly(step: RelativePose) -> bool:

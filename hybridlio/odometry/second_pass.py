@@ -14,7 +14,6 @@ import numpy as np
 
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
-from hybridlio.core.chi_square import chi_square_quantile
 from hybridlio.core.estimates import RefinesAgain, RelativePose, State, TakesBack
 from hybridlio.core.motion_limits import LEVEL_SINE, POINT_LEVER_M, UNKNOWN_TRANSLATION_SIGMA_M
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples
@@ -29,7 +28,6 @@ _SIGMAS = 3.0  # of the gyroscope's scale
 _QUIET_RAD_S, _QUIET_M_S2, _FEWEST_QUIET, _BIAS_SIGMAS = 0.02, 0.15, 5, 3.0
 _REST_M_S = 0.1  # 1 cm at 10 Hz, the error of a step; a standing person sways by less
 _ANY_TURN_RAD = 10.0
-_EXCLUDED_TURN = chi_square_quantile(0.999, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,13 +91,6 @@ def second_compensation(
     if moved_m.sum() <= _LEAST_RATIO * noise_m:
         return None
     return SecondCompensation(compensated_by @ se3.exp(error), holds)
-
-
-def turns_elsewhere(initial: RelativePose, found: RelativePose, sigma_rad: float = 0.0) -> bool:
-    """Return whether a step, whose own turn is uncertain by ``sigma_rad``, turns by what its initial pose excludes."""
-    apart = se3.so3_log(initial.pose[:3, :3].T @ found.pose[:3, :3])
-    covariance = initial.covariance[:3, :3] + sigma_rad**2 * np.eye(3)
-    return bool(apart @ np.linalg.solve(covariance, apart) > _EXCLUDED_TURN)
 
 
 def without_misfit(

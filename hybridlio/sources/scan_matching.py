@@ -121,6 +121,14 @@ class ScanMatching:
         """The settings at the scene's scale."""
         return self._scene.settings
 
+    @property
+    def weighs_predictions(self) -> bool:
+        """Whether matches are weighed with the IMU's predictions along weak directions: of lidars that do not repeat.
+
+        A spinning lidar's minima err alike, on the same few trunks: weighed so, drift in a field is a third larger.
+        """
+        return not self.recent.repeats
+
     def _thin(self, scan: Scan, has_imu: bool = False) -> ThinnedScan:
         """Thin a scan at the scene's scale, which it may change; the map then goes on at the new one."""
         before = self.settings
@@ -156,8 +164,7 @@ class ScanMatching:
     ) -> RelativePose:
         """Move the state on to the pose found and return the step to it."""
         pose, before, weak = observed.registration.pose, self._state.current, np.zeros((6, 6))
-        # A spinning lidar's minima err alike, on the same few trunks: weighed so, drift in a field is a third larger.
-        if initial.from_imu and not self.recent.repeats:
+        if initial.from_imu and self.weighs_predictions:
             predicted = before.predicted_covariance(initial)
             pose, weak = observed.weighed_with(before.T_map_lidar @ initial.pose, predicted)
         self._state = self._state.matched(pose, dt_s, bool(len(observed.degenerate)), has_vague_start(initial), weak)

@@ -4,38 +4,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matching import OFF, SURE, guess, true_pose, with_points
 
 from hybridlio.core import se3
 from hybridlio.core.errors import DataError
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.motion_limits import unknown_motion_covariance
-from hybridlio.core.sensors import Frame, Scan
+from hybridlio.core.sensors import Frame
 from hybridlio.datasets.sequence import Sequence
-from hybridlio.registration.settings import RegistrationSettings
 from hybridlio.sources.scan_matching import ScanMatching
 from hybridlio.sources.settings import ScanMatchingSettings
 
 TARGETS = ("local-map", "last-scan")
-SURE = np.diag(np.r_[np.full(3, 0.01), np.full(3, 0.1)] ** 2)
-OFF = se3.exp(np.array([0.003, -0.002, 0.005, 0.12, -0.08, 0.05]))
 
 
 @pytest.fixture(scope="module")
 def frames(sequence: Sequence) -> list[Frame]:
     return [sequence[k] for k in range(12)]
-
-
-def true_pose(sequence: Sequence, i: int, j: int) -> np.ndarray:
-    assert sequence.reference is not None
-    return se3.between(sequence.reference.poses[i], sequence.reference.poses[j])
-
-
-def guess(pose: np.ndarray, covariance: np.ndarray = SURE) -> RelativePose:
-    return RelativePose(pose, covariance, "guess")
-
-
-def with_points(frame: Frame, points: np.ndarray, stamp_ns: int | None = None) -> Frame:
-    return replace(frame, scan=Scan(stamp_ns or frame.scan.stamp_ns, points.astype(np.float32)))
 
 
 def empty(frame: Frame) -> Frame:
@@ -49,38 +34,6 @@ def error(found: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
 
 
 # -------------------------------------------------------------------------------------------------- a drive
-
-
-def test_a_scan_that_is_matched_again_is_matched_as_if_once(sequence: Sequence, frames: list[Frame]):
-    steps = []
-    for times in (1, 2):
-        matching = ScanMatching()
-        matching.start(frames[0])
-        for k in range(1, 4):
-            initial = guess(true_pose(sequence, k - 1, k) @ OFF)
-            found = matching.refine(frames[k], initial)
-            if times == 2:
-                found = matching.refine_again(frames[k], initial)
-            steps.append(found)
-    for once, twice in zip(steps[:3], steps[3:], strict=True):
-        np.testing.assert_array_equal(once.pose, twice.pose)
-        np.testing.assert_array_equal(once.covariance, twice.covariance)
-
-
-def test_a_scan_that_is_matched_again_counts_once_for_the_scale_of_the_scene(sequence: Sequence, frames: list[Frame]):
-    """A running mean over scans that shrink to a room's size goes as far with a second match of each as without."""
-    scales = []
-    for again in (False, True):
-        matching = ScanMatching(ScanMatchingSettings(registration=RegistrationSettings(max_distance_m=3.0)))
-        matching.start(frames[0])
-        for k in range(1, 6):
-            smaller = with_points(frames[k], frames[k].scan.points * 0.85**k)
-            matching.refine(smaller, guess(np.eye(4)))
-            if again:
-                matching.refine_again(smaller, guess(np.eye(4)))
-            scales.append(matching.settings.map_voxel_m)
-    assert scales[:5] == scales[5:]
-    assert scales[4] < scales[0]
 
 
 @pytest.mark.parametrize("target", TARGETS)

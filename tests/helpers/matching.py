@@ -1,0 +1,28 @@
+"""Guesses and scans for tests of scan matching."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hybridlio.core import se3
+from hybridlio.core.estimates import RelativePose
+from hybridlio.core.sensors import Frame, Scan
+from hybridlio.datasets.sequence import Sequence
+
+SURE = np.diag(np.r_[np.full(3, 0.01), np.full(3, 0.1)] ** 2)
+OFF = se3.exp(np.array([0.003, -0.002, 0.005, 0.12, -0.08, 0.05]))
+
+
+def true_pose(sequence: Sequence, i: int, j: int) -> np.ndarray:
+    assert sequence.reference is not None
+    return se3.between(sequence.reference.poses[i], sequence.reference.poses[j])
+
+
+def guess(pose: np.ndarray, covariance: np.ndarray = SURE) -> RelativePose:
+    return RelativePose(pose, covariance, "guess")
+
+
+def with_points(frame: Frame, points: np.ndarray, stamp_ns: int | None = None) -> Frame:
+    return replace(frame, scan=Scan(stamp_ns or frame.scan.stamp_ns, points.astype(np.float32)))
