@@ -78,6 +78,7 @@ class RegistrationProblem:
         settings: of the registration.
         dense_source: ``(M, 3)`` more of the scan's points, for point-to-point matches; None for ``source``.
         only_scan_pose: ``(4, 4)`` pose of the single scan of which the surface is made; None for several scans.
+        without_edges: leave out points beyond the edge of what the surface shows, which has no gaps between rings.
         has_rooms_planes: what observes a weak direction is planes of a room, seen densely, in a map of several scans.
     """
 
@@ -86,6 +87,7 @@ class RegistrationProblem:
     settings: RegistrationSettings
     dense_source: Array | None = None
     only_scan_pose: Array | None = None
+    without_edges: bool = False
     has_rooms_planes: bool = False
 
     @property
@@ -101,7 +103,7 @@ class RegistrationProblem:
 
     def neighbours(self) -> MixedNeighbours:
         """Return the source's neighbours on the surface, to be followed from a pose."""
-        return MixedNeighbours(self.surface, self.source, self.settings.threads)
+        return MixedNeighbours(self.surface, self.source, self.settings.threads, self.without_edges)
 
 
 def register_with_degeneracy(

@@ -31,11 +31,23 @@ class Candidates(NamedTuple):
     reach_m: Array
 
 
+class Reach(NamedTuple):
+    """Which neighbours count.
+
+    Attributes:
+        distance_m: how far they may be.
+        aside_m: how far along their planes.
+        one_sided: not those on thin planes that the lidar would have to see from behind.
+    """
+
+    distance_m: float
+    aside_m: float
+    one_sided: bool
+
+
 @compiled
-def near(
-    pose: Array, source: Array, index: Index, points: Array, planes: Array, max_distance_m: float, one_sided: bool
-) -> Index:
-    """Return which of the points ``(N, 3)`` are within a distance of their neighbours, ascending.
+def near(pose: Array, source: Array, index: Index, points: Array, planes: Array, reach: Reach) -> Index:
+    """Return which of the points ``(N, 3)`` have neighbours that count, ascending.
 
     Args:
         pose: ``(4, 4)`` of the scan.
@@ -43,20 +55,21 @@ def near(
         index: ``(N,)`` of the neighbours.
         points: ``(M, 3)`` of the surface.
         planes: ``(M, 5)`` of the surface.
-        max_distance_m: largest distance.
-        one_sided: leave out points of thin planes that the lidar would have to see from behind.
+        reach: which neighbours count.
     """
     kept, count = np.empty(len(source), np.int64), 0
     for i in range(len(source)):
-        away_m, distance2, range2, k = 0.0, 0.0, 0.0, index[i]
+        away_m, height_m, distance2, range2, k = 0.0, 0.0, 0.0, 0.0, index[i]
         for row in range(3):
             turned = pose[row, 0] * source[i, 0] + pose[row, 1] * source[i, 1] + pose[row, 2] * source[i, 2]
-            distance2 += (turned + pose[row, 3] - points[k, row]) ** 2
+            difference = turned + pose[row, 3] - points[k, row]
+            distance2 += difference**2
+            height_m += planes[k, row] * difference
             away_m += planes[k, row] * turned
             range2 += source[i, row] ** 2
-        if distance2 >= max_distance_m * max_distance_m:
+        if distance2 >= reach.distance_m**2 or distance2 - height_m**2 >= reach.aside_m**2:
             continue
-        is_behind = one_sided and away_m >= _LARGEST_FROM_BEHIND * np.sqrt(range2)
+        is_behind = reach.one_sided and away_m >= _LARGEST_FROM_BEHIND * np.sqrt(range2)
         if is_behind and planes[k, 4] >= THIN_PLANE_WEIGHT:
             continue
         kept[count] = i

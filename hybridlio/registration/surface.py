@@ -31,6 +31,13 @@ if TYPE_CHECKING:
     from hybridlio.registration.loops import Rows, Sums
     from hybridlio.registration.match_loops import Candidates
 
+# Of the matching distance, along the plane: a voxel of the map at the default settings. A map without gaps has a point
+# in each voxel that it has seen. A point whose neighbour is farther aside lies where nothing has been seen yet, and the
+# plane at the edge, continued to there, is a guess. Matches with edges are commonly left out: Turk and Levoy, "Zippered
+# polygon meshes from range images", SIGGRAPH 1994. With a rosette in rooms and mines errors are then 0.8 times as
+# large, and with 0.4 in place of 0.6 they are 0.9 times. Between the rings of spinning lidars neighbours lie as far
+# aside everywhere: with 16 beams the drift on roads is 1.13 times as large without these.
+_ASIDE_SHARE = 0.6
 # Nearest points that are kept of each query: four take 1.4 times as long to find as two, and the query may move four
 # times as far (3 to 9 cm in rooms and streets) without a search.
 _CANDIDATES = 4
@@ -175,13 +182,15 @@ class Neighbours:
         surface: where neighbours are searched.
         source: ``(N, 3)`` the scan's points, scan frame.
         threads: for the search.
+        without_edges: leave out points beyond the edge of what the surface shows; it must have no gaps between rings.
 
     Attributes:
         surface: as given.
     """
 
-    def __init__(self, surface: Surface, source: Array, threads: int) -> None:
+    def __init__(self, surface: Surface, source: Array, threads: int, without_edges: bool = False) -> None:
         self.surface, self._source, self._threads = surface, np.ascontiguousarray(source), threads
+        self._aside_share = _ASIDE_SHARE if without_edges else np.inf
         self._searched: Array | None = None  # (N, 3) where each point was when its neighbour was last searched
         self._candidates: Candidates
         self._index = np.empty(0, np.int64)
@@ -204,7 +213,8 @@ class Neighbours:
         pose = np.ascontiguousarray(pose)
         self._update(pose)
         surface, index, source = self.surface, self._index, self._source
-        kept = match_loops.near(pose, source, index, surface.points, surface.all_planes, max_distance_m, one_sided)
+        reach = match_loops.Reach(max_distance_m, self._aside_share * max_distance_m, one_sided)
+        kept = match_loops.near(pose, source, index, surface.points, surface.all_planes, reach)
         return (index, source) if len(kept) == len(source) else (index.take(kept), source.take(kept, axis=0))
 
     def costs(self, pose: Array, kernel_m: float, max_distance_m: float) -> Array:

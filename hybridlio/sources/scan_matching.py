@@ -293,8 +293,8 @@ class ScanMatching:
         return register_with_degeneracy(problem, start, kernel_start_m, is_vague)
 
     def _problem(self, scan: ThinnedScan, is_start_vague: bool = True) -> RegistrationProblem:
-        surface = self._map.surface
+        surface, only, has_rings = self._map.surface, self._map.only_keyframe_pose, self.recent.repeats
         assert surface is not None
-        only = self._map.only_keyframe_pose
-        has_planes = surface.one_sided and self.recent.repeats and only is None and not is_start_vague
-        return RegistrationProblem(surface, scan.source, self.settings.registration, scan.points, only, has_planes)
+        has_planes = surface.one_sided and has_rings and only is None and not is_start_vague
+        of_scan = scan.source, self.settings.registration, scan.points
+        return RegistrationProblem(surface, *of_scan, only, not has_rings, has_planes)

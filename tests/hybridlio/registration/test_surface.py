@@ -94,6 +94,19 @@ def test_points_without_a_neighbour_within_the_distance_are_left_out(rng: np.ran
     np.testing.assert_array_equal(matches.source, points)
 
 
+def test_points_beyond_the_edge_of_a_surface_are_left_out_if_it_has_no_gaps(rng: np.random.Generator):
+    side = np.arange(-2, 2.01, 0.25)
+    points = np.column_stack([*(grid.ravel() for grid in np.meshgrid(side, side)), np.zeros(len(side) ** 2)])
+    surface = Surface(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)))
+    source = np.column_stack([rng.uniform(-4, 4, (2000, 2)), rng.uniform(-0.3, 0.3, 2000)])
+    beyond_m = np.abs(source[:, :2]).max(axis=1) - 2.0
+    for without_edges, reach_m in ((False, 1.0), (True, 0.6)):
+        matched = Neighbours(surface, source, 1, without_edges).matches(np.eye(4), 1.0).source
+        assert set(map(tuple, source[beyond_m < 0])) <= set(map(tuple, matched))  # all that the surface shows
+        farthest_m = np.abs(matched[:, :2]).max() - 2.0
+        assert 0.9 * reach_m < farthest_m <= reach_m
+
+
 def test_the_point_of_a_single_point_surface_is_every_points_neighbour():
     surface = Surface(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))
     source = np.array([[0.1, 0.0, 0.2], [0.0, 0.3, -0.1]])

@@ -114,6 +114,21 @@ def test_a_start_with_few_beams_claims_what_its_young_map_bears(monkeypatch: pyt
     assert claimed < 0.7 * squared_error_of_turns()
 
 
+# ---------------------------------------------------------------------------------------------------- edges of the map
+
+
+def test_points_beyond_the_maps_edge_are_left_out_for_lidars_whose_map_has_no_gaps(
+    sequence: Sequence, frames: list[Frame]
+):
+    """Between the rings of a spinning lidar every point is as far from the map's points as beyond an edge."""
+    matching = driven(sequence, frames, 1)
+    scan = matching.current_scan
+    assert scan is not None
+    for repeats in (True, False):
+        matching.recent.tell(repeats)
+        assert matching._problem(scan).without_edges is not repeats
+
+
 # ---------------------------------------------------------------------------------------------------- where to start
 
 
