@@ -13,7 +13,7 @@ from hybridlio.core.sensors import ImuNoise
 from hybridlio.simulation.choices import Driving, Scene
 
 SIMULATED_IMU = ImuNoise(gyro_bias_sigma_rad_s=1.0e-2, accel_bias_sigma_m_s2=1.0e-1)
-"""The IMU of simulated road vehicles: an industrial MEMS unit."""
+"""The IMU of simulated road vehicles: the densities that are assumed by default, and biases of a trimmed MEMS unit."""
 
 
 class SimulationConfig(BaseModel):
