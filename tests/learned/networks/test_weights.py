@@ -105,6 +105,7 @@ def test_the_shipped_weights_load_and_are_small():
 def test_the_shipped_published_weights_have_no_registration_step():
     network = load_weights(shipped("published")).recipe.network
     assert network.projective_steps == 0
+    assert network.iterations == 3
     assert network.encoder
     assert network.imu == "initial-pose"
 
