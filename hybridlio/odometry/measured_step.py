@@ -25,7 +25,7 @@ from hybridlio.odometry.start.false_start import turns_elsewhere
 from hybridlio.odometry.start.start_search import StartEstimate, StartSearch
 from hybridlio.record import plain_values
 from hybridlio.sources.late_start import LateStart, less_certain
-from hybridlio.sources.recent_points import repeats_directions, repeats_rows
+from hybridlio.sources.recent_points import FEWEST_POINTS, repeats_directions, repeats_rows
 from hybridlio.sources.scan_matching import LOST_COST, ScanMatching
 from hybridlio.sources.thinned_scan import thin
 
@@ -88,7 +88,7 @@ def _measured(
 def _learn_pattern(pipeline: Pipeline, second: Frame) -> None:
     """Tell scan matching whether the lidar repeats its pattern; if not, a search leads the start."""
     residual, first = pipeline.residual, pipeline.first
-    if not isinstance(residual, ScanMatching):
+    if not isinstance(residual, ScanMatching) or min(len(first.scan), len(second.scan)) < FEWEST_POINTS:
         return
     repeats = repeats_directions(first.scan, second.scan)
     residual.recent.tell(repeats)

@@ -35,6 +35,13 @@ def test_scans_with_rings_do_not_fill_each_other(rng: np.random.Generator):
     assert kept.together(scans[-1], HERE, 0.01) is scans[-1]
 
 
+@pytest.mark.parametrize("few", [0, 40])
+def test_a_scan_of_few_points_decides_nothing_about_the_pattern(rng: np.random.Generator, few: int):
+    for kind, repeats in ((rings, True), (scattered, False)):
+        scans = [kind(rng) for _ in range(2)]
+        assert recent([scans[0], scattered(rng, few), scans[1]]).repeats is repeats
+
+
 @pytest.mark.parametrize("count", [2, 9, 10, 12])
 def test_scattered_scans_fill_each_other_over_a_second(rng: np.random.Generator, count: int):
     scans = [scattered(rng, 500) for _ in range(count)]
