@@ -30,7 +30,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from front_end import REAL_PERTURBATIONS, adapted, errors_by_step, perturbed
+from front_end import REAL_PERTURBATIONS, adapted
 
 from hybridlio.commands.terminal import progress
 from hybridlio.core import se3, tables
@@ -42,7 +42,7 @@ from hybridlio.learned.networks.odometry_network import OdometryNetwork
 from hybridlio.learned.networks.weights import Weights, load_weights, weights_path
 from hybridlio.learned.settings import Recipe
 from hybridlio.learned.training.objective import clouds_for, descended
-from hybridlio.learned.training.validation import step_errors
+from hybridlio.learned.training.validation import errors_by_step, step_errors, with_errors
 from hybridlio.runs.training.training_data import DataOptions, prepare_once
 from hybridlio.simulation import SimulationConfig
 from hybridlio.simulation.drive.path import SmoothPath
@@ -114,7 +114,7 @@ def left(network: OdometryNetwork, tested: Shard) -> Left:
     """Return the error that is left after all steps."""
     rotation_deg, translation_m = REAL_PERTURBATIONS[0]
     reference = tested.reference[1:]
-    return Left(*errors_by_step(network, tested, reference, perturbed(reference, rotation_deg, translation_m))[-1])
+    return Left(*errors_by_step(network, tested, reference, with_errors(reference, rotation_deg, translation_m))[-1])
 
 
 def minimum(recipe: Recipe, tested: Shard) -> Left:

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import torch
-from front_end import PERTURBATIONS, Row, errors_by_step, perturbed
+from front_end import PERTURBATIONS, Row
 
 from hybridlio.core import tables
 from hybridlio.core.files import write_atomically
@@ -25,7 +25,7 @@ from hybridlio.learned.settings import Recipe
 from hybridlio.learned.training.driving import drive
 from hybridlio.learned.training.run_options import RunOptions
 from hybridlio.learned.training.train import train
-from hybridlio.learned.training.validation import step_errors
+from hybridlio.learned.training.validation import errors_by_step, step_errors, with_errors
 from hybridlio.runs.training.recipes import for_steps
 from hybridlio.runs.training.training_data import DataOptions, prepare_shards
 
@@ -34,7 +34,7 @@ def measure(name: str, network: OdometryNetwork, tests: list[Shard]) -> Iterator
     """Yield a row for each test recording: error left of the larger perturbation, drift of the chained steps."""
     for shard in tests:
         reference = shard.reference[1:]
-        degrees, metres = errors_by_step(network, shard, reference, perturbed(reference, *PERTURBATIONS[0]))[-1]
+        degrees, metres = errors_by_step(network, shard, reference, with_errors(reference, *PERTURBATIONS[0]))[-1]
         driven = drive(network, shard)
         initial_deg, initial_m = step_errors(driven.initial, driven.reference)
         t_rel, r_rel = driven.drift or (None, None)

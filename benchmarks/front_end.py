@@ -40,7 +40,7 @@ from hybridlio.learned.settings import NetworkSettings
 from hybridlio.learned.training.driving import drive
 from hybridlio.learned.training.run_options import RunOptions
 from hybridlio.learned.training.train import train
-from hybridlio.learned.training.validation import step_errors
+from hybridlio.learned.training.validation import errors_by_step, step_errors, with_errors
 from hybridlio.runs.training.recipes import choose_recipe
 from hybridlio.runs.training.training_data import DataOptions, prepare_shards
 
@@ -51,29 +51,6 @@ Sizes = tuple[tuple[float, float], ...]  # degrees and metres
 PERTURBATIONS = ((0.41, 0.145), (0.10, 0.054))  # degrees and metres, RMS over pairs
 REAL_PERTURBATIONS = ((0.41, 0.149),)
 VOXEL_M, MAX_DISTANCE_M = 0.2, 1.0  # small_gicp's thinning and largest distance of a match
-
-
-def perturbed(reference: Array, rotation_deg: float, translation_m: float) -> Array:
-    """Return poses ``(N, 4, 4)`` with random errors of these RMS sizes, always the same draws."""
-    sigmas = np.r_[np.full(3, np.radians(rotation_deg)), np.full(3, translation_m)] / np.sqrt(3)
-    draws = np.random.default_rng(0).normal(size=(len(reference), 6)) * sigmas
-    return reference @ se3.exp(draws)
-
-
-@torch.no_grad()
-def errors_by_step(
-    network: OdometryNetwork, shard: Shard, reference: Array, initial: Array
-) -> list[tuple[float, float]]:
-    """Return the RMS error in degrees and metres before, and after each of the network's steps, over all pairs."""
-    # the last velocity is not used here, so pairs without one count too
-    pairs, poses = Pairs([shard], replace(network.settings, velocity=False)), []
-    rows = [pairs.where(i)[1] - 1 for i in range(len(pairs))]
-    for i, row in enumerate(rows):
-        given = pairs.batch([i]).network
-        start = torch.tensor(initial[row], dtype=torch.float32)[None]
-        poses.append(torch.stack(network.refine(given, start).poses)[:, 0].double().numpy())
-    found = np.swapaxes(np.array(poses), 0, 1)
-    return [step_errors(steps, reference[rows]) for steps in (initial[rows], *found)]
 
 
 def gicp_steps(sequence: Sequence) -> Array:
@@ -107,7 +84,7 @@ def untrained(settings: NetworkSettings) -> Networks:
 
 def accuracy_rows(networks: Networks, shard: Shard, reference: Array, perturbations: Sizes) -> Iterator[Row]:
     for (rotation_deg, translation_m), (name, network) in itertools.product(perturbations, networks.items()):
-        figures = errors_by_step(network, shard, reference, perturbed(reference, rotation_deg, translation_m))
+        figures = errors_by_step(network, shard, reference, with_errors(reference, rotation_deg, translation_m))
         cells = [f"{100 * metres:.2f} cm / {degrees:.3f}°" for degrees, metres in figures]
         yield {
             "recording": shard.info.name,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.learned.data.augmentation import perturbed
 from hybridlio.learned.data.pairs import Pairs
+from hybridlio.learned.data.shards import Shard
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
 from hybridlio.learned.settings import Recipe
 from hybridlio.learned.training.driving import drift_of
@@ -86,6 +87,38 @@ def step_errors(poses: Array, reference: Array) -> tuple[float, float]:
     angles = np.linalg.norm(se3.so3_log(error[:, :3, :3]), axis=1)
     distances = np.linalg.norm(error[:, :3, 3], axis=1)
     return float(np.degrees(np.sqrt((angles**2).mean()))), float(np.sqrt((distances**2).mean()))
+
+
+def with_errors(reference: Array, rotation_deg: float, translation_m: float) -> Array:
+    """Return poses ``(N, 4, 4)`` with random errors of these root mean square sizes, always the same draws."""
+    sigmas = np.r_[np.full(3, np.radians(rotation_deg)), np.full(3, translation_m)] / np.sqrt(3)
+    draws = np.random.default_rng(0).normal(size=(len(reference), 6)) * sigmas
+    return np.asarray(reference @ se3.exp(draws))
+
+
+@torch.no_grad()
+def errors_by_step(
+    network: OdometryNetwork, shard: Shard, reference: Array, initial: Array
+) -> list[tuple[float, float]]:
+    """Return the errors before, and after each of the network's steps, over all pairs of a recording.
+
+    Args:
+        network: asked for the residual of each initial pose.
+        shard: the recording.
+        reference, initial: ``(N, 4, 4)`` relative poses of all its steps.
+
+    Returns:
+        root mean squares in degrees and in metres, as :func:`step_errors`.
+    """
+    # the last velocity is not used here, so pairs without one count too
+    pairs, poses = Pairs([shard], replace(network.settings, velocity=False)), []
+    rows = [pairs.where(i)[1] - 1 for i in range(len(pairs))]
+    for i, row in enumerate(rows):
+        given = pairs.batch([i]).network
+        start = torch.tensor(initial[row], dtype=torch.float32)[None]
+        poses.append(torch.stack(network.refine(given, start).poses)[:, 0].double().numpy())
+    found = np.swapaxes(np.array(poses), 0, 1)
+    return [step_errors(steps, reference[rows]) for steps in (initial[rows], *found)]
 
 
 def _drift(pairs: Pairs, steps: Steps) -> tuple[float | None, float | None]:

@@ -26,3 +26,7 @@ def guess(pose: np.ndarray, covariance: np.ndarray = SURE) -> RelativePose:
 
 def with_points(frame: Frame, points: np.ndarray, stamp_ns: int | None = None) -> Frame:
     return replace(frame, scan=Scan(stamp_ns or frame.scan.stamp_ns, points.astype(np.float32)))
+
+
+def empty(frame: Frame) -> Frame:
+    return with_points(frame, np.empty((0, 3)))

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from matching import OFF, SURE, guess, true_pose, with_points
+from matching import OFF, SURE, empty, guess, true_pose, with_points
 
 from hybridlio.core import se3
 from hybridlio.core.errors import DataError
@@ -21,10 +21,6 @@ TARGETS = ("local-map", "last-scan")
 @pytest.fixture(scope="module")
 def frames(sequence: Sequence) -> list[Frame]:
     return [sequence[k] for k in range(12)]
-
-
-def empty(frame: Frame) -> Frame:
-    return with_points(frame, np.empty((0, 3)))
 
 
 def error(found: np.ndarray, truth: np.ndarray) -> tuple[float, float]:

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matching import guess, true_pose, with_points
 from walks import errors_of, estimated, walk
 
 from hybridlio.core import se3
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.motion_limits import unknown_motion_covariance
-from hybridlio.core.sensors import Frame, Scan
+from hybridlio.core.sensors import Frame
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.simulation.platforms.config import PlatformConfig
 from hybridlio.sources import map_errors, scan_matching
@@ -20,8 +21,12 @@ from hybridlio.sources.settings import ScanMatchingSettings
 from hybridlio.sources.thinned_scan import thin
 
 
-def guess(pose: np.ndarray, rotation_rad: float = 0.001, translation_m: float = 0.02) -> RelativePose:
-    return RelativePose(pose, np.diag(np.r_[np.full(3, rotation_rad), np.full(3, translation_m)] ** 2), "guess")
+def certain_to(rotation_rad: float, translation_m: float) -> np.ndarray:
+    """A covariance with these standard deviations."""
+    return np.diag(np.r_[np.full(3, rotation_rad), np.full(3, translation_m)] ** 2)
+
+
+NEAR = certain_to(0.001, 0.02)
 
 
 def unknown(rotation_rad: float | None = None) -> RelativePose:
@@ -32,20 +37,11 @@ def unknown(rotation_rad: float | None = None) -> RelativePose:
     return RelativePose(np.eye(4), covariance, "none")
 
 
-def true_step(sequence: Sequence, k: int) -> np.ndarray:
-    assert sequence.reference is not None
-    return se3.between(sequence.reference.poses[k - 1], sequence.reference.poses[k])
-
-
-def with_points(frame: Frame, points: np.ndarray) -> Frame:
-    return replace(frame, scan=Scan(frame.scan.stamp_ns, points.astype(np.float32)))
-
-
 def driven(sequence: Sequence, frames: list[Frame], steps: int) -> ScanMatching:
     matching = ScanMatching()
     matching.start(frames[0])
     for k in range(1, steps + 1):
-        assert matching.refine(frames[k], guess(true_step(sequence, k))).ok
+        assert matching.refine(frames[k], guess(true_pose(sequence, k - 1, k), NEAR)).ok
     return matching
 
 
@@ -60,7 +56,7 @@ def standing(frames: list[Frame], rng: np.random.Generator, steps: int) -> list[
     for k in range(steps + 1):
         scan = with_points(frames[k], points + 0.01 * rng.standard_normal(points.shape))
         if k:
-            found.append(matching.refine(scan, guess(np.eye(4))))
+            found.append(matching.refine(scan, guess(np.eye(4), NEAR)))
         else:
             matching.start(scan)
     return found
@@ -86,7 +82,7 @@ def test_steps_along_a_map_of_one_scan_drift_by_a_tenth(sequence: Sequence, fram
         replace(ScanMatchingSettings(), local_map=replace(ScanMatchingSettings().local_map, keyframe_m=50.0))
     )
     matching.start(frames[0])
-    steps = [matching.refine(frames[k], guess(true_step(sequence, k))) for k in (1, 2, 3)]
+    steps = [matching.refine(frames[k], guess(true_pose(sequence, k - 1, k), NEAR)) for k in (1, 2, 3)]
     for step in steps[1:]:
         assert step.drift is not None
         assert 0.05 < np.trace(step.drift) / np.trace(step.covariance) < 0.2
@@ -176,7 +172,7 @@ def test_an_unknown_motion_is_continued_where_the_scan_fits_there(
     found = matching.refine(frames[4], unknown())
     assert found.ok
     assert searches == []
-    assert np.linalg.norm(se3.between(found.pose, true_step(sequence, 4))[:3, 3]) < 0.05
+    assert np.linalg.norm(se3.between(found.pose, true_pose(sequence, 3, 4))[:3, 3]) < 0.05
 
 
 def test_an_unknown_motion_is_searched_where_the_scan_does_not_fit(
@@ -192,10 +188,10 @@ def test_an_unknown_motion_is_searched_where_the_scan_does_not_fit(
 @pytest.mark.parametrize(
     ("initial", "least_m", "most_m"),
     [
-        (guess(np.eye(4), rotation_rad=0.0005, translation_m=0.001), 0.05, 0.15),
-        (guess(np.eye(4), rotation_rad=0.03, translation_m=0.001), 0.25, 0.9),
-        (guess(np.eye(4), rotation_rad=0.001, translation_m=0.2), 0.2, 0.5),
-        (guess(np.eye(4), rotation_rad=1.0, translation_m=0.2), 0.9, 1.1),
+        (guess(np.eye(4), certain_to(0.0005, 0.001)), 0.05, 0.15),
+        (guess(np.eye(4), certain_to(0.03, 0.001)), 0.25, 0.9),
+        (guess(np.eye(4), certain_to(0.001, 0.2)), 0.2, 0.5),
+        (guess(np.eye(4), certain_to(1.0, 0.2)), 0.9, 1.1),
     ],
     ids=["certain", "uncertain rotation", "uncertain translation", "unknown rotation"],
 )

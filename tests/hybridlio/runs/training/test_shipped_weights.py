@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
-from hybridlio.core import se3
 from hybridlio.core.lidar_models import LIDAR_MODELS
-from hybridlio.learned.data.pairs import Pairs
 from hybridlio.learned.data.shards import Shard
 from hybridlio.learned.networks.odometry_network import OdometryNetwork
 from hybridlio.learned.networks.weights import load_weights, shipped
 from hybridlio.learned.settings import Recipe
-from hybridlio.learned.training.validation import step_errors
+from hybridlio.learned.training.validation import errors_by_step, with_errors
 from hybridlio.runs.training.simulated_data import prepare_drives
 from hybridlio.runs.training.training_data import DataOptions
 from hybridlio.simulation import SimulationConfig
 
 DRIVE = SimulationConfig(seed=3031, seconds=1.2, speed_m_s=10.0), LIDAR_MODELS["hdl-64e"]
-OFF = np.r_[np.full(3, np.radians(0.4)), np.full(3, 0.145)] / np.sqrt(3)  # of the initial poses, RMS
 
 
 @pytest.fixture(scope="module")
@@ -31,15 +26,10 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Recipe], Sha
     return lambda recipe: prepare_drives([DRIVE], recipe, options)[0]
 
 
-@torch.no_grad()
 def left(network: OdometryNetwork, shard: Shard) -> tuple[float, float]:
     """Return the RMS errors that are left of perturbed initial poses, degrees and metres."""
-    pairs = Pairs([shard], replace(network.settings, velocity=False))
-    batch = pairs.batch(range(len(pairs)))
-    exact = batch.reference.double().numpy()
-    off = se3.exp(OFF * np.random.default_rng(0).standard_normal((len(exact), 6)))
-    found = network.refine(batch.network, torch.tensor(exact @ off, dtype=torch.float32)).pose
-    return step_errors(found.double().numpy(), exact)
+    reference = shard.reference[1:]
+    return errors_by_step(network, shard, reference, with_errors(reference, 0.4, 0.145))[-1]
 
 
 @pytest.mark.parametrize(
