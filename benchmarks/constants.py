@@ -58,6 +58,7 @@ MAP = tuple(f"{REGISTRATION}{name}.py" for name in ("local_map_limits", "local_m
 PLANES = ("tests/hybridlio/cloud/test_plane_fitting.py", "tests/hybridlio/cloud/test_normals.py", *MAP)
 POINTS = tuple(f"{REGISTRATION}{name}.py" for name in ("point_to_point", "degeneracy"))
 SEARCH = (f"{REGISTRATION}motion_search.py",)
+ADRIFT = f"{REGISTRATION}adrift.py", f"{SOURCES}scans_adrift.py"
 GATE = tuple(f"tests/hybridlio/sources/gate/test_innovation_gate{end}.py" for end in ("_constants", ""))
 MATCHING = tuple(f"{SOURCES}{name}.py" for name in ("scan_matching_constants", "scan_matching"))
 START = ("tests/hybridlio/odometry/start/test_start_search.py",)
@@ -173,13 +174,10 @@ TABLE = [
     *_in("hybridlio/sources/gate/gate_result.py", GATE, GATE_NIS=("5.0", "300.0")),
     *_in("hybridlio/sources/gate/innovation_gate.py", GATE, GROSS_NIS=("30.0", "1e6"), MAX_REJECTIONS=("1", "50")),
     *_in("hybridlio/sources/gate/innovation_gate.py", GATE, WARM_UP_STEPS=("0", "100"), _BISECTIONS=("3",)),
-    *_in(
-        "hybridlio/sources/scan_matching.py",
-        MATCHING,
-        _UNKNOWN_ROTATION_SIGMA_RAD=("1e-5", "10.0"),
-        LOST_COST=("0.01", "1.0"),
-        _LOST_SCANS=("1", "50"),
-    ),
+    *_in("hybridlio/sources/scan_matching.py", MATCHING, LOST_COST=("0.01", "1.0"), _LOST_SCANS=("1", "50")),
+    *_in("hybridlio/registration/results.py", ADRIFT, LONG_ADRIFT=("1", "50")),
+    *_in("hybridlio/registration/surface.py", (f"{REGISTRATION}surface.py", *MATCHING), _ASIDE_SHARE=("0.05", "10.0")),
+    *_in("hybridlio/sources/refinding.py", MATCHING, _UNKNOWN_ROTATION_SIGMA_RAD=("1e-5", "10.0")),
     *_in("hybridlio/sources/map_errors.py", MATCHING, _YOUNG_MAP_INFLATION=("0.0", "100.0")),
     *_in("hybridlio/sources/map_errors.py", MATCHING, _YOUNG_MAP_DRIFT_SHARE=("0.0", "50.0")),
     *_in("hybridlio/sources/map_errors.py", MATCHING, _UNCHANGED_MAP_DRIFT_SHARE=("0.5", "0.0")),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +12,9 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.registration.information import UNKNOWN_SIGMA_M, covariance_of
 
+# Scans in a row that leave a direction unobserved, from which on that is taken for the scene. Most starts in rooms and
+# streets have one, over the gaps between the rings of the only scan before.
+LONG_ADRIFT = 2
 _LEAST_COVERAGE = 0.3  # a surface that covers less of a scan says little about it
 
 
@@ -100,6 +103,8 @@ class ObservedRegistration:
         normal_noise: spurious share of the surface's information.
         is_settled: the deviations of observed directions are those of independent residuals, to be scaled as those of
             strong directions are.
+        adrift_m: how far off the pose may be along a direction in which scan after scan has left it unknown.
+        disbelieved: ``(U, 6)`` unit tangent directions that seem observed and are taken for unobserved.
     """
 
     registration: Registration
@@ -109,16 +114,41 @@ class ObservedRegistration:
     weak_sigmas_m: Array
     normal_noise: float
     is_settled: bool = False
+    adrift_m: float = 0.0
+    disbelieved: Array = field(default_factory=lambda: np.empty((0, 6)))
 
     @property
     def degenerate(self) -> Array:
         """``(U, 6)`` unit tangent directions that are not observed."""
         unobserved = self.weak_tangents[~self.is_observed]
-        return np.asarray(unobserved / np.linalg.norm(unobserved, axis=1, keepdims=True))
+        return np.concatenate([unobserved / np.linalg.norm(unobserved, axis=1, keepdims=True), self.disbelieved])
 
     def within_coverage(self, coverage: float) -> ObservedRegistration:
         """As :meth:`hybridlio.registration.results.Registration.within_coverage`."""
         return replace(self, registration=self.registration.within_coverage(coverage))
+
+    def adrift(self, times: int, disbelieved: Array) -> ObservedRegistration:
+        """Return what is to be believed of the result where nothing else knows the position along a direction.
+
+        From the second scan in a row on, three errors are shared with the scans before, and no number of scans averages
+        them out. In tunnels they were taken for measurements of the speed, and positions became sure and wrong:
+
+        * What little the costs depend on the position comes from the lidar's own pattern, at rest relative to it.
+          Guesses with one error are worth one. With ``k(k + 1)/2`` times the variance of the ``k``-th, any number of
+          them has at most twice the information of the first, as ``Σ 1/(k(k + 1)) = 1``.
+        * Normals lean. Moved along the direction by an unknown way, points seem nearer to their planes or farther.
+        * By chance one sparse scan in ten or twenty seems to observe the direction.
+
+        Args:
+            times: number of scans in a row that leave the direction unobserved.
+            disbelieved: ``(U, 6)`` unit tangent directions that are not observed even if no direction seems unobserved.
+        """
+        if times < LONG_ADRIFT:
+            return self
+        factor = np.where(self.is_observed, 1.0, np.sqrt(times * (times + 1) / 2))
+        disbelieved = self.disbelieved if len(self.degenerate) else disbelieved
+        sigmas_m = factor * self.weak_sigmas_m
+        return replace(self, weak_sigmas_m=sigmas_m, adrift_m=UNKNOWN_SIGMA_M, disbelieved=disbelieved)
 
     def covariance(self, scale: float) -> Array:
         """Return ``(6, 6)`` rad² and m², rotation first: from the Hessian in strong directions, from costs in weak
@@ -127,13 +157,12 @@ class ObservedRegistration:
         Args:
             scale: ratio of the strong directions' covariance to that of independent residuals.
         """
-        found = self.registration
-        strong = covariance_of(
-            found.hessian, found.sigma_m, scale, found.lever_arms_m, self.normal_noise, fixed=self.weak_basis
-        )
+        found, noise = self.registration, self.normal_noise
+        sigma_m = float(np.hypot(found.sigma_m, self.adrift_m * np.sqrt(noise)))  # of normals that lean as they do
+        strong = covariance_of(found.hessian, sigma_m, scale, found.lever_arms_m, noise, fixed=self.weak_basis)
         sigmas_m = np.where(self.is_settled & self.is_observed, np.sqrt(scale), 1.0) * self.weak_sigmas_m
         weak = self.weak_tangents * np.minimum(sigmas_m, UNKNOWN_SIGMA_M)[:, None]
-        return np.asarray(strong + weak.T @ weak)
+        return np.asarray(strong + weak.T @ weak + UNKNOWN_SIGMA_M**2 * self.disbelieved.T @ self.disbelieved)
 
     def weighed_with(self, start: Array, predicted: Array) -> tuple[Array, Array]:
         """Return the pose ``(4, 4)`` with its weak directions weighed with a prediction, and their covariance.

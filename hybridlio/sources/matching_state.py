@@ -85,14 +85,17 @@ class MatchingState:
         keyframe: ``(N, 3)`` points of the last scan, lidar frame, that go into the map before the next scan is matched;
             None where the scan is no keyframe. They wait because the scan may be taken back.
         unmatched: number of scans in a row that had enough points and did not fit the map.
-        adrift: whether the last scan's position relative to the map is unknown. The next keyframe starts a new map.
+        adrift: number of scans in a row, up to the last, whose position relative to the map is unknown. Unless it is 0,
+            the next keyframe starts a new map.
+        unobserved: ``(U, 6)`` unit tangent directions that the last scan left unobserved, if it is adrift.
     """
 
     current: PathPoint
     previous: PathPoint
     doubted: PathPoint | None = None
     keyframe: Array | None = None
-    adrift: bool = False
+    adrift: int = 0
+    unobserved: Array = field(default_factory=lambda: np.empty((0, 6)))
     unmatched: int = 0
 
     @classmethod
@@ -114,24 +117,34 @@ class MatchingState:
         return cls(PathPoint(T_map_lidar, twist, map_changed=True), PathPoint(T_map_previous), keyframe=keyframe)
 
     def matched(
-        self, T_map_lidar: Array, dt_s: float, is_degenerate: bool, is_vague: bool, weak_covariance: Array | None = None
+        self, T_map_lidar: Array, dt_s: float, unobserved: Array, adrift: int, weak_covariance: Array | None = None
     ) -> MatchingState:
         """Return the state after a scan that was matched.
 
         Args:
             T_map_lidar: ``(4, 4)`` the pose found.
             dt_s: time since the last scan.
-            is_degenerate: whether the scan leaves a direction unconstrained.
-            is_vague: whether the initial pose is too uncertain to fill in for such a direction.
+            unobserved: ``(U, 6)`` unit tangent directions that the scan leaves unconstrained.
+            adrift: number of scans in a row, with this one, whose position relative to the map is unknown.
             weak_covariance: ``(6, 6)`` of the pose along weak directions; None if there are none.
         """
         weak = np.zeros((6, 6)) if weak_covariance is None else weak_covariance
         last = self.doubted or (None if self.current.bridged else self.current)
         twist = None
-        if last is not None and not is_degenerate:
+        if last is not None and not len(unobserved):
             twist = se3.log(se3.between(last.T_map_lidar, T_map_lidar)) / dt_s
         found = PathPoint(T_map_lidar, twist, weak_covariance=weak)
-        return MatchingState(found, self.current, adrift=is_degenerate and is_vague)
+        unknown = unobserved if adrift else unobserved[:0]
+        return MatchingState(found, self.current, adrift=adrift, unobserved=unknown)
+
+    def is_adrift_with(self, unobserved: Array, is_vague: bool) -> bool:
+        """Return whether the next scan's position is unknown, or was until this scan, which may have it by chance.
+
+        Args:
+            unobserved: ``(U, 6)`` unit tangent directions that it leaves unconstrained.
+            is_vague: whether its initial pose is too uncertain to fill in for such a direction.
+        """
+        return is_vague and len(unobserved) + len(self.unobserved) > 0
 
     def bridged(self, initial: RelativePose, first_keyframe: Array | None = None) -> MatchingState:
         """Return the state after a scan that could not be matched, placed by its initial pose.
@@ -158,7 +171,7 @@ class MatchingState:
     def restarted(self, keyframe: Array) -> MatchingState:
         """Return the state in which a new map starts at the last scan, because scans no longer fit the old one."""
         here = replace(self.current, bridge_covariance=np.zeros((6, 6)), map_changed=True)
-        return replace(self, current=here, keyframe=keyframe, adrift=True, unmatched=0)
+        return replace(self, current=here, keyframe=keyframe, adrift=1, unmatched=0)
 
     @property
     def last_found(self) -> PathPoint:

@@ -15,19 +15,16 @@ from hybridlio.core.motion_limits import MEASUREMENT_FLOOR_SIGMAS, POINT_LEVER_M
 from hybridlio.core.sensors import NS_PER_S, Frame, Scan
 from hybridlio.registration.degeneracy import RegistrationProblem, register_with_degeneracy
 from hybridlio.registration.local_map import LocalMap
-from hybridlio.registration.motion_search import best_start, coarse_kernel_m, fits_better, motions, rotated
-from hybridlio.registration.results import ObservedRegistration
+from hybridlio.registration.motion_search import best_start, coarse_kernel_m, fits_better
+from hybridlio.registration.results import LONG_ADRIFT, ObservedRegistration
 from hybridlio.sources import map_errors
 from hybridlio.sources.gate.position_doubt import NEW_MAP
 from hybridlio.sources.matching_state import MatchingState, PathPoint
 from hybridlio.sources.recent_points import RecentPoints
-from hybridlio.sources.refinding import REFOUND_COST, has_vague_start, starts_within
+from hybridlio.sources.refinding import REFOUND_COST, has_vague_start, searched_start, starts_within
 from hybridlio.sources.settings import ScanMatchingSettings
 from hybridlio.sources.thinned_scan import SceneThinning, ThinnedScan, thin
 
-# An initial rotation less certain than this (all axes together) is searched for as well: 1.1°, which displaces points
-# 10 m away by 0.2 m, two of the default kernels.
-_UNKNOWN_ROTATION_SIGMA_RAD = 0.02
 LOST_COST = 0.6  # mean cost of the points that the map covers; well above that of any scan that is placed correctly
 # A new map starts after this number of scans in a row that have enough points and do not fit. A passing occlusion lasts
 # less than half a second at 10 Hz; bridging longer adds more error than a new map, which starts at the bridges' error.
@@ -163,13 +160,16 @@ class ScanMatching:
         self, scan: ThinnedScan, initial: RelativePose, observed: ObservedRegistration, dt_s: float
     ) -> RelativePose:
         """Move the state on to the pose found and return the step to it."""
-        pose, before, weak = observed.registration.pose, self._state.current, np.zeros((6, 6))
-        if initial.from_imu and self.weighs_predictions:
-            predicted = before.predicted_covariance(initial)
-            pose, weak = observed.weighed_with(before.T_map_lidar @ initial.pose, predicted)
-        self._state = self._state.matched(pose, dt_s, bool(len(observed.degenerate)), has_vague_start(initial), weak)
+        state, before, unobserved = self._state, self._state.current, observed.degenerate
+        if is_adrift := state.is_adrift_with(unobserved, has_vague_start(initial)):
+            # single scans of a lidar that repeats its pattern are dense, and what they observe is no chance
+            disbelieved = np.empty((0, 6)) if self.recent.repeats else state.unobserved
+            observed = observed.adrift(state.adrift + (len(unobserved) > 0), disbelieved)
+        adrift = state.adrift + 1 if is_adrift and len(observed.degenerate) else 0
+        pose, weak = self._weighed(observed, initial)
+        self._state = state.matched(pose, dt_s, unobserved, adrift, weak)
         self.recent.add(scan.points, pose)
-        if self.settings.target == "last-scan" or self._state.adrift:
+        if self._follows_last_scan:
             self._state = self._state.keyframe_pending(scan.points)
         elif self._map.needs_keyframe(pose) or self.recent.is_filling:
             filled = self.recent.together(scan.points, pose, self.settings.map_voxel_m)
@@ -178,14 +178,16 @@ class ScanMatching:
         drift = self._drift(covariance, before.map_changed)
         if drift is None:  # the scan it is matched to lies before those that were bridged
             covariance = covariance + before.bridge_covariance
-        return RelativePose(
-            se3.between(before.T_map_lidar, pose),
-            covariance,
-            source=self.name,
-            drift=drift,
-            degenerate=observed.degenerate,
-            details={"points": float(len(scan.points)), **observed.registration.diagnostics},
-        )
+        step = se3.between(before.T_map_lidar, pose)
+        details = {"points": float(len(scan.points)), **observed.registration.diagnostics}
+        return RelativePose(step, covariance, self.name, drift=drift, degenerate=observed.degenerate, details=details)
+
+    def _weighed(self, observed: ObservedRegistration, initial: RelativePose) -> tuple[Array, Array]:
+        """Return the pose found and its covariance along weak directions, weighed with the IMU's prediction or not."""
+        if not (initial.from_imu and self.weighs_predictions):
+            return observed.registration.pose, np.zeros((6, 6))
+        before = self._state.current
+        return observed.weighed_with(before.T_map_lidar @ initial.pose, before.predicted_covariance(initial))
 
     def _bridge(self, scan: ThinnedScan, initial: RelativePose, observed: ObservedRegistration | None) -> RelativePose:
         """Move the state on by the initial pose and return that pose as a failed step."""
@@ -206,6 +208,11 @@ class ScanMatching:
         )  # fmt: skip
 
     @property
+    def _follows_last_scan(self) -> bool:
+        """Whether the map is the last scan alone: by the settings, or as no other scan's position is known."""
+        return self.settings.target == "last-scan" or self._state.adrift > 0
+
+    @property
     def _keyframes(self) -> int:
         """Number of keyframes in the map, with the pending one."""
         return 1 if self.settings.target == "last-scan" else self._map.keyframes + (self._state.keyframe is not None)
@@ -215,16 +222,17 @@ class ScanMatching:
 
     def _drift(self, covariance: Array, map_changed: bool) -> Array | None:
         """Return the part of a step's covariance that adds up over steps; None if all of it does."""
+        if self.settings.target == "last-scan" or self._state.adrift >= LONG_ADRIFT:
+            return None
         least, repeats = self.settings.drift_share, self.recent.repeats
-        is_all = self.settings.target == "last-scan"
-        return None if is_all else map_errors.drift_share(map_changed, self._keyframes, least, repeats) * covariance
+        return map_errors.drift_share(map_changed, self._keyframes, least, repeats) * covariance
 
     def _insert_pending_keyframe(self) -> None:
         """Insert the last scan into the map if it is a keyframe; otherwise use the time to rebuild the map if due."""
         if self._state.keyframe is None:
             self._map.rebuild_if_due()
             return
-        if self.settings.target == "last-scan" or self._state.adrift:
+        if self._follows_last_scan:
             self._map = LocalMap(self.settings.local_map)
         keyframe, pose = self._state.keyframe, self._state.current.T_map_lidar
         self._map.insert(keyframe, pose)
@@ -242,7 +250,8 @@ class ScanMatching:
             continued = self._continue_motion(self._state.current, scan, dt_s)
             if continued is not None and continued.registration.cost < REFOUND_COST:
                 return continued
-            start = self._search_motion(scan, start, initial, dt_s)
+            of_scan, last = (self._problem(scan).surface, scan.source, scan.points), self._state.current.T_map_lidar
+            start = searched_start(*of_scan, last, initial, self.settings, dt_s)
         observed = self._register_from(start, scan, initial)
         if observed.registration.matched < self.settings.min_matched:  # a faulty IMU's initial pose is wrong
             return self._continue_motion(self._state.last_found, scan, dt_s) or observed
@@ -266,16 +275,6 @@ class ScanMatching:
         observed = register_with_degeneracy(self._problem(scan), start, kernel_m, is_start_vague=True)
         found = observed.registration
         return observed if found.matched >= settings.min_matched and found.cost < LOST_COST else None
-
-    def _search_motion(self, scan: ThinnedScan, start: Array, initial: RelativePose, dt_s: float) -> Array:
-        """Return the best of several motions from ``start``: speeds ahead and, if the rotation is unknown, turns."""
-        surface, settings = self._map.surface, self.settings
-        assert surface is not None
-        turns = initial.covariance[:3, :3].trace() > _UNKNOWN_ROTATION_SIGMA_RAD**2
-        rates_deg_s = settings.start_rates_deg_s if turns else (0.0,)
-        starts = [start @ step for step in motions(settings.start_speeds_m_s, rates_deg_s, dt_s)]
-        starts += rotated(self._state.current.T_map_lidar, start, dt_s) if turns else []
-        return best_start(surface, scan.source, scan.points, starts, settings.registration)
 
     def _register_from(self, start: Array, scan: ThinnedScan, initial: RelativePose) -> ObservedRegistration:
         """Register from ``start``, or from the proposed pose if the scan fits the map better there."""

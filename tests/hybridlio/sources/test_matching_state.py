@@ -14,6 +14,7 @@ from hybridlio.sources.matching_state import MatchingState
 POINTS = np.zeros((3, 3))
 TWIST = np.array([0.0, 0.0, 0.1, 5.0, 0.0, 0.0])
 STEP = se3.exp(0.1 * TWIST)
+NOTHING, ALONG = np.empty((0, 6)), np.eye(6)[3:4]  # directions that a scan leaves unobserved
 INITIAL = RelativePose(se3.exp([0.0, 0.0, 0.0, 0.4, 0.0, 0.0]), 1e-2 * np.eye(6), "imu")
 
 
@@ -24,7 +25,7 @@ def started() -> MatchingState:
 
 @pytest.fixture
 def matched(started: MatchingState) -> MatchingState:
-    return started.keyframe_inserted().matched(STEP, 0.1, is_degenerate=False, is_vague=False)
+    return started.keyframe_inserted().matched(STEP, 0.1, NOTHING, adrift=0)
 
 
 def test_the_first_scan_is_the_origin_and_a_pending_keyframe(started: MatchingState):
@@ -36,7 +37,7 @@ def test_the_first_scan_is_the_origin_and_a_pending_keyframe(started: MatchingSt
 
 def test_a_state_is_immutable(started: MatchingState):
     with pytest.raises(FrozenInstanceError):
-        started.adrift = True  # type: ignore[misc]
+        started.adrift = 1  # type: ignore[misc]
 
 
 def test_a_match_moves_on_and_measures_the_twist(started: MatchingState, matched: MatchingState):
@@ -44,23 +45,41 @@ def test_a_match_moves_on_and_measures_the_twist(started: MatchingState, matched
     np.testing.assert_allclose(matched.current.twist, TWIST, atol=1e-12)
     assert matched.previous is started.current
     assert not matched.current.map_changed
-    assert (matched.doubted, matched.keyframe, matched.adrift) == (None, None, False)
+    assert (matched.doubted, matched.keyframe, matched.adrift) == (None, None, 0)
 
 
-@pytest.mark.parametrize(("is_degenerate", "is_vague"), [(False, False), (False, True), (True, False), (True, True)])
-def test_a_state_is_adrift_only_after_a_degenerate_match_from_a_vague_pose(
-    started: MatchingState, is_degenerate: bool, is_vague: bool
+@pytest.mark.parametrize("unobserved", [NOTHING, ALONG])
+@pytest.mark.parametrize("is_vague", [False, True])
+def test_a_scan_is_adrift_only_if_it_is_degenerate_and_starts_at_a_vague_pose(
+    started: MatchingState, unobserved: np.ndarray, is_vague: bool
 ):
-    state = started.matched(STEP, 0.1, is_degenerate, is_vague)
-    assert state.adrift == (is_degenerate and is_vague)
-    assert (state.current.twist is None) == is_degenerate
+    assert started.is_adrift_with(unobserved, is_vague) == (len(unobserved) > 0 and is_vague)
+
+
+def test_only_a_degenerate_match_leaves_the_twist_unknown(started: MatchingState):
+    assert started.matched(STEP, 0.1, ALONG, adrift=0).current.twist is None
+    assert started.matched(STEP, 0.1, NOTHING, adrift=0).current.twist is not None
+
+
+def test_the_first_scan_after_those_adrift_is_doubted_too_and_the_second_is_not(started: MatchingState):
+    """By chance single scans seem to observe what others do not."""
+    adrift = started.matched(STEP, 0.1, ALONG, adrift=1)
+    assert adrift.is_adrift_with(NOTHING, is_vague=True)
+    assert not adrift.is_adrift_with(NOTHING, is_vague=False)
+    claimed = adrift.matched(STEP, 0.1, NOTHING, adrift=2)
+    assert not claimed.is_adrift_with(NOTHING, is_vague=True)
+
+
+def test_what_a_scan_with_a_known_start_leaves_unobserved_is_not_remembered(started: MatchingState):
+    known = started.matched(STEP, 0.1, ALONG, adrift=0)
+    assert not known.is_adrift_with(NOTHING, is_vague=True)
 
 
 def test_a_pending_keyframe_changes_the_map_before_the_next_match(matched: MatchingState):
     pending = matched.keyframe_pending(POINTS)
     assert pending.keyframe is POINTS
     assert pending.current.map_changed
-    assert not pending.matched(STEP @ STEP, 0.1, is_degenerate=False, is_vague=False).current.map_changed
+    assert not pending.matched(STEP @ STEP, 0.1, NOTHING, adrift=0).current.map_changed
 
 
 def test_bridges_add_up_until_the_next_match(matched: MatchingState):
@@ -71,7 +90,7 @@ def test_bridges_add_up_until_the_next_match(matched: MatchingState):
     assert (np.diag(twice.current.bridge_covariance) >= 2 * np.diag(INITIAL.covariance) - 1e-15).all()
     assert twice.current.bridged
     assert twice.current.map_changed  # the keyframe before the first bridge still counts for the next match
-    found = twice.matched(twice.current.T_map_lidar, 0.1, is_degenerate=False, is_vague=False).current
+    found = twice.matched(twice.current.T_map_lidar, 0.1, NOTHING, adrift=0).current
     assert found.twist is None  # the motion since a bridge is not measured
     np.testing.assert_array_equal(found.bridge_covariance, np.zeros((6, 6)))
 
@@ -87,7 +106,7 @@ def test_a_match_taken_back_is_replaced_by_the_initial_pose_but_remembered(match
     assert state.keyframe is None
     assert state.doubted is not None
     np.testing.assert_array_equal(state.last_found.T_map_lidar, STEP)
-    again = state.matched(STEP @ STEP, 0.1, is_degenerate=False, is_vague=False)
+    again = state.matched(STEP @ STEP, 0.1, NOTHING, adrift=0)
     np.testing.assert_allclose(again.current.twist, TWIST, atol=1e-12)  # from where the scan was found
     assert again.doubted is None
 

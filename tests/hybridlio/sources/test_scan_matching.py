@@ -160,7 +160,7 @@ def corridor(rng: np.random.Generator) -> np.ndarray:
 def test_the_direction_along_a_corridor_is_degenerate(rng: np.random.Generator, frames: list[Frame]):
     matching = ScanMatching()
     matching.start(with_points(frames[0], corridor(rng)))
-    initial = guess(se3.exp(np.array([0.0, 0.0, 0.004, 0.8, 0.05, -0.03])))
+    initial = guess(se3.exp(np.array([0.0, 0.0, 0.004, 0.8, 0.05, -0.03])), SURE / 9)
     found = matching.refine(with_points(frames[1], corridor(rng)), initial)
     assert found.ok
     assert len(found.degenerate) == 1
