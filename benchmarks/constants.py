@@ -176,6 +176,7 @@ TABLE = [
     *_in("hybridlio/sources/gate/innovation_gate.py", GATE, WARM_UP_STEPS=("0", "100"), _BISECTIONS=("3",)),
     *_in("hybridlio/sources/scan_matching.py", MATCHING, LOST_COST=("0.01", "1.0"), _LOST_SCANS=("1", "50")),
     *_in("hybridlio/registration/results.py", ADRIFT, LONG_ADRIFT=("1", "50")),
+    *_in("hybridlio/sources/matching_state.py", ADRIFT, _DISBELIEVED_CLAIMS=("0", "50")),
     *_in("hybridlio/registration/surface.py", (f"{REGISTRATION}surface.py", *MATCHING), _ASIDE_SHARE=("0.05", "10.0")),
     *_in("hybridlio/sources/refinding.py", MATCHING, _UNKNOWN_ROTATION_SIGMA_RAD=("1e-5", "10.0")),
     *_in("hybridlio/sources/map_errors.py", MATCHING, _YOUNG_MAP_INFLATION=("0.0", "100.0")),

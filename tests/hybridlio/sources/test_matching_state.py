@@ -61,13 +61,16 @@ def test_only_a_degenerate_match_leaves_the_twist_unknown(started: MatchingState
     assert started.matched(STEP, 0.1, NOTHING, adrift=0).current.twist is not None
 
 
-def test_the_first_scan_after_those_adrift_is_doubted_too_and_the_second_is_not(started: MatchingState):
+def test_four_scans_after_those_adrift_are_doubted_too_and_the_fifth_is_not(started: MatchingState):
     """By chance single scans seem to observe what others do not."""
-    adrift = started.matched(STEP, 0.1, ALONG, adrift=1)
-    assert adrift.is_adrift_with(NOTHING, is_vague=True)
-    assert not adrift.is_adrift_with(NOTHING, is_vague=False)
-    claimed = adrift.matched(STEP, 0.1, NOTHING, adrift=2)
-    assert not claimed.is_adrift_with(NOTHING, is_vague=True)
+    state = started.matched(STEP, 0.1, ALONG, adrift=1)
+    assert not state.is_adrift_with(NOTHING, is_vague=False)
+    for count in (2, 3, 4, 5):
+        assert state.is_adrift_with(NOTHING, is_vague=True)
+        state = state.matched(STEP, 0.1, NOTHING, adrift=count)
+        np.testing.assert_array_equal(state.unobserved, ALONG)
+    assert not state.is_adrift_with(NOTHING, is_vague=True)
+    assert state.matched(STEP, 0.1, ALONG, adrift=6).is_adrift_with(NOTHING, is_vague=True)
 
 
 def test_what_a_scan_with_a_known_start_leaves_unobserved_is_not_remembered(started: MatchingState):
