@@ -59,6 +59,23 @@ def motions(speeds_m_s: Iterable[float], rates_deg_s: Iterable[float], dt_s: flo
     return [se3.exp(np.array([0, 0, rate, speed, 0, 0]) * dt_s) for speed, rate in pairs]
 
 
+def starts_after(
+    last: Array, step: Array, speeds_m_s: Sequence[float], rates_deg_s: Sequence[float], dt_s: float, turns: bool
+) -> list[Array]:
+    """Return poses ``(4, 4)`` at which a scan may be whose motion is unknown.
+
+    Args:
+        last: ``(4, 4)`` pose of the last scan.
+        step: ``(4, 4)`` initial relative pose of this one, to which motions are added.
+        speeds_m_s: forward speeds to try.
+        rates_deg_s: yaw rates to try with each, if it may turn; turns about the other axes are tried then as well.
+        dt_s: time since the last scan.
+        turns: whether the turn of the step is unknown, too.
+    """
+    starts = [last @ step @ motion for motion in motions(speeds_m_s, rates_deg_s if turns else (0.0,), dt_s)]
+    return starts + (rotated(last, last @ step, dt_s) if turns else [])
+
+
 def rotated(T_map_before: Array, T_map_start: Array, dt_s: float) -> list[Array]:
     """Return poses ``(4, 4)`` at the place of a start, rotated against the scan before as bodies turn in ``dt_s``.
 

@@ -1,4 +1,4 @@
-"""Finding a scan's place again after scans that were bridged over decimetres or more, or after an unknown motion."""
+"""Finding a scan's place again after scans that were bridged over decimetres or more."""
 
 from __future__ import annotations
 
@@ -10,9 +10,6 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.motion_limits import POINT_LEVER_M, VAGUE_TRANSLATION_SIGMA_M
-from hybridlio.registration.motion_search import best_start, motions, rotated
-from hybridlio.registration.surface import Surface
-from hybridlio.sources.settings import ScanMatchingSettings
 
 # An initial rotation less certain than this (all axes together) is searched for as well: 1.1°, which displaces points
 # 10 m away by 0.2 m, two of the default kernels.
@@ -49,30 +46,6 @@ def has_vague_start(pose: RelativePose) -> bool:
     return pose.translation_sigma_m > VAGUE_TRANSLATION_SIGMA_M
 
 
-def searched_start(
-    surface: Surface,
-    source: Array,
-    points: Array,
-    T_map_last: Array,
-    initial: RelativePose,
-    settings: ScanMatchingSettings,
-    dt_s: float,
-) -> Array:
-    """Return the pose ``(4, 4)`` at which a scan fits a map best, after several motions.
-
-    These are speeds ahead and, if the rotation is unknown, turns.
-
-    Args:
-        surface: of the map.
-        source: ``(N, 3)`` points of the scan that are registered, lidar frame.
-        points: ``(M, 3)`` more of them.
-        T_map_last: ``(4, 4)`` pose of the last scan.
-        initial: initial relative pose of the step, whose translation is unknown.
-        settings: speeds and yaw rates that are tried.
-        dt_s: time since the last scan.
-    """
-    turns = initial.covariance[:3, :3].trace() > _UNKNOWN_ROTATION_SIGMA_RAD**2
-    rates_deg_s, start = settings.start_rates_deg_s if turns else (0.0,), T_map_last @ initial.pose
-    starts = [start @ step for step in motions(settings.start_speeds_m_s, rates_deg_s, dt_s)]
-    starts += rotated(T_map_last, start, dt_s) if turns else []
-    return best_start(surface, source, points, starts, settings.registration)
+def has_unknown_turn(pose: RelativePose) -> bool:
+    """Whether a search for a scan's place has to try turns as well."""
+    return float(pose.covariance[:3, :3].trace()) > _UNKNOWN_ROTATION_SIGMA_RAD**2

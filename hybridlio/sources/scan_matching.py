@@ -15,13 +15,13 @@ from hybridlio.core.motion_limits import MEASUREMENT_FLOOR_SIGMAS, POINT_LEVER_M
 from hybridlio.core.sensors import NS_PER_S, Frame, Scan
 from hybridlio.registration.degeneracy import RegistrationProblem, register_with_degeneracy
 from hybridlio.registration.local_map import LocalMap
-from hybridlio.registration.motion_search import best_start, coarse_kernel_m, fits_better
+from hybridlio.registration.motion_search import best_start, coarse_kernel_m, fits_better, starts_after
 from hybridlio.registration.results import LONG_ADRIFT, ObservedRegistration
 from hybridlio.sources import map_errors
 from hybridlio.sources.gate.position_doubt import NEW_MAP
 from hybridlio.sources.matching_state import MatchingState, PathPoint
 from hybridlio.sources.recent_points import RecentPoints
-from hybridlio.sources.refinding import REFOUND_COST, has_vague_start, searched_start, starts_within
+from hybridlio.sources.refinding import REFOUND_COST, has_unknown_turn, has_vague_start, starts_within
 from hybridlio.sources.settings import ScanMatchingSettings
 from hybridlio.sources.thinned_scan import SceneThinning, ThinnedScan, thin
 
@@ -29,7 +29,6 @@ LOST_COST = 0.6  # mean cost of the points that the map covers; well above that 
 # A new map starts after this number of scans in a row that have enough points and do not fit. A passing occlusion lasts
 # less than half a second at 10 Hz; bridging longer adds more error than a new map, which starts at the bridges' error.
 _LOST_SCANS = 5
-_FLOOR_COVARIANCE = np.diag(MEASUREMENT_FLOOR_SIGMAS**2)
 
 
 class ScanMatching:
@@ -162,7 +161,6 @@ class ScanMatching:
         """Move the state on to the pose found and return the step to it."""
         state, before, unobserved = self._state, self._state.current, observed.degenerate
         if is_adrift := state.is_adrift_with(unobserved, has_vague_start(initial)):
-            # single scans of a lidar that repeats its pattern are dense, and what they observe is no chance
             disbelieved = np.empty((0, 6)) if self.recent.repeats else state.unobserved
             observed = observed.adrift(state.adrift + (len(unobserved) > 0), disbelieved)
         adrift = state.adrift + 1 if is_adrift and len(observed.degenerate) else 0
@@ -194,7 +192,7 @@ class ScanMatching:
         before = self._state.current
         self._state = self._state.bridged(initial, scan.points if self._map.surface is None else None)  # no planes yet
         added = initial.covariance if initial.from_imu else self._state.current.added_since(before, initial)
-        drift = self._drift(_FLOOR_COVARIANCE, map_changed=False)
+        drift = self._drift(np.diag(MEASUREMENT_FLOOR_SIGMAS**2), map_changed=False)
         details = {"points": float(len(scan.points)), **(observed.registration.diagnostics if observed else {})}
         self._state = replace(self._state, unmatched=self._state.unmatched + (observed is not None))
         if self._state.unmatched >= _LOST_SCANS:
@@ -250,8 +248,9 @@ class ScanMatching:
             continued = self._continue_motion(self._state.current, scan, dt_s)
             if continued is not None and continued.registration.cost < REFOUND_COST:
                 return continued
-            of_scan, last = (self._problem(scan).surface, scan.source, scan.points), self._state.current.T_map_lidar
-            start = searched_start(*of_scan, last, initial, self.settings, dt_s)
+            given = (settings := self.settings).start_speeds_m_s, settings.start_rates_deg_s, dt_s
+            starts = starts_after(self._state.current.T_map_lidar, initial.pose, *given, has_unknown_turn(initial))
+            start = best_start(self._problem(scan).surface, scan.source, scan.points, starts, settings.registration)
         observed = self._register_from(start, scan, initial)
         if observed.registration.matched < self.settings.min_matched:  # a faulty IMU's initial pose is wrong
             return self._continue_motion(self._state.last_found, scan, dt_s) or observed

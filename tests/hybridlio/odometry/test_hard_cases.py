@@ -21,7 +21,7 @@ from hybridlio.registration.motion_search import best_start
 from hybridlio.runs.run import Run, run_odometry
 from hybridlio.simulation.faults import block_sector, drop_scans, imu_bias, imu_gap
 from hybridlio.simulation.scenarios import open_scenario
-from hybridlio.sources import refinding
+from hybridlio.sources import scan_matching
 from hybridlio.sources.scan_matching import ScanMatching
 from hybridlio.sources.thinned_scan import ThinnedScan
 
@@ -102,7 +102,7 @@ def test_an_initial_pose_source_without_motion_costs_one_search_at_the_start(
         searches.append(1)
         return best_start(*given)
 
-    monkeypatch.setattr(refinding, "best_start", counted)
+    monkeypatch.setattr(scan_matching, "best_start", counted)
     run = ran(sequence.part(0, 10), initial_pose="identity")
     assert len(searches) == 1
     assert farthest_off_m(run) < 0.05
@@ -110,7 +110,7 @@ def test_an_initial_pose_source_without_motion_costs_one_search_at_the_start(
 
 def test_the_motion_is_searched_again_after_a_rejected_scan(sequence: Sequence, monkeypatch: pytest.MonkeyPatch):
     searches = []
-    monkeypatch.setattr(refinding, "best_start", lambda _, __, ___, starts, *____: searches.append(1) or starts[0])
+    monkeypatch.setattr(scan_matching, "best_start", lambda _, __, ___, starts, *____: searches.append(1) or starts[0])
     matching = ScanMatching()
     matching.start(sequence[0])
     unsure = RelativePose(np.eye(4), np.diag(np.r_[np.full(3, 0.1), np.full(3, 2.0)] ** 2), "guess")

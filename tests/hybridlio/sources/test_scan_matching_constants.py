@@ -15,7 +15,7 @@ from hybridlio.core.motion_limits import unknown_motion_covariance
 from hybridlio.core.sensors import Frame
 from hybridlio.datasets.sequence import Sequence
 from hybridlio.simulation.platforms.config import PlatformConfig
-from hybridlio.sources import map_errors, refinding, scan_matching
+from hybridlio.sources import map_errors, scan_matching
 from hybridlio.sources.scan_matching import ScanMatching
 from hybridlio.sources.settings import ScanMatchingSettings
 from hybridlio.sources.thinned_scan import thin
@@ -132,13 +132,13 @@ def test_points_beyond_the_maps_edge_are_left_out_for_lidars_whose_map_has_no_ga
 def searches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Number of starts of each search for a motion."""
     found: list[int] = []
-    search = refinding.best_start
+    search = scan_matching.best_start
 
     def counted(surface, source, points, starts, settings):
         found.append(len(starts))
         return search(surface, source, points, starts, settings)
 
-    monkeypatch.setattr(refinding, "best_start", counted)
+    monkeypatch.setattr(scan_matching, "best_start", counted)
     return found
 
 
