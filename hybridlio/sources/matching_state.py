@@ -11,8 +11,7 @@ from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose
 
 # Scans in a row that seem to observe what others before did not, and are not believed. In tunnels one sparse scan in
-# ten or twenty seems to; over 24 recordings of 12 s with 20,000 points a scan, up to three in a row did. Scans of a lidar
-# that repeats its pattern are dense, and what they observe is no chance.
+# ten or twenty seems to; over 24 recordings of 12 s with 20,000 points a scan, up to three in a row did.
 _DISBELIEVED_CLAIMS = 4
 
 

@@ -161,6 +161,7 @@ class ScanMatching:
         """Move the state on to the pose found and return the step to it."""
         state, before, unobserved = self._state, self._state.current, observed.degenerate
         if is_adrift := state.is_adrift_with(unobserved, has_vague_start(initial)):
+            # single scans of a lidar that repeats its pattern are dense, and what they observe is no chance
             disbelieved = np.empty((0, 6)) if self.recent.repeats else state.unobserved
             observed = observed.adrift(state.adrift + (len(unobserved) > 0), disbelieved)
         adrift = state.adrift + 1 if is_adrift and len(observed.degenerate) else 0
