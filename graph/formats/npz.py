@@ -21,7 +21,7 @@ from hybridlio.graph.model.calibrations import CALIBRATION_KINDS, chosen
 from hybridlio.graph.model.edge_table import FORMS
 from hybridlio.graph.model.graph_data import GraphData
 from hybridlio.graph.model.keys import Key, check_key
-from hybridlio.graph.model.measurements import CODE, Factor, Kind
+from hybridlio.graph.model.measurements import CODE, OF_LANDMARKS, Factor, Kind
 from hybridlio.graph.model.new_factors import check_vector
 from hybridlio.graph.model.noise import Noise, NoiseInput, Robust, make_noise, make_robust
 
@@ -204,12 +204,12 @@ def _key_rows(table: Any) -> list[tuple[Key, ...]]:
 
 def _factors(kind: Kind, columns: dict[str, Any]) -> dict[int, Factor]:
     found = {}
-    samples = _samples(columns)
-    landmarks = [key for (key,) in _key_rows(columns["landmark"])] if "landmark" in columns else []
+    samples = _samples(columns) if kind == "imu" else []
+    landmarks = [key for (key,) in _key_rows(columns["landmark"])] if kind in OF_LANDMARKS else []
     for row, (factor_id, keys) in enumerate(zip(columns["id"].tolist(), _key_rows(columns["keys"]), strict=True)):
         measured = columns["measured"][row]
         name = f"{kind} {keys}"
-        noise = _noise(columns, row, name) if "noise" in columns else None
+        noise = None if kind == "imu" else _noise(columns, row, name)
         kernel = str(columns["kernel"][row])
         robust: Robust | None = make_robust((kernel, float(columns["width"][row])), 1, name) if kernel else None
         measured = check_vector(measured, len(measured), name)
@@ -226,8 +226,6 @@ def _noise(columns: dict[str, Any], row: int, name: str) -> Noise:
 
 
 def _samples(columns: dict[str, Any]) -> list[ImuSamples]:
-    if "sample_count" not in columns:
-        return []
     ends = np.cumsum(columns["sample_count"])[:-1]
     parts = (np.split(columns[name], ends) for name in ("stamps_ns", "gyro_rad_s", "accel_m_s2"))
     return [ImuSamples(*part) for part in zip(*parts, strict=True)]

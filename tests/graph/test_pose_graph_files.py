@@ -222,6 +222,24 @@ def test_a_truncated_archive_is_refused(rng, tmp_path, keep):
         PoseGraph.load(tmp_path / "a.npz")
 
 
+def test_a_file_without_one_of_its_arrays_is_read_or_refused_clearly(rng, tmp_path):
+    """A between-factor without its noise stopped at an assertion."""
+    graph = full_graph(rng)
+    add_inertial(graph, rng)
+    graph.add_range(3, (1, 77), 12.0, sigma_m=0.1)
+    graph.save(tmp_path / "a.npz")
+    with np.load(tmp_path / "a.npz") as stored:
+        arrays = dict(stored)
+    refused = set()
+    for left_out in arrays:
+        np.savez(tmp_path / "b.npz", **{name: array for name, array in arrays.items() if name != left_out})
+        try:
+            PoseGraph.load(tmp_path / "b.npz")
+        except DataError:
+            refused.add(left_out)
+    assert {"keys", "initial", "between_noise", "imu_sample_count", "imu_stamps_ns", "range_landmark"} <= refused
+
+
 def test_missing_files_and_formats_that_cannot_hold_the_graph_are_refused(rng, tmp_path):
     with pytest.raises(DataError, match=r"missing\.g2o"):
         PoseGraph.load(tmp_path / "missing.g2o")
