@@ -9,6 +9,7 @@ import numpy as np
 from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose
+from hybridlio.registration.results import ObservedRegistration
 
 # Scans in a row that seem to observe what others before did not, and are not believed. In tunnels one sparse scan in
 # ten or twenty seems to; over 24 recordings of 12 s with 20,000 points a scan, up to three in a row did.
@@ -145,6 +146,23 @@ class MatchingState:
         if len(unobserved):
             return MatchingState(found, self.current, adrift=adrift, unobserved=unobserved)
         return MatchingState(found, self.current, adrift=adrift, unobserved=self.unobserved, claims=self.claims + 1)
+
+    def believed(
+        self, observed: ObservedRegistration, is_vague: bool, is_dense: bool
+    ) -> tuple[ObservedRegistration, int]:
+        """Return what is believed of the next scan's registration, and how many scans in a row are adrift with it.
+
+        Args:
+            observed: the registration.
+            is_vague: whether its initial pose is too uncertain to fill in for a direction that it leaves unconstrained.
+            is_dense: whether what a single scan observes is no chance, as of a lidar that repeats its pattern.
+        """
+        unobserved = observed.degenerate
+        if not self.is_adrift_with(unobserved, is_vague):
+            return observed, 0
+        times = self.adrift + (len(unobserved) > 0)
+        observed = observed.adrift(times, unobserved[:0] if is_dense else self.unobserved)
+        return observed, self.adrift + 1 if len(observed.degenerate) else 0
 
     def is_adrift_with(self, unobserved: Array, is_vague: bool) -> bool:
         """Return whether the next scan's position is unknown, or was until this scan, which may have it by chance.

@@ -29,6 +29,7 @@ LOST_COST = 0.6  # mean cost of the points that the map covers; well above that 
 # A new map starts after this number of scans in a row that have enough points and do not fit. A passing occlusion lasts
 # less than half a second at 10 Hz; bridging longer adds more error than a new map, which starts at the bridges' error.
 _LOST_SCANS = 5
+_FLOOR_COVARIANCE = np.diag(MEASUREMENT_FLOOR_SIGMAS**2)
 
 
 class ScanMatching:
@@ -159,14 +160,10 @@ class ScanMatching:
         self, scan: ThinnedScan, initial: RelativePose, observed: ObservedRegistration, dt_s: float
     ) -> RelativePose:
         """Move the state on to the pose found and return the step to it."""
-        state, before, unobserved = self._state, self._state.current, observed.degenerate
-        if is_adrift := state.is_adrift_with(unobserved, has_vague_start(initial)):
-            # single scans of a lidar that repeats its pattern are dense, and what they observe is no chance
-            disbelieved = np.empty((0, 6)) if self.recent.repeats else state.unobserved
-            observed = observed.adrift(state.adrift + (len(unobserved) > 0), disbelieved)
-        adrift = state.adrift + 1 if is_adrift and len(observed.degenerate) else 0
+        before, unobserved = self._state.current, observed.degenerate
+        observed, adrift = self._state.believed(observed, has_vague_start(initial), is_dense=self.recent.repeats)
         pose, weak = self._weighed(observed, initial)
-        self._state = state.matched(pose, dt_s, unobserved, adrift, weak)
+        self._state = self._state.matched(pose, dt_s, unobserved, adrift, weak)
         self.recent.add(scan.points, pose)
         if self._follows_last_scan:
             self._state = self._state.keyframe_pending(scan.points)
@@ -193,7 +190,7 @@ class ScanMatching:
         before = self._state.current
         self._state = self._state.bridged(initial, scan.points if self._map.surface is None else None)  # no planes yet
         added = initial.covariance if initial.from_imu else self._state.current.added_since(before, initial)
-        drift = self._drift(np.diag(MEASUREMENT_FLOOR_SIGMAS**2), map_changed=False)
+        drift = self._drift(_FLOOR_COVARIANCE, map_changed=False)
         details = {"points": float(len(scan.points)), **(observed.registration.diagnostics if observed else {})}
         self._state = replace(self._state, unmatched=self._state.unmatched + (observed is not None))
         if self._state.unmatched >= _LOST_SCANS:

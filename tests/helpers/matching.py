@@ -30,3 +30,13 @@ def with_points(frame: Frame, points: np.ndarray, stamp_ns: int | None = None) -
 
 def empty(frame: Frame) -> Frame:
     return with_points(frame, np.empty((0, 3)))
+
+
+def corridor(rng: np.random.Generator) -> np.ndarray:
+    """Return points on a floor and two walls along x, 6 m apart."""
+    x = rng.uniform(-25, 25, (30000, 1))
+    across = rng.uniform(-3, 3, (10000, 1))
+    height = rng.uniform(-1.7, 3.0, (20000, 1))
+    floor = np.hstack([x[:10000], across, np.full((10000, 1), -1.7)])
+    walls = np.hstack([x[10000:], np.where(np.arange(20000) < 10000, -3.0, 3.0)[:, None], height])
+    return np.concatenate([floor, walls]) + 0.01 * rng.standard_normal((30000, 3))

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from matching import OFF, SURE, empty, guess, true_pose, with_points
+from matching import OFF, SURE, corridor, empty, guess, true_pose, with_points
 
 from hybridlio.core import se3
 from hybridlio.core.errors import DataError
@@ -145,16 +145,6 @@ def test_points_out_of_range_are_ignored(rng: np.random.Generator, sequence: Seq
             else:
                 answers.append(matching.refine(frame, guess(true_pose(sequence, 0, 1))).pose)
     np.testing.assert_array_equal(answers[0], answers[1])
-
-
-def corridor(rng: np.random.Generator) -> np.ndarray:
-    """Return points on a floor and two walls along x, 6 m apart."""
-    x = rng.uniform(-25, 25, (30000, 1))
-    across = rng.uniform(-3, 3, (10000, 1))
-    height = rng.uniform(-1.7, 3.0, (20000, 1))
-    floor = np.hstack([x[:10000], across, np.full((10000, 1), -1.7)])
-    walls = np.hstack([x[10000:], np.where(np.arange(20000) < 10000, -3.0, 3.0)[:, None], height])
-    return np.concatenate([floor, walls]) + 0.01 * rng.standard_normal((30000, 3))
 
 
 def test_the_direction_along_a_corridor_is_degenerate(rng: np.random.Generator, frames: list[Frame]):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from matching import guess
+from matching import corridor, guess
 
 from hybridlio.core.motion_limits import unknown_motion_covariance
 from hybridlio.core.sensors import Frame, Scan
@@ -14,15 +14,10 @@ from hybridlio.sources.scan_matching import ScanMatching
 UNKNOWN = guess(np.eye(4), unknown_motion_covariance(0.1))
 
 
-def passage(rng: np.random.Generator, ends: bool = False) -> np.ndarray:
-    """Return points on a floor and two walls along x, 6 m apart, and on two walls that close them."""
-    x = rng.uniform(-25, 25, (30000, 1))
-    height = rng.uniform(-1.7, 3.0, (20000, 1))
-    floor = np.hstack([x[:10000], rng.uniform(-3, 3, (10000, 1)), np.full((10000, 1), -1.7)])
-    walls = np.hstack([x[10000:], np.where(np.arange(20000) < 10000, -3.0, 3.0)[:, None], height])
+def closed(rng: np.random.Generator) -> np.ndarray:
+    """Return points on the corridor, and on two walls across it."""
     across = np.column_stack([np.tile([-8.0, 8.0], 3000), rng.uniform(-3, 3, 6000), rng.uniform(-1.7, 3.0, 6000)])
-    points = np.concatenate([floor, walls, across] if ends else [floor, walls])
-    return points + 0.01 * rng.standard_normal(points.shape)
+    return np.concatenate([corridor(rng), across + 0.01 * rng.standard_normal(across.shape)])
 
 
 def frame(k: int, points: np.ndarray) -> Frame:
@@ -32,9 +27,9 @@ def frame(k: int, points: np.ndarray) -> Frame:
 def test_no_number_of_scans_of_a_corridor_measures_an_unknown_speed(rng: np.random.Generator):
     """Their errors along it are the same, and all of a step's covariance adds up."""
     matching, information = ScanMatching(), []
-    matching.start(frame(0, passage(rng)))
+    matching.start(frame(0, corridor(rng)))
     for k in range(1, 12):
-        step = matching.refine(frame(k, passage(rng)), UNKNOWN)
+        step = matching.refine(frame(k, corridor(rng)), UNKNOWN)
         assert len(step.degenerate) == 1
         assert (step.drift is None) == (k > 1)
         information.append(1 / step.covariance[3, 3])
@@ -47,9 +42,9 @@ def test_what_seems_to_end_a_corridor_is_believed_at_once_only_of_a_lidar_with_d
 ):
     monkeypatch.setattr(RecentPoints, "repeats", property(lambda _: repeats))
     matching, unobserved = ScanMatching(), []
-    matching.start(frame(0, passage(rng)))
+    matching.start(frame(0, corridor(rng)))
     for k in range(1, 10):
-        step = matching.refine(frame(k, passage(rng, ends=k > 2)), UNKNOWN)
+        step = matching.refine(frame(k, (closed if k > 2 else corridor)(rng)), UNKNOWN)
         unobserved.append(len(step.degenerate))
     # the first scan with ends is matched to one without, and the second is the first that may find them
     assert unobserved == [1, 1, 1] + ([0, 0, 0, 0, 0, 0] if repeats else [1, 1, 1, 1, 0, 0])
