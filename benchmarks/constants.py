@@ -181,6 +181,7 @@ TABLE = [
     *_in("hybridlio/sources/refinding.py", MATCHING, _UNKNOWN_ROTATION_SIGMA_RAD=("1e-5", "10.0")),
     *_in("hybridlio/sources/map_errors.py", MATCHING, _YOUNG_MAP_INFLATION=("0.0", "100.0")),
     *_in("hybridlio/sources/map_errors.py", MATCHING, _YOUNG_MAP_DRIFT_SHARE=("0.0", "50.0")),
+    *_in("hybridlio/sources/map_errors.py", MATCHING, _DENSE_SHARE=("0.1", "5.0"), _DENSE=("0.5", "20.0")),
     *_in("hybridlio/sources/map_errors.py", MATCHING, _UNCHANGED_MAP_DRIFT_SHARE=("0.5", "0.0")),
     *_in("hybridlio/sources/map_errors.py", MATCHING, _UNCHANGED_YOUNG_MAP_DRIFT_SHARE=("0.0", "1.0")),
     *_in("hybridlio/odometry/second_pass.py", SECOND_PASS, _LEAST_RATIO=("10.0",)),

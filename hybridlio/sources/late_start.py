@@ -109,7 +109,7 @@ class LateStart:
         times_s = self.frame.scan.time_offsets_ns[kept] / NS_PER_S
         speeds = (_SPEED_SIGMA_M_S, _SPEED_SIGMA_M_S)
         sweep = Sweep(points[kept], times_s, without_s, (change, at_end), speeds)
-        scale = settings.covariance_scale * map_errors.inflation(1)
+        scale = settings.covariance_scale * map_errors.inflation(1, is_dense=False)
         found = register_sweep(surface, sweep, T_scan_first, settings.registration, scale)
         if found.matched < settings.min_matched or found.cost > lost_cost:
             return None

@@ -12,11 +12,36 @@ _YOUNG_MAP_INFLATION, _YOUNG_MAP_DRIFT_SHARE = 5.0, 0.5
 # normalised errors of positions and rotations are 1.7 and 2.3 without that, and 1.2 and 1.6 with it.
 _UNCHANGED_MAP_DRIFT_SHARE = 1e-3
 _UNCHANGED_YOUNG_MAP_DRIFT_SHARE = 0.1
+# Of the covariance relative to a map where a lidar that repeats its pattern measures many points a scan: several beams
+# see each surface. Planes fitted between the rings of few beams lean, so that their points share more of an error.
+# On 16 simulated drives with 64 beams half the covariance makes the drift 0.88 times as large, as the IMU's noise
+# disturbs it less, and the mean squared normalised errors 0.4 in place of 0.3. In ten other scenes with 64 beams the
+# error is 0.90 times as large, and none of them is above 1.4. With 16 beams an error in a room is seven times as large.
+_DENSE_SHARE = 0.5
+# Points of such a scan, relative to `least_measured`, 20,000: 16 beams measure 29,000 or fewer, 64 beams over a whole
+# turn 47,000 to 130,000.
+_DENSE = 2.0
 
 
-def inflation(keyframes: int) -> float:
-    """Return the factor on the covariance of a pose relative to a map of this number of keyframes."""
-    return 1 + _YOUNG_MAP_INFLATION / keyframes
+def is_dense(measured: int, least_measured: int, repeats: bool) -> bool:
+    """Return whether scans of this number of measured points show each surface with several beams.
+
+    Args:
+        measured: points of a scan.
+        least_measured: see :class:`hybridlio.sources.settings.ScanMatchingSettings`.
+        repeats: whether the lidar repeats its pattern.
+    """
+    return repeats and measured >= _DENSE * least_measured
+
+
+def inflation(keyframes: int, is_dense: bool) -> float:
+    """Return the factor on the covariance of a pose relative to a map.
+
+    Args:
+        keyframes: number of keyframes in the map.
+        is_dense: see :func:`is_dense`.
+    """
+    return (1 + _YOUNG_MAP_INFLATION / keyframes) * (_DENSE_SHARE if is_dense else 1.0)
 
 
 def drift_share(map_changed: bool, keyframes: int, least: float, has_rings: bool = True) -> float:

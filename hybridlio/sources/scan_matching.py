@@ -153,7 +153,7 @@ class ScanMatching:
         observed = register_with_degeneracy(problem, initial.pose, kernel_start_m)
         if observed.registration.matched < self.settings.min_matched:
             return replace(initial, ok=False)
-        pose, covariance = observed.registration.pose, self._covariance(observed, keyframes=1)
+        pose, covariance = observed.registration.pose, self._covariance(observed, current, keyframes=1)
         return RelativePose(pose, covariance, self.name, degenerate=observed.degenerate)
 
     def _accept(
@@ -170,7 +170,7 @@ class ScanMatching:
         elif self._map.needs_keyframe(pose) or self.recent.is_filling:
             filled = self.recent.together(scan.points, pose, self.settings.map_voxel_m)
             self._state = self._state.keyframe_pending(filled)
-        covariance = self._covariance(observed, self._keyframes)
+        covariance = self._covariance(observed, scan, self._keyframes)
         drift = self._drift(covariance, before.map_changed)
         if drift is None:  # the scan it is matched to lies before those that were bridged
             covariance = covariance + before.bridge_covariance
@@ -213,8 +213,10 @@ class ScanMatching:
         """Number of keyframes in the map, with the pending one."""
         return 1 if self.settings.target == "last-scan" else self._map.keyframes + (self._state.keyframe is not None)
 
-    def _covariance(self, observed: ObservedRegistration, keyframes: int) -> Array:
-        return observed.covariance(self.settings.covariance_scale * map_errors.inflation(keyframes))
+    def _covariance(self, observed: ObservedRegistration, scan: ThinnedScan, keyframes: int) -> Array:
+        is_dense = map_errors.is_dense(scan.measured, self.settings.least_measured, self.recent.repeats)
+        is_dense = is_dense and not self._follows_last_scan  # a single scan errs as one
+        return observed.covariance(self.settings.covariance_scale * map_errors.inflation(keyframes, is_dense))
 
     def _drift(self, covariance: Array, map_changed: bool) -> Array | None:
         """Return the part of a step's covariance that adds up over steps; None if all of it does."""

@@ -32,17 +32,19 @@ class ThinnedScan:
         points: ``(N, 3)`` metres, lidar frame, one a voxel, for the map.
         source: ``(M, 3)`` some of ``points``, to register.
         view_m: median range of the averaged points beyond :data:`NEAREST_M`, in range or not; NaN without points.
+        measured: number of the scan's points, in range or not.
         settings: settings of the surface that the scan makes by itself.
     """
 
     points: Array
     source: Array
     view_m: float
+    measured: int
     settings: LocalMapSettings
 
     def emptied(self) -> ThinnedScan:
         """Return the scan without its points."""
-        return ThinnedScan(self.points[:0], self.source[:0], self.view_m, self.settings)
+        return ThinnedScan(self.points[:0], self.source[:0], self.view_m, self.measured, self.settings)
 
     @cached_property
     def surface(self) -> Surface | None:
@@ -99,7 +101,7 @@ def thin(scan: Scan, settings: ScanMatchingSettings) -> ThinnedScan:
     seen = range2[range2 > NEAREST_M**2]
     view_m = float(np.sqrt(np.median(seen))) if len(seen) else np.nan
     points = np.asarray(points[_in_range(range2, settings)])
-    return ThinnedScan(points, _pick_source(points, scan, settings), view_m, settings.local_map)
+    return ThinnedScan(points, _pick_source(points, scan, settings), view_m, len(scan), settings.local_map)
 
 
 def _pick_source(points: Array, scan: Scan, settings: ScanMatchingSettings) -> Array:

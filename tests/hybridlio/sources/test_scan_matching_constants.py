@@ -110,6 +110,24 @@ def test_a_start_with_few_beams_claims_what_its_young_map_bears(monkeypatch: pyt
     assert claimed < 0.7 * squared_error_of_turns()
 
 
+@pytest.mark.parametrize(("lidar", "least", "most"), [("os0", 0.3, 0.7), ("vlp-16", 1.0, 1.0)])
+def test_lidars_of_many_beams_claim_about_half(lidar: str, least: float, most: float, monkeypatch: pytest.MonkeyPatch):
+    """Planes between the rings of few beams lean, and their points share more of an error."""
+    office = walk(PlatformConfig(scene="office", platform="handheld", lidar=lidar, seconds=1.4, seed=8522), 0, 12)
+
+    def claimed() -> float:
+        """The mean variance of a step's translation, once the map has a few keyframes."""
+        matching = ScanMatching()
+        matching.start(office[0])
+        guesses = [guess(true_pose(office, k - 1, k), NEAR) for k in range(1, len(office))]
+        steps = [matching.refine(office[k], one) for k, one in enumerate(guesses, start=1)]
+        return float(np.mean([np.trace(step.covariance[3:, 3:]) for step in steps[3:]]))
+
+    with_share = claimed()
+    monkeypatch.setattr(map_errors, "_DENSE_SHARE", 1.0)
+    assert least <= with_share / claimed() <= most
+
+
 # ---------------------------------------------------------------------------------------------------- edges of the map
 
 
