@@ -1,8 +1,9 @@
-"""How much scan matching could gain from weights of points, as bounds from the simulator's truth; see results.md.
+"""What weights of points could gain scan matching, and what registering more points gains; see results.md.
 
-    python benchmarks/point_removal.py [--kinds dust,people,…] [--seeds 8111,8112,8113] [--length-m 100]
+    python benchmarks/point_removal.py [--kinds dust,people,…] [--seeds 8111,8112,8113] [--length-m 100] [--no-bounds]
 
-Each drive is run with the defaults on its scans as they are, and on the same scans
+Each drive is run with the defaults, which register one average a cubic metre, and with all averages of a scan. Both
+take each scan in turn, so that their times are comparable. The bounds are runs with the defaults on the same scans
 
 * without the points that lie farther than five standard deviations from what stands along their ray: those of cars,
   people, drops and dust. Weights that tell such points from others gain at most this.
@@ -22,6 +23,7 @@ Ratios are geometric means over the drives.
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -40,6 +42,8 @@ from hybridlio.core.lidar_models import LidarModel
 from hybridlio.core.sensors import Calibration, Scan
 from hybridlio.core.trajectory import Trajectory
 from hybridlio.datasets.sequence import Sequence
+from hybridlio.odometry.config import Config
+from hybridlio.odometry.estimate import Estimate
 from hybridlio.odometry.odometry import Odometry
 from hybridlio.simulation.measurements import hits_at
 from hybridlio.simulation.plan import plan
@@ -50,6 +54,7 @@ from hybridlio.simulation.recording import drive_recording
 from hybridlio.simulation.scenarios import SCENARIOS, scenario_config
 from hybridlio.simulation.sensors.air import CLEAR
 from hybridlio.simulation.sensors.lidar import ray_pattern
+from hybridlio.sources.settings import ScanMatchingSettings
 
 KINDS = ("heavy-traffic", "parked-lot", "vegetation", "16-beam", "rain", "dust", "people")
 PLATFORMS = {"parked-lot": ("garage", 0), "vegetation": ("forest", 0), "people": ("campus", 12)}  # scene and people
@@ -57,7 +62,13 @@ SECONDS = 10.0  # of platforms
 MOVING_SIGMAS = 5.0
 ROUGH_M, NEIGHBOURS = 0.03, 15
 THIN_M = 0.03  # thickness at which planes get half their weight
-VARIANTS = ("as it is", "standing points", "standing, smooth", "smooth, thin planes", "by neighbours, thin planes")
+AS_IT_IS, MORE = "as it is", "all averages"
+STANDING, SMOOTH, THIN, TOLD = (
+    "standing points",
+    "standing, smooth",
+    "smooth, thin planes",
+    "by neighbours, thin planes",
+)
 
 
 class Drive(NamedTuple):
@@ -87,8 +98,8 @@ def platform(kind: str, seed: int) -> Drive:
     return Drive(recording, scanner.model, scanner.sweep(0.0).directions, lambda k: alone.hits(k).range_m)
 
 
-def variants(drive: Drive) -> Iterator[tuple[Scan, ...]]:
-    """Return of each scan: as it is, what stands, of this what is smooth, and what neighbours tell to be smooth."""
+def parts(drive: Drive) -> Iterator[tuple[Scan, ...]]:
+    """Return of each scan: what stands, of this what is smooth, and what neighbours tell to be smooth."""
     rays = cKDTree(drive.directions)
     for k in range(len(drive.recording)):
         scan = drive.recording.load_scan(k)
@@ -99,7 +110,7 @@ def variants(drive: Drive) -> Iterator[tuple[Scan, ...]]:
         smooth = standing.copy()
         smooth[standing] = roughness_m(drive.directions[ray[standing]] * exact_m[standing, None]) <= ROUGH_M
         told = roughness_m(scan.points.astype(np.float64)) <= ROUGH_M
-        yield scan, scan.part(standing), scan.part(smooth), scan.part(told)
+        yield scan.part(standing), scan.part(smooth), scan.part(told)
 
 
 def roughness_m(points: Array) -> Array:
@@ -109,15 +120,22 @@ def roughness_m(points: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(mean_squares[:, 0], 0.0)))
 
 
-def figures(sequence: Sequence, scans: tuple[Scan, ...]) -> Figures:
-    """Return the errors of the defaults on these scans of a recording."""
-    odometry = Odometry(keep_record=False)
-    answers = [odometry.step(frame) for frame in replace(sequence, load_scan=lambda k: scans[k])]
-    poses, covariances = (np.array([getattr(a, name) for a in answers]) for name in ("pose", "covariance"))
-    found = evaluation_of(Trajectory(sequence.stamps_ns, poses, covariances), sequence)
-    assert found is not None
-    errors = {"t_rel [%]": drift_of(found)[0], "ATE [mm]": 1e3 * found.ate_m}
-    return {**errors, "ANEES rotation": found.anees_rotation, "ANEES position": found.anees_position}
+def loaded(recording: Sequence, scans: tuple[Scan, ...]) -> Sequence:
+    """Return a recording with other scans, which are in memory."""
+    return replace(recording, load_scan=lambda k: scans[k])
+
+
+def in_turn(sequence: Sequence, configs: dict[str, Config]) -> dict[str, Figures]:
+    """Return the errors and times of odometries that take each scan of a recording in turn."""
+    runs: dict[str, tuple[Odometry, list[Estimate], list[float]]] = {
+        name: (Odometry(config=config, keep_record=False), [], []) for name, config in configs.items()
+    }
+    for frame in sequence:
+        for odometry, answers, times_s in runs.values():
+            start_s = time.perf_counter()
+            answers.append(odometry.step(frame))
+            times_s.append(time.perf_counter() - start_s)
+    return {name: figures(sequence, answers, times_s) for name, (_, answers, times_s) in runs.items()}
 
 
 @contextmanager
@@ -131,44 +149,61 @@ def thin_planes() -> Iterator[None]:
         plane_fitting._HALF_WEIGHT_THICKNESS_M = before
 
 
-def measure(kind: str, seed: int, length_m: float) -> list[Figures]:
-    """Return the figures of one drive for each of ``VARIANTS``."""
+def figures(sequence: Sequence, answers: list[Estimate], times_s: list[float]) -> Figures:
+    """Return the errors of a run, and the median time of a scan."""
+    poses, covariances = (np.array([getattr(a, name) for a in answers]) for name in ("pose", "covariance"))
+    found = evaluation_of(Trajectory(sequence.stamps_ns, poses, covariances), sequence)
+    assert found is not None
+    errors = {"t_rel [%]": drift_of(found)[0], "ATE [mm]": 1e3 * found.ate_m}
+    anees = {"ANEES rotation": found.anees_rotation, "ANEES position": found.anees_position}
+    return {**errors, **anees, "time [ms]": 1e3 * float(np.median(times_s))}
+
+
+def measure(kind: str, seed: int, length_m: float, with_bounds: bool) -> dict[str, Figures]:
+    """Return the figures of one drive for each variant."""
     drive = platform(kind, seed) if kind in PLATFORMS else road(kind, seed, length_m)
-    scans = []
+    scans = tuple(drive.recording.load_scan(k) for k in range(len(drive.recording)))
+    recording = loaded(drive.recording, scans)
+    more = Config(scan_matching=ScanMatchingSettings(source_voxel_m=ScanMatchingSettings().map_voxel_m))
+    found = in_turn(recording, {AS_IT_IS: Config(), MORE: more})
+    if not with_bounds:
+        return found
+    kept = []
     with progress(f"{kind} {seed}") as tick:
-        for k, one in enumerate(variants(drive)):
-            scans.append(one)
-            tick("", k + 1, len(drive.recording))
-    as_it_is, standing, smooth, told = zip(*scans, strict=True)
-    found = [figures(drive.recording, one) for one in (as_it_is, standing, smooth)]
+        for k, one in enumerate(parts(drive)):
+            kept.append(one)
+            tick("", k + 1, len(recording))
+    standing, smooth, told = zip(*kept, strict=True)
+    found |= in_turn(loaded(recording, standing), {STANDING: Config()})
+    found |= in_turn(loaded(recording, smooth), {SMOOTH: Config()})
     with thin_planes():
-        found += [figures(drive.recording, one) for one in (smooth, told)]
-    points = [sum(map(len, one)) for one in (as_it_is, standing, smooth, smooth, told)]
-    return [{"removed [%]": 100 * (1 - n / points[0]), **one} for n, one in zip(points, found, strict=True)]
+        found |= in_turn(loaded(recording, smooth), {THIN: Config()})
+        found |= in_turn(loaded(recording, told), {TOLD: Config()})
+    for name, part in ((STANDING, standing), (SMOOTH, smooth), (THIN, smooth), (TOLD, told)):
+        found[name]["removed [%]"] = 100 * (1 - sum(map(len, part)) / sum(map(len, scans)))
+    return found
 
 
-def summary(rows: list[list[Figures]]) -> list[Figures]:
+def summary(rows: list[dict[str, Figures]]) -> dict[str, Figures]:
     """Return the mean figures of drives for each variant, with ratios to the first one."""
-    out = []
-    for variant in range(len(VARIANTS)):
-        mean = {name: float(np.mean([row[variant][name] for row in rows])) for name in rows[0][0]}
+    out = {}
+    for variant in rows[0]:
+        mean = {name: float(np.mean([row[variant][name] for row in rows])) for name in rows[0][variant]}
         ratios = {
-            f"ratio of {name.split()[0]}": float(np.exp(np.mean([np.log(r[variant][name] / r[0][name]) for r in rows])))
-            for name in ("t_rel [%]", "ATE [mm]")
+            f"ratio of {name.split()[0]}": float(
+                np.exp(np.mean([np.log(r[variant][name] / r[AS_IT_IS][name]) for r in rows]))
+            )
+            for name in ("t_rel [%]", "ATE [mm]", "time [ms]")
         }
-        out.append({**mean, **ratios})
+        out[variant] = {**mean, **ratios}
     return out
 
 
-def table(found: dict[str, list[list[Figures]]]) -> str:
+def table(found: dict[str, list[dict[str, Figures]]]) -> str:
     """Return the table of all kinds, and of all together."""
     everything = {**found, "all": [row for rows in found.values() for row in rows]}
     return table_of(
-        {
-            f"{kind}, {name}": row
-            for kind, rows in everything.items()
-            for name, row in zip(VARIANTS, summary(rows), strict=True)
-        }
+        {f"{kind}, {name}": row for kind, rows in everything.items() for name, row in summary(rows).items()}
     )
 
 
@@ -177,14 +212,15 @@ def main() -> None:
     parser.add_argument("--kinds", default=",".join(KINDS), metavar="A,B,…", help="(default: %(default)s)")
     parser.add_argument("--seeds", default="8111,8112,8113", metavar="A,B,…", help="(default: %(default)s)")
     parser.add_argument("--length-m", type=float, default=100.0, help="of each drive on a road (default: %(default)s)")
+    parser.add_argument("--no-bounds", action="store_true", help="without the runs on fewer points")
     options = parser.parse_args()
     kinds, known = options.kinds.split(","), (*PLATFORMS, *SCENARIOS)
     if unknown := [kind for kind in kinds if kind not in known]:
         parser.error(f"unknown kind {unknown[0]!r}; choose among {', '.join(known)}")
-    found: dict[str, list[list[Figures]]] = {}
+    found: dict[str, list[dict[str, Figures]]] = {}
     for seed in map(int, options.seeds.split(",")):
         for kind in kinds:
-            found.setdefault(kind, []).append(measure(kind, seed, options.length_m))
+            found.setdefault(kind, []).append(measure(kind, seed, options.length_m, not options.no_bounds))
         print(f"\n{table(found)}", flush=True)
 
 
