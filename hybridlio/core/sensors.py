@@ -155,6 +155,10 @@ class ImuSamples:
         first = ImuSamples(np.array([start_ns]), self.gyro_rad_s[:1], self.accel_m_s2[:1])
         return ImuSamples.concatenate([first, self])
 
+    def starts_after(self, stamp_ns: int) -> bool:
+        """Return whether the first sample is later than a stamp by more than a period; rates hardly change in one."""
+        return len(self) < 2 or bool(self.stamps_ns[0] - stamp_ns > np.median(np.diff(self.stamps_ns)))
+
     def turns(self, bias_rad_s: Array) -> Array:
         """Return rotation vectors ``(S - 1, 3)`` between samples, rad, by rates without a bias ``(3,)``."""
         return se3.turns_by_rates(self.gyro_rad_s - bias_rad_s, np.diff(self.stamps_ns) / NS_PER_S)

@@ -75,6 +75,27 @@ class MotionCompensation:
         self._change.learn(None if step is None else se3.log(step.pose) / step_s)
         self._stamp_ns = stamp_ns
 
+    def noise_of_gravity(self, frame: Frame, before: State) -> Array:
+        """Return the covariance ``(6, 6)`` of the step to this frame by that of gravity, which bends the sweep's path.
+
+        A path that is bent by ``a·t·(t − T)/2`` too much, with the step's duration ``T``, leads through both ends of the
+        step and displaces most points of a sweep by ``a·(T·m + s)/2``, with the mean ``m`` of its points' times after
+        the stamp and ``s`` that of their squares. Points of the scan before are displaced by ``a·(−T·m + s)/2``, so that
+        the two scans lie ``a·T·m`` apart: 5 mm at 10 Hz where 0.1 s of a motion that shakes show gravity to 1 m/s².
+
+        Args:
+            frame: the frame.
+            before: the state at the scan before.
+        """
+        offsets_ns, covariance = frame.scan.time_offsets_ns, np.zeros((6, 6))
+        if offsets_ns is None or not len(offsets_ns) or not before.has_imu or not len(frame.sweep_imu):
+            return covariance
+        step_s = (frame.scan.stamp_ns - before.stamp_ns) / NS_PER_S
+        R_world_lidar = before.T_world_imu[:3, :3] @ self._calibration.T_imu_lidar[:3, :3]
+        apart_s2 = step_s * float(offsets_ns.mean()) / NS_PER_S
+        covariance[3:, 3:] = apart_s2**2 * R_world_lidar.T @ before.gravity_covariance @ R_world_lidar
+        return covariance
+
     def noise(self, frame: Frame, before_ns: int) -> Array | None:
         """Return the covariance ``(6, 6)`` that compensation adds to the step to this frame; None without point times.
 

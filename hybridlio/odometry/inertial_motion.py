@@ -28,6 +28,7 @@ def inertial_motion(
 
     Samples that start after the state's stamp, as those of an IMU that wakes up after the lidar, are continued back to
     it: the rate changes linearly to that of the first sample, from one by which the motion turns as ``T_start_end``.
+    Within a period of the samples it stays as it is: a few milliseconds could take any turn.
 
     Args:
         imu: samples from the state's stamp, or before it, to beyond ``end_ns``; or starting shortly after the stamp.
@@ -41,6 +42,7 @@ def inertial_motion(
         Poses ``T_world_lidar`` at the samples' stamps; None if there is no sample at both ends, or a gap.
     """
     begin_ns = int(imu.stamps_ns[0]) if len(imu) else 0
+    is_late = imu.starts_after(state.stamp_ns)
     if begin_ns > state.stamp_ns:
         imu = _with_sample_at(end_ns, imu.held_from(state.stamp_ns))
     stamps = imu.stamps_ns
@@ -52,7 +54,7 @@ def inertial_motion(
     since_s = (stamps - state.stamp_ns) / NS_PER_S
     rates = imu.gyro_rad_s - state.gyro_bias_rad_s
     step, turned = _of_imu(T_start_end, calibration), slice(int(i), int(j) + 1)
-    if begin_ns > state.stamp_ns:
+    if is_late:
         before = np.maximum(1 - since_s * NS_PER_S / (begin_ns - state.stamp_ns), 0.0)
         for _ in range(_TURN_ROUNDS):
             rates = _turned_to(step[:3, :3], rates, before, since_s, turned)

@@ -80,9 +80,11 @@ def second_compensation(
     by_imu = len(frame.imu) > 0
     turn = lidar_turn(frame.imu, before, calibration) if by_imu else initial.pose[:3, :3]
     compensated_by = se3.make(turn, initial.pose[:3, 3])
-    error = se3.log(se3.between(compensated_by, found.pose)) * step_s / (step_s + mean_s)
+    seen = (step_s + mean_s) / step_s
+    apart = se3.log(se3.between(compensated_by, found.pose))
+    error = apart / seen
     if weighs:
-        error[3:] = (initial.covariance @ np.linalg.solve(initial.covariance + found.covariance, error))[3:]
+        error[3:] = (seen * initial.covariance @ np.linalg.solve(seen**2 * initial.covariance + found.covariance, apart))[3:]
     moved_m = np.linalg.norm(error.reshape(2, 3), axis=1) * (POINT_LEVER_M, 1.0) * sweep_s / step_s
     by_scale_rad = _SIGMAS * imu_noise.gyro_scale_sigma * float(np.linalg.norm(se3.so3_log(turn)))
     holds = by_imu and bool(moved_m[0] <= _LEAST_RATIO * noise_m or np.linalg.norm(error[:3]) > by_scale_rad)

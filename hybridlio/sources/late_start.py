@@ -125,12 +125,12 @@ class LateStart:
 def starts_late(first: Frame) -> bool:
     """Return whether samples that motion compensation needs are missing at the first scan's stamp.
 
-    A first sample within a period of the stamp is not late: rates hardly change in that time.
+    A first sample within a period of the stamp is not late.
     """
-    offsets_ns, stamps_ns = first.scan.time_offsets_ns, first.sweep_imu.stamps_ns
+    offsets_ns = first.scan.time_offsets_ns
     if first.calibration is None or offsets_ns is None or not len(offsets_ns) or offsets_ns.max() <= 0:
         return False
-    return len(stamps_ns) < 2 or bool(stamps_ns[0] - first.scan.stamp_ns > np.median(np.diff(stamps_ns)))
+    return first.sweep_imu.starts_after(first.scan.stamp_ns)
 
 
 def less_certain(step: RelativePose, noise: Array) -> RelativePose:
