@@ -122,7 +122,7 @@ def _registered(
     residual = pipeline.residual
     if not isinstance(residual, RefinesAgain):
         return compensated, step
-    weighs = initial.from_imu and not residual.weighs_predictions
+    weighs = initial.from_imu
     second = second_compensation(frame, initial, step, before, pipeline.calibration, pipeline.imu_noise, weighs)
     if second is not None:
         again = initial if len(frame.imu) else replace(initial, proposed=step.pose)
