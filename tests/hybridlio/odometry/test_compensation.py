@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from hybridlio.cloud.deskew import compensation_noise, constant_twist, sweep_mot
 from hybridlio.core import se3
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.sensors import Calibration, Frame, ImuNoise, ImuSamples, Scan
+from hybridlio.core.start_state import start_state
 from hybridlio.odometry.compensation import MotionCompensation
 from hybridlio.odometry.odometry import Odometry
 
@@ -99,6 +102,34 @@ def test_a_frame_without_point_times_passes_unchanged_and_without_noise(rng):
     assert compensation.noise(frame, 0) is not None
     assert compensation.compensate(compensated, np.eye(4), 0, SWEEP_NS, None, ImuSamples.empty()) is compensated
     assert compensation.noise(compensated, 0) is None
+
+
+@pytest.mark.parametrize("begin_ns", [0, -SWEEP_NS // 2, -SWEEP_NS])
+def test_gravitys_error_displaces_two_scans_by_what_is_stated(begin_ns):
+    """A lidar at rest, whose IMU does not know which way is up: both sweeps are bent by the same acceleration."""
+    calibration = Calibration(se3.exp(np.array([0.4, -0.3, 2.0, 0.1, -0.2, 0.3])))
+    stamps_ns = np.arange(-SWEEP_NS, 3 * SWEEP_NS + 1, SWEEP_NS // 20)
+    imu, offsets_ns = turning(np.zeros(3), stamps_ns), np.linspace(begin_ns, begin_ns + SWEEP_NS, 201).astype(np.int64)
+    sigmas = np.array([1.0, 2.0, 3.0])
+    start = start_state(0, ImuSamples.empty(), ImuNoise())
+    state = replace(start, has_imu=True, gravity_covariance=np.diag(sigmas**2))
+    compensation = MotionCompensation(calibration, ImuNoise())
+
+    def frame_at(stamp_ns: int) -> Frame:
+        scan = Scan(stamp_ns, np.full((201, 3), 10.0, np.float32), time_offsets_ns=offsets_ns)
+        return Frame(0, scan, sweep_imu=imu.during(scan), calibration=calibration)
+
+    apart = []
+    for wrong in np.diag(sigmas):
+        known = replace(state, gravity_m_s2=np.array([0.0, 0.0, -9.81]) + wrong)
+        scans = [
+            compensation.compensate(frame_at(stamp_ns), np.eye(4), 0, SWEEP_NS, known, imu).scan.points.mean(axis=0)
+            for stamp_ns in (0, SWEEP_NS)
+        ]
+        apart.append(np.subtract(*scans).astype(np.float64))
+    stated = compensation.noise_of_gravity(frame_at(SWEEP_NS), state)
+    np.testing.assert_allclose(stated[3:, 3:], np.transpose(apart) @ apart, rtol=0.02, atol=1e-9)
+    np.testing.assert_array_equal(stated[:3], 0.0)
 
 
 def test_the_first_scan_is_compensated_for_rotation(rng):

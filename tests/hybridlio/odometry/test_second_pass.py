@@ -63,32 +63,55 @@ def test_the_first_scans_lie_as_later_ones_and_steps_do_not_swing_although_bias_
     assert largest_step_error_m(estimated(frames), recording) > 0.03
 
 
+def compensated_again_m(predicted_m: Array, covered_m: float, found_m: Array, match_m: float, weighs: bool) -> Array:
+    """Return the translation ``(3,)`` by which a sweep stamped at its end is compensated again.
+
+    Args:
+        predicted_m, covered_m: the initial pose and its standard deviation.
+        found_m, match_m: the match and its standard deviation.
+        weighs: whether the initial pose counts.
+    """
+    step_ns = 100_000_000
+    scan = Scan(step_ns, np.ones((101, 3), np.float32), time_offsets_ns=np.linspace(-step_ns, 0, 101).astype(np.int64))
+
+    def step(position_m: Array, sigma_m: float) -> RelativePose:
+        covariance = np.diag(np.r_[np.full(3, 1e-3), np.full(3, sigma_m)] ** 2)
+        return RelativePose(se3.make(np.eye(3), position_m), covariance, "given", details={"sigma_m": 1e-6})
+
+    start = start_state.start_state(0, ImuSamples.empty(), ImuNoise())
+    given = step(predicted_m, covered_m), step(found_m, match_m)
+    found = second_compensation(Frame(1, scan), *given, start, Calibration(), ImuNoise(), weighs)
+    return predicted_m if found is None else np.asarray(found.T_start_end[:3, 3])
+
+
 @pytest.mark.parametrize(
     ("weighs", "predicted_m", "matched_m", "share"),
-    [(True, 1.0, 1e-4, 1.0), (True, 0.01, 0.01, 0.5), (True, 1e-4, 0.01, 0.0), (False, 1e-4, 0.01, 1.0)],
+    [(True, 1.0, 1e-4, 2.0), (True, 0.01, 0.01, 0.4), (True, 1e-4, 0.01, 0.0), (False, 1e-4, 0.01, 2.0)],
 )
 def test_a_scan_is_compensated_again_by_what_its_match_knows_better(
     weighs: bool, predicted_m: float, matched_m: float, share: float
 ) -> None:
     """Stamped at its end, a sweep whose speed is wrong by δ is displaced by -δ/2 of a step, and its match so by δ/2."""
-    step_ns, wrong_m = 100_000_000, np.array([0.2, -0.1, 0.3])
-    scan = Scan(step_ns, np.ones((101, 3), np.float32), time_offsets_ns=np.linspace(-step_ns, 0, 101).astype(np.int64))
+    apart_m = np.array([0.2, -0.1, 0.3])
+    moved_m = compensated_again_m(np.zeros(3), predicted_m, apart_m, matched_m, weighs)
+    np.testing.assert_allclose(moved_m, share * apart_m, atol=2e-3)
 
-    def step(position_m: Array, position_sigma_m: float) -> RelativePose:
-        covariance = np.diag(np.r_[np.full(3, 1e-3), np.full(3, position_sigma_m)] ** 2)
-        return RelativePose(se3.make(np.eye(3), position_m), covariance, "given", details={"sigma_m": 0.01})
 
-    found = second_compensation(
-        Frame(1, scan),
-        step(np.zeros(3), predicted_m),
-        step(wrong_m, matched_m),
-        start_state.start_state(0, ImuSamples.empty(), ImuNoise()),
-        Calibration(),
-        ImuNoise(),
-        weighs,
-    )
-    moved_m = np.zeros(3) if found is None else found.T_start_end[:3, 3]
-    np.testing.assert_allclose(moved_m, 2 * share * wrong_m, atol=2e-3)
+@pytest.mark.parametrize("match_m", [0.003, 0.01, 0.03])
+def test_a_second_compensation_is_closer_than_the_first_and_than_one_by_the_whole_difference(
+    rng: np.random.Generator, match_m: float
+) -> None:
+    """The truth is 0. Of matches that scatter as much as predictions, the whole difference doubles the error."""
+    predicted_m, draws = 0.01, 400
+    wrong_m = rng.normal(0.0, predicted_m, (draws, 3))
+    found_m = wrong_m / 2 + rng.normal(0.0, match_m, (draws, 3))
+
+    def left_m(weighs: bool) -> float:
+        pairs = zip(wrong_m, found_m, strict=True)
+        again = [compensated_again_m(wrong, predicted_m, found, match_m, weighs) for wrong, found in pairs]
+        return float(np.sqrt(np.mean(np.square(again))))
+
+    assert left_m(weighs=True) < min(left_m(weighs=False), predicted_m)
 
 
 def test_a_gyroscope_of_a_wrong_scale_distorts_fast_turns_less(monkeypatch: pytest.MonkeyPatch) -> None:
