@@ -230,11 +230,6 @@ class TakesBack(Protocol):
 class RefinesAgain(Protocol):
     """A residual source that can measure its last scan again, compensated otherwise. Implementing it is optional."""
 
-    @property
-    def weighs_predictions(self) -> bool:
-        """Whether its answers are weighed with the IMU's predictions already."""
-        ...
-
     def refine_again(self, frame: Frame, initial: RelativePose) -> RelativePose:
         """Return what ``refine`` would return for the frame in place of the last one, which must have been usable."""
         ...

@@ -122,7 +122,7 @@ def _registered(
     residual = pipeline.residual
     if not isinstance(residual, RefinesAgain):
         return compensated, step
-    weighs = initial.from_imu
+    weighs = initial.from_imu and not pipeline.gate.is_warming_up
     second = second_compensation(frame, initial, step, before, pipeline.calibration, pipeline.imu_noise, weighs)
     if second is not None:
         again = initial if len(frame.imu) else replace(initial, proposed=step.pose)

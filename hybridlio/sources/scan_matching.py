@@ -119,7 +119,7 @@ class ScanMatching:
         return self._scene.settings
 
     @property
-    def weighs_predictions(self) -> bool:
+    def _weighs_predictions(self) -> bool:
         """Whether matches are weighed with the IMU's predictions along weak directions: of lidars that do not repeat.
 
         A spinning lidar's minima err alike, on the same few trunks: weighed so, drift in a field is a third larger.
@@ -180,7 +180,7 @@ class ScanMatching:
 
     def _weighed(self, observed: ObservedRegistration, initial: RelativePose) -> tuple[Array, Array]:
         """Return the pose found and its covariance along weak directions, weighed with the IMU's prediction or not."""
-        if not (initial.from_imu and self.weighs_predictions):
+        if not (initial.from_imu and self._weighs_predictions):
             return observed.registration.pose, np.zeros((6, 6))
         before = self._state.current
         return observed.weighed_with(before.T_map_lidar @ initial.pose, before.predicted_covariance(initial))
