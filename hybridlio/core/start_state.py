@@ -47,7 +47,7 @@ def start_state(stamp_ns: int, imu: ImuSamples, noise: ImuNoise) -> State:
     if not len(imu):
         down = np.array([0.0, 0.0, -GRAVITY_M_S2])
         return State(stamp_ns, np.eye(4), zero, zero, zero, down, covariance, np.eye(3), has_imu=False)
-    force = force_at(stamp_ns, imu)
+    force = _force_at(stamp_ns, imu)
     mean_force = force.mean(axis=0)
     magnitude = float(np.linalg.norm(mean_force))
     if magnitude < _MIN_FORCE_M_S2:
@@ -61,7 +61,7 @@ def start_state(stamp_ns: int, imu: ImuSamples, noise: ImuNoise) -> State:
     return State(stamp_ns, np.eye(4), zero, zero, zero, gravity, covariance, gravity_covariance)
 
 
-def force_at(stamp_ns: int, imu: ImuSamples) -> Array:
+def _force_at(stamp_ns: int, imu: ImuSamples) -> Array:
     """Return the specific forces ``(S, 3)`` in the IMU's frame at the sample nearest to a stamp.
 
     A drone turns by half a radian between two scans; its samples, averaged as they are, tilt the vertical by as much.

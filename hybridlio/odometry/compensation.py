@@ -11,7 +11,6 @@ from hybridlio.core import se3
 from hybridlio.core.arrays import Array
 from hybridlio.core.estimates import RelativePose, State
 from hybridlio.core.sensors import NS_PER_S, Calibration, Frame, ImuNoise, ImuSamples
-from hybridlio.core.start_state import force_at
 from hybridlio.odometry.inertial_motion import inertial_motion
 from hybridlio.sources.gate.motion_change import UsualChange
 
@@ -75,32 +74,6 @@ class MotionCompensation:
         step_s = (stamp_ns - self._stamp_ns) / NS_PER_S
         self._change.learn(None if step is None else se3.log(step.pose) / step_s)
         self._stamp_ns = stamp_ns
-
-    def noise_of_gravity(self, frame: Frame, before: State) -> Array:
-        """Return the covariance ``(6, 6)`` of the step to this frame by that of gravity, which bends the sweep's path.
-
-        A path that is bent by ``a·t·(t − T)/2`` too much, with the step's duration ``T``, leads through both ends of
-        the step and displaces the points of a sweep by ``a·(T·m + s)/2`` on average, with the mean ``m`` of their times
-        after the stamp and ``s`` that of the squares. Points of the scan before are displaced by ``a·(−T·m + s)/2``,
-        so that the two scans lie ``a·T·m`` apart: 5 mm at 10 Hz for 1 m/s².
-
-        The state's covariance holds for any start. The mean of a specific force is off by about as much as that
-        changes meanwhile: by 3 to 4 m/s² in the hand of somebody who runs on stairs, hardly at rest.
-
-        Args:
-            frame: the frame.
-            before: the state at the scan before.
-        """
-        offsets_ns, covariance = frame.scan.time_offsets_ns, np.zeros((6, 6))
-        if offsets_ns is None or not len(offsets_ns) or not before.has_imu or not len(frame.sweep_imu):
-            return covariance
-        step_s = (frame.scan.stamp_ns - before.stamp_ns) / NS_PER_S
-        apart_s2 = step_s * float(offsets_ns.mean()) / NS_PER_S
-        changes = force_at(frame.scan.stamp_ns, ImuSamples.concatenate([frame.imu, frame.sweep_imu])).var(axis=0).max()
-        share = min(float(changes / before.gravity_covariance.diagonal().mean()), 1.0)
-        R_world_lidar = before.T_world_imu[:3, :3] @ self._calibration.T_imu_lidar[:3, :3]
-        covariance[3:, 3:] = share * apart_s2**2 * R_world_lidar.T @ before.gravity_covariance @ R_world_lidar
-        return covariance
 
     def noise(self, frame: Frame, before_ns: int) -> Array | None:
         """Return the covariance ``(6, 6)`` that compensation adds to the step to this frame; None without point times.

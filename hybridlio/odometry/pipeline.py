@@ -31,7 +31,7 @@ from hybridlio.odometry.start.start_search import StartSearch
 from hybridlio.sources.gate.gate_result import GateResult
 from hybridlio.sources.gate.imu_trust import ImuTrust, without_imu
 from hybridlio.sources.gate.innovation_gate import InnovationGate
-from hybridlio.sources.late_start import LateStart, less_certain
+from hybridlio.sources.late_start import LateStart
 
 if TYPE_CHECKING:
     from hybridlio.odometry.setup import Setup
@@ -159,11 +159,7 @@ class Pipeline:
 
     def _with_compensation_noise(self, frame: Frame, relative: RelativePose, state: State) -> RelativePose:
         noise = self.compensation.noise(frame, state.stamp_ns)
-        if noise is None or not relative.ok:
-            return relative
-        of_gravity = self.compensation.noise_of_gravity(frame, state)
-        step = _widened(relative, noise, frame)
-        return step.wider(added=of_gravity) if self.state is not None else less_certain(step, of_gravity)
+        return relative if noise is None or not relative.ok else _widened(relative, noise, frame)
 
     def apply_gate(
         self, frame: Frame, initial: RelativePose, measured: RelativePose, state: State

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,6 @@ from hybridlio.cloud.deskew import compensation_noise, constant_twist, sweep_mot
 from hybridlio.core import se3
 from hybridlio.core.estimates import RelativePose
 from hybridlio.core.sensors import Calibration, Frame, ImuNoise, ImuSamples, Scan
-from hybridlio.core.start_state import start_state
 from hybridlio.odometry.compensation import MotionCompensation
 from hybridlio.odometry.odometry import Odometry
 
@@ -102,40 +99,6 @@ def test_a_frame_without_point_times_passes_unchanged_and_without_noise(rng):
     assert compensation.noise(frame, 0) is not None
     assert compensation.compensate(compensated, np.eye(4), 0, SWEEP_NS, None, ImuSamples.empty()) is compensated
     assert compensation.noise(compensated, 0) is None
-
-
-@pytest.mark.parametrize("begin_ns", [0, -SWEEP_NS // 2, -SWEEP_NS])
-def test_where_the_body_shakes_gravitys_error_displaces_two_scans_by_what_is_stated(begin_ns):
-    """Both sweeps are bent by the same acceleration, which is not there."""
-    calibration = Calibration(se3.exp(np.array([0.4, -0.3, 2.0, 0.1, -0.2, 0.3])))
-    stamps_ns = np.arange(-SWEEP_NS, 3 * SWEEP_NS + 1, SWEEP_NS // 20)
-    still, offsets_ns = (
-        turning(np.zeros(3), stamps_ns),
-        np.linspace(begin_ns, begin_ns + SWEEP_NS, 201).astype(np.int64),
-    )
-    shaken = np.outer(np.where(np.arange(len(stamps_ns)) % 2, 5.0, -5.0), [1.0, 1.0, 1.0])
-    imu = ImuSamples(stamps_ns, still.gyro_rad_s, still.accel_m_s2 + shaken)
-    sigmas = np.array([1.0, 2.0, 3.0])
-    start = start_state(0, ImuSamples.empty(), ImuNoise())
-    state = replace(start, has_imu=True, gravity_covariance=np.diag(sigmas**2))
-    compensation = MotionCompensation(calibration, ImuNoise())
-
-    def frame_at(stamp_ns: int, samples: ImuSamples) -> Frame:
-        scan = Scan(stamp_ns, np.full((201, 3), 10.0, np.float32), time_offsets_ns=offsets_ns)
-        return Frame(0, scan, sweep_imu=samples.during(scan), calibration=calibration)
-
-    def apart_m(wrong: np.ndarray) -> np.ndarray:
-        """Return how far the second scan's points lie from those of the first, on average."""
-        known = replace(state, gravity_m_s2=np.array([0.0, 0.0, -9.81]) + wrong)
-        frames = (frame_at(stamp_ns, imu) for stamp_ns in (0, SWEEP_NS))
-        scans = [compensation.compensate(frame, np.eye(4), 0, SWEEP_NS, known, imu).scan for frame in frames]
-        return np.subtract(*(scan.points.mean(axis=0, dtype=np.float64) for scan in scans))
-
-    apart = np.array([apart_m(wrong) - apart_m(np.zeros(3)) for wrong in np.diag(sigmas)])
-    stated = compensation.noise_of_gravity(frame_at(SWEEP_NS, imu), state)
-    np.testing.assert_allclose(stated[3:, 3:], apart.T @ apart, rtol=0.02, atol=1e-7)
-    np.testing.assert_array_equal(stated[:3], 0.0)
-    np.testing.assert_array_equal(compensation.noise_of_gravity(frame_at(SWEEP_NS, still), state), 0.0)
 
 
 def test_the_first_scan_is_compensated_for_rotation(rng):
