@@ -42,7 +42,7 @@ def inertial_motion(
         Poses ``T_world_lidar`` at the samples' stamps; None if there is no sample at both ends, or a gap.
     """
     begin_ns = int(imu.stamps_ns[0]) if len(imu) else 0
-    is_late = imu.starts_after(state.stamp_ns)
+    is_late = begin_ns > state.stamp_ns and imu.starts_after(state.stamp_ns)
     if begin_ns > state.stamp_ns:
         imu = _with_sample_at(end_ns, imu.held_from(state.stamp_ns))
     stamps = imu.stamps_ns
