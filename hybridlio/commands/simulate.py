@@ -47,7 +47,7 @@ Lidar = Annotated[
     typer.Option(
         metavar="NAME",
         autocompletion=completion.lidar,
-        help="Roads: hdl-64e, 32-beam or 16-beam; else os0, os1, pandar, hdl-64e, vlp-16, mid360 or rosette.",
+        help="Roads: hdl-64e, 32-beam or 16-beam; else os0, os1, pandar, hdl-64e, vlp-16, mid360, rosette or raster.",
     ),
 ]
 ImuGrade = Annotated[

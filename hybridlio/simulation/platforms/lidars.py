@@ -25,6 +25,10 @@ _PRISM_HZ = (7294 / 60, -4664 / 60)
 _TURN_HZ, _NOD_HZ = 9.77, 463.0
 _MID_360_DEG = (-7.0, 52.0)  # data sheet
 
+# A mirror that moves in two axes looks along rows, from the lowest to the highest. Field of view of RoboSense's M1
+# (data sheet), which has twice the resolution in both directions.
+_RASTER_DEG, _RASTER_COLUMNS, _RASTER_ROWS = (120.0, 25.0), 300, 63
+
 
 @dataclass(frozen=True)
 class Scanner:
@@ -69,6 +73,14 @@ def _rosette_sweep(start_s: float) -> RayPattern:
     return _ray_by_ray(times, off_axis.real, off_axis.imag)
 
 
+def _raster_sweep(_: float) -> RayPattern:
+    row, place = np.divmod(np.arange(_RASTER_ROWS * _RASTER_COLUMNS), _RASTER_COLUMNS)
+    across = (place + 0.5) / _RASTER_COLUMNS - 0.5
+    azimuth = np.radians(_RASTER_DEG[0]) * np.where(row % 2 == 0, across, -across)  # to and fro
+    elevation = np.radians(_RASTER_DEG[1]) * ((row + 0.5) / _RASTER_ROWS - 0.5)
+    return _ray_by_ray(np.arange(len(row)) / (10.0 * len(row)), azimuth, elevation)
+
+
 def _even(high_deg: float, low_deg: float, beams: int) -> tuple[float, ...]:
     return tuple(np.linspace(high_deg, low_deg, beams).tolist())
 
@@ -97,5 +109,10 @@ SCANNERS: dict[str, Scanner] = {
         "70° to the front, not repetitive, 24,000 points, like Livox's Avia",
         LidarModel("rosette", (), 0, 1.0, 190.0, 0.02, 0.02),
         _rosette_sweep,
+    ),
+    "raster": Scanner(
+        "120° × 25° to the front, in rows, 18,900 points, like RoboSense's M1",
+        LidarModel("raster", (), 0, 0.5, 150.0, 0.02, 0.02),
+        _raster_sweep,
     ),
 }

@@ -93,6 +93,9 @@ def test_the_lidars_see_what_their_data_sheets_say():
     assert np.allclose([elevation.min(), elevation.max()], [-7, 52], atol=0.5)
     off_axis = np.degrees(np.arccos(SCANNERS["rosette"].sweep(3.0).directions[:, 0]))
     assert 33 < off_axis.max() < 35.1
+    azimuth, elevation = angles("raster")
+    assert np.allclose([azimuth.max(), azimuth.min()], [60, -60], atol=0.5)
+    assert np.allclose([elevation.max(), elevation.min()], [12.5, -12.5], atol=0.5)
     assert len(SCANNERS["os0"].sweep(0.0).directions) == 64 * 1024
 
 
